@@ -1,0 +1,103 @@
+"""Questions to the optimiser and its answers: plain values that travel, are journalled and replayed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sim_engine.space import Space
+
+Point = tuple[float, ...]
+"""A point of the unit cube."""
+
+MeanName = Literal["constant", "zero", "simulated"]
+AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol"]
+
+
+@dataclass(frozen=True)
+class Data:
+    """Observations of a cost to be minimised.
+
+    Attributes:
+        points: in the unit cube, one tuple of `Space.dimension` numbers each.
+        costs: one number each; failed trials are left out by the strategy or penalised by it.
+    """
+
+    points: tuple[Point, ...] = ()
+    costs: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.points) != len(self.costs):
+            raise ValueError(f"{len(self.points)} points but {len(self.costs)} costs")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def added(self, point: Point, cost: float) -> Data:
+        """A copy with one more observation."""
+        return Data((*self.points, tuple(float(u) for u in point)), (*self.costs, float(cost)))
+
+
+@dataclass(frozen=True)
+class SuggestProblem:
+    """Everything that a proposal depends on; the optimiser actor keeps no state that matters.
+
+    Attributes:
+        space: searched box.
+        data: what was observed of the cost.
+        pending: points asked for and not answered yet.
+        count: how many points are wanted.
+        seed: of every random choice in the answer.
+        mean: prior mean of the surrogate: 'constant' (fitted), 'zero' (the paper's), 'simulated' (posterior mean of a
+            GP over `simulated`, the paper's D3).
+        simulated: cheap observations of the same cost, for `mean='simulated'`.
+        acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x); 'random' and 'sobol' only draw.
+        kappa: κ of the lower confidence bound, constant as in the paper.
+        map_resolution: if > 0 and the space has two dimensions, the answer carries the surrogate on a square grid.
+    """
+
+    space: Space
+    data: Data
+    pending: tuple[Point, ...] = ()
+    count: int = 1
+    seed: int = 0
+    mean: MeanName = "constant"
+    simulated: Data = Data()
+    acquisition: AcquisitionName = "lcb"
+    kappa: float = 2.0
+    map_resolution: int = 0
+
+
+@dataclass(frozen=True)
+class SurrogateMap:
+    """The surrogate on a square grid over the unit square, for pictures: row i is the second axis' i-th place."""
+
+    mean: tuple[tuple[float, ...], ...]
+    deviation: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """An answer.
+
+    Attributes:
+        points: `count` proposals in the unit cube.
+        means: posterior means there; NaN-free; empty if no surrogate was fitted (too few data, or only drawn).
+        deviations: posterior standard deviations of the noise-free cost there.
+        best_point: minimiser of the posterior mean over the observed points; None without a surrogate.
+        best_mean: posterior mean there.
+        best_deviation: its standard deviation.
+        hyperparameters: fitted values by name (for people and plots).
+        surrogate: see `SuggestProblem.map_resolution`.
+        seconds: CPU seconds it took.
+    """
+
+    points: tuple[Point, ...]
+    means: tuple[float, ...] = ()
+    deviations: tuple[float, ...] = ()
+    best_point: Point | None = None
+    best_mean: float | None = None
+    best_deviation: float | None = None
+    hyperparameters: dict[str, float] | None = None
+    surrogate: SurrogateMap | None = None
+    seconds: float = 0.0

@@ -1,0 +1,145 @@
+"""What the orchestrator may ask of a laboratory. Real hardware, the virtual bench and in-process twins implement these.
+
+All are asynchronous; none of them knows what a strategy is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from actors.optimizer.core.problem import SuggestProblem, Suggestion
+from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.task import PourTask, Scene
+
+
+class LaboratoryError(Exception):
+    """Something in the laboratory can't do what was asked; the text is for the person who can mend it."""
+
+
+class InvalidActionError(LaboratoryError):
+    """The vessels would touch, or the motion can't be made: refused before anything moved or was simulated."""
+
+
+class SimulationError(LaboratoryError):
+    """A simulation gave no result (diverged, or its worker died more often than it may)."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Recorded particles of one simulated pour, for the monitor.
+
+    Attributes:
+        times: (F,) [s].
+        positions: F arrays of shape (N, 3), world frame [m], float32.
+        states: F arrays of shape (N,), uint8: see `sim_engine.fluid.state.ParticleState`.
+        pourer_poses: (F, 7) float: x y z qw qx qy qz of the pourer's frame.
+    """
+
+    times: Any
+    positions: Any
+    states: Any
+    pourer_poses: Any
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """A simulated pour: its outcome, and its frames if the task asked for any."""
+
+    outcome: PourOutcome
+    frames: Frames | None = None
+
+
+class SimulatorPool(Protocol):
+    """Several simulators that share a queue. Dead members are replaced and their jobs retried."""
+
+    @property
+    def size(self) -> int:
+        """Number of simulators."""
+        ...
+
+    async def simulate(self, task: PourTask) -> SimulationResult:
+        """Run one pour on the next free simulator.
+
+        Cancelling the awaiting task cancels the simulation.
+
+        Raises:
+            InvalidActionError: the vessels touch, or the motion is impossible.
+            SimulationError: no result after the retries allowed.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PourProgress:
+    """Where a pour on the bench stands: for people and the monitor, never for control.
+
+    Attributes:
+        checkpoint: one of 'operator', 'tare', 'approach', 'tilt', 'hold', 'return', 'settle', 'weigh', 'record'.
+        fraction: 0 … 1 of the whole pour.
+        tilt: of the pourer [rad], if known.
+        balance: last reading [kg], if known.
+    """
+
+    checkpoint: str
+    fraction: float
+    tilt: float | None = None
+    balance: float | None = None
+
+
+ProgressCallback = Callable[[PourProgress], None]
+
+
+class Bench(Protocol):
+    """Arm, balance and operator together: it can pour once and weigh what came of it."""
+
+    @property
+    def mode(self) -> str:
+        """'virtual' or 'hardware'; part of every record."""
+        ...
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+    ) -> PourMeasurement:
+        """One whole pour: operator ready → tare → start pose → tilt → hold → return → settle → weigh → record.
+
+        Args:
+            action: `sim_engine.action.Action`.
+            seed: hidden noise of a virtual bench; ignored by hardware.
+
+        Raises:
+            InvalidActionError: refused before anything moved.
+            LaboratoryError: it failed after something had moved: what was poured is unknown.
+        """
+        ...
+
+
+class Optimizer(Protocol):
+    """Proposes points. Keeps no state: the same question may be asked again after a death."""
+
+    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+        """Answer a `SuggestProblem`."""
+        ...
+
+
+class Laboratory(Protocol):
+    """Everything a campaign needs, opened and closed as one (`async with`)."""
+
+    @property
+    def simulators(self) -> SimulatorPool: ...
+
+    @property
+    def bench(self) -> Bench | None:
+        """None where a campaign needs no pours (recorded data, planning)."""
+        ...
+
+    @property
+    def optimizer(self) -> Optimizer: ...
+
+    async def __aenter__(self) -> Laboratory: ...
+
+    async def __aexit__(self, *exc: object) -> None: ...
+
+
+Closer = Callable[[], Awaitable[None]]

@@ -1,0 +1,148 @@
+"""A campaign with everything resolved: scenes, spaces, budgets, seeds as plain values. What the YAML means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from actors.spec import LaboratorySpec
+from sim_engine.action import Action
+from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import Loss
+from sim_engine.space import Space
+from sim_engine.task import Scene
+
+CalibrationName = Literal["C4"]
+DeploymentName = Literal["D1", "D2", "D3"]
+
+
+@dataclass(frozen=True)
+class RecordedPour:
+    """One weighed pour read from a file.
+
+    Attributes:
+        poured, spilled, retained: masses [kg].
+        split: 'train', 'test' or 'transfer'.
+    """
+
+    action: Action
+    poured: float
+    spilled: float
+    retained: float
+    split: str
+
+    @property
+    def normalised_spillage(self) -> float | None:
+        """r = spilled / poured, None below 5 % poured."""
+        loaded = self.poured + self.retained
+        return None if self.poured < 0.05 * loaded else self.spilled / self.poured
+
+
+@dataclass(frozen=True)
+class RecordSet:
+    """Weighed pours in one scene."""
+
+    scene: Scene
+    pours: tuple[RecordedPour, ...]
+    path: Path
+
+
+@dataclass(frozen=True)
+class CalibrationPlan:
+    """C4 (and later C1–C3): which θ_s reproduces the weighed spills.
+
+    Attributes:
+        actions: space in which calibration pours are designed and the prior g draws.
+        parameters: searched θ_s.
+        fixed_parameters: θ_s values that are not searched.
+        pour_count: pours to be made on the bench (0 with `records`).
+        holdout: how many of them are kept for testing.
+        records: weighed pours to calibrate on in place of new ones (split 'train' and 'test').
+        transfer: weighed pours in another scene, scored only.
+        simulations: budget of the strategy.
+        random_baseline: how many random θ are scored for comparison.
+        initial: random θ before the surrogate takes over.
+    """
+
+    strategy: CalibrationName
+    scene: Scene
+    actions: Space
+    parameters: Space
+    fixed_parameters: dict[str, float]
+    pour_count: int
+    holdout: int
+    records: RecordSet | None
+    transfer: RecordSet | None
+    simulations: int
+    random_baseline: int = 0
+    initial: int = 8
+    kappa: float = 2.0
+
+
+@dataclass(frozen=True)
+class DeploymentPlan:
+    """D1, D2 or D3: how to pour into vessels that calibration never saw.
+
+    Attributes:
+        scenes: one per receiver.
+        actions: searched action space.
+        iterations: D1: iterations of the optimiser in simulation.
+        simulations_per_iteration: D1: m1.
+        prior_simulations: D3: m2.
+        pours: real pours per scene (D1: 1).
+        per_pour: simulations told to the strategy between two pours (D3); None: as many as the wall clock allows.
+        mean: prior mean of D2's surrogate: 'constant' or 'zero' (the paper's).
+        on_failed_pour: how a failed pour enters the data.
+    """
+
+    strategy: DeploymentName
+    scenes: tuple[Scene, ...]
+    actions: Space
+    loss: Loss
+    pours: int
+    iterations: int = 15
+    simulations_per_iteration: int = 2
+    prior_simulations: int = 37
+    per_pour: int | None = 0
+    mean: Literal["constant", "zero"] = "constant"
+    kappa: float = 2.0
+    initial: int = 3
+    on_failed_pour: Literal["penalise", "ignore"] = "penalise"
+
+
+@dataclass(frozen=True)
+class OutputPlan:
+    """What is written beside the journal."""
+
+    directory: Path
+    rrd: bool = True
+    figures: bool = True
+    record_rate: float = 10.0
+    recorded_simulations: int = 6
+
+
+@dataclass(frozen=True)
+class CampaignPlan:
+    """A whole campaign.
+
+    Attributes:
+        source: the YAML file.
+        parameters: θ_s in force where nothing is calibrated.
+        parallel_simulations: logical slots of the simulation lane; part of the plan (not of the machine), so that the
+            same seed asks for the same things anywhere.
+        on_unknown: what happens on resume to a pour that had started and has no outcome.
+        resolved: the YAML with everything filled in, JSON-ready, as kept with the run.
+    """
+
+    name: str
+    seed: int
+    source: Path
+    laboratory: LaboratorySpec
+    parameters: SimulationParameters
+    calibration: CalibrationPlan | None
+    deployment: DeploymentPlan | None
+    outputs: OutputPlan
+    parallel_simulations: int = 2
+    on_unknown: Literal["ask", "repeat"] = "ask"
+    resolved: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,116 @@
+"""What strategies ask for and what they are told: values only, no handles, no clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from actors.optimizer.core.problem import SuggestProblem, Suggestion
+from sim_engine.action import Action
+from sim_engine.liquid import SimulationParameters
+from sim_engine.outcome import PourMeasurement, PourOutcome
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A predicted loss and its standard deviation, in the loss' own unit."""
+
+    mean: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Run one simulated pour (idempotent, retried at will).
+
+    Attributes:
+        purpose: one word for journal and monitor: 'calibrate', 'prior', 'refine', 'evaluate' …
+    """
+
+    scene: str
+    action: Action
+    parameters: SimulationParameters
+    seed: int
+    purpose: str = "simulate"
+
+
+@dataclass(frozen=True)
+class Pour:
+    """Pour once on the real (or virtual) bench. Never retried by software.
+
+    Attributes:
+        number: 1, 2, … within the stage.
+        seed: of the virtual bench's hidden noise for this pour; a real bench ignores it.
+        predicted: what the strategy expects, for people and for the trust check.
+    """
+
+    scene: str
+    action: Action
+    number: int
+    seed: int
+    predicted: Prediction | None = None
+    purpose: str = "pour"
+
+
+@dataclass(frozen=True)
+class Suggest:
+    """Ask the optimiser actor for points. Its answer is journalled and replayed, never recomputed."""
+
+    problem: SuggestProblem
+    purpose: str = "suggest"
+
+
+Request = Simulate | Pour | Suggest
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Outcome of a `Simulate`."""
+
+    outcome: PourOutcome
+
+
+@dataclass(frozen=True)
+class Poured:
+    """Outcome of a `Pour`."""
+
+    measurement: PourMeasurement
+
+
+@dataclass(frozen=True)
+class Suggested:
+    """Outcome of a `Suggest`."""
+
+    suggestion: Suggestion
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The request came to nothing: a simulation that leaked or diverged, a touching pair of vessels, a pour that was
+    declared lost by the operator.
+
+    Attributes:
+        kind: 'invalid_action', 'simulation', 'pour_unknown', 'pour_failed', 'optimizer'.
+        reason: for people.
+    """
+
+    kind: str
+    reason: str
+
+
+Outcome = Simulated | Poured | Suggested | Failed
+
+
+@dataclass(frozen=True)
+class Slots:
+    """How many requests of each kind the scheduler could start now."""
+
+    simulations: int
+    pours: int = 1
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Why a strategy asked for what it asked for; shown, streamed and journalled."""
+
+    text: str
+    values: dict[str, float] = field(default_factory=dict)

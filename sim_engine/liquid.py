@@ -1,0 +1,84 @@
+"""Liquids and the simulator's knobs: what is poured (SI), and θ_s, what calibration may turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """A simulation parameter as forms, schema and plots need it (bounds are those of the model field)."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    integer: bool
+    meaning: str
+
+
+class Liquid(BaseModel):
+    """A load of liquid.
+
+    Attributes:
+        name: for people.
+        mass: loaded mass [kg].
+        density: [kg/m³].
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = "water"
+    mass: float = Field(gt=0.0, le=20.0)
+    density: float = Field(default=998.0, gt=100.0, lt=20_000.0)
+
+    @property
+    def volume(self) -> float:
+        """Loaded volume [m³]."""
+        return self.mass / self.density
+
+
+class SimulationParameters(BaseModel):
+    """What calibration may turn (θ_s). Names follow FleX where it has one; meanings are ours."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    particles: int = Field(default=2_000, ge=200, le=50_000)
+    """Number of particles at fixed liquid volume; sets the spacing d = (V/N)^(1/3)."""
+
+    cohesion: float = Field(default=0.02, ge=0.0, le=0.2, json_schema_extra={"unit": "N/m"})
+    """Surface tension [N/m] that the pairwise attraction is scaled to, so that it means the same at any spacing.
+    Below about one capillary length per spacing (2.7 mm for water) it only acts on drips."""
+
+    viscosity: float = Field(default=3.0, ge=0.0, le=60.0, json_schema_extra={"unit": "1/s"})
+    """Rate at which a particle's velocity relaxes to its neighbours' mean (XSPH) [1/s], independent of the time step."""
+
+    friction: float = Field(default=0.05, ge=0.0, le=1.0, json_schema_extra={"unit": "1"})
+    """Coulomb coefficient between particles and vessel walls."""
+
+    @classmethod
+    def info(cls) -> dict[str, ParameterInfo]:
+        """Name, unit, bounds and meaning of every parameter."""
+        table = {}
+        for name, field in cls.model_fields.items():
+            lower = next(m.ge for m in field.metadata if hasattr(m, "ge"))
+            upper = next(m.le for m in field.metadata if hasattr(m, "le"))
+            extra: dict[str, Any] = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+            table[name] = ParameterInfo(
+                name,
+                str(extra.get("unit", "1")),
+                float(lower),
+                float(upper),
+                field.annotation is int,
+                field.description or "",
+            )
+        return table
+
+    @classmethod
+    def from_values(cls, values: dict[str, float]) -> SimulationParameters:
+        """From a searched point; whole numbers are rounded. Parameters not named keep their defaults."""
+        fixed = {k: round(v) if cls.model_fields[k].annotation is int else v for k, v in values.items()}
+        return cls(**fixed)

@@ -1,0 +1,82 @@
+"""What is asked of a simulator: a scene, an action, θ_s and a seed. Small values without Taichi."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from sim_engine.action import Action
+from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.vessel.spec import VesselSpec
+
+
+@dataclass(frozen=True)
+class Pivot:
+    """The horizontal line (along y) about which the pourer turns.
+
+    Attributes:
+        kind: `lip`: through the inner lip's lowest point in the pouring direction; `point`: through `x`, `z`.
+        x: in the vessel's frame, towards the receiver [m].
+        z: in the vessel's frame, above its underside [m].
+    """
+
+    kind: str = "lip"
+    x: float = 0.0
+    z: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything about a pour that is not chosen: vessels, liquid, pivot, fixed action dimensions.
+
+    Attributes:
+        name: key by which strategies and the journal refer to it.
+        fixed: action dimensions that are not searched, SI (None switches an optional one off).
+        hold_cap: longest hold 'until the predicted end of flow' [s].
+    """
+
+    name: str
+    pourer: VesselSpec
+    receiver: VesselSpec
+    liquid: Liquid
+    pivot: Pivot = Pivot()
+    fixed: dict[str, float | None] = field(default_factory=dict)
+    hold_cap: float = 5.0
+
+    def action(self, chosen: dict[str, float]) -> Action:
+        """The complete action of a searched point. Raises ValueError as `Action.compose` does."""
+        return Action.compose(self.fixed, chosen)
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """How the real placement differs from the intended one (the virtual bench's grip and placement errors).
+
+    Attributes:
+        x: the receiver stands that much further from the pourer [m].
+        y: … and that much sideways [m].
+        tilt: the pourer is held that much more tilted than commanded [rad].
+        speed_factor: executed over commanded angular velocity.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    tilt: float = 0.0
+    speed_factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class PourTask:
+    """One simulated pour.
+
+    Attributes:
+        seed: of the initial positions; same task, same seed → same bits on one CPU thread.
+        record_rate: frames of all particles kept per simulated second; 0 keeps none.
+        pose_error: deviations from the intended scene; None for a plain simulation.
+    """
+
+    scene: Scene
+    action: Action
+    parameters: SimulationParameters
+    seed: int
+    record_rate: float = 0.0
+    pose_error: PoseError | None = None
