@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from actors.optimizer.core.problem import SuggestProblem, Suggestion
+from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.task import PourTask, Scene
 

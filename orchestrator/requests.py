@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from actors.optimizer.core.problem import SuggestProblem, Suggestion
+from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome

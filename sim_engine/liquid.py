@@ -80,5 +80,5 @@ class SimulationParameters(BaseModel):
     @classmethod
     def from_values(cls, values: dict[str, float]) -> SimulationParameters:
         """From a searched point; whole numbers are rounded. Parameters not named keep their defaults."""
-        fixed = {k: round(v) if cls.model_fields[k].annotation is int else v for k, v in values.items()}
-        return cls(**fixed)
+        rounded = {k: round(v) if cls.model_fields[k].annotation is int else v for k, v in values.items()}
+        return cls.model_validate(rounded)
