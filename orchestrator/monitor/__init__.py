@@ -1,0 +1,1 @@
+"""Rerun recordings: what a campaign looks like while it runs and afterwards."""

@@ -1,0 +1,219 @@
+"""A simulated pour as a picture: four moments from the side, and where the liquid was at every time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.report import style
+from orchestrator.report.section import Floats, Solid, fill_section, place, section
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from actors.protocols import SimulationResult
+    from sim_engine.task import PourTask
+
+IN_POURER, _FALLING, _RECEIVED, SPILLED, _ESCAPED = range(5)
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+
+def simulation_png(path: Path, task: PourTask, result: SimulationResult) -> Path:
+    """Picture of one simulated pour, for `decant simulate --png`.
+
+    Args:
+        path: PNG to write.
+        task: what was simulated, with `record_rate` > 0.
+        result: what came of it.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: the result has no frames.
+    """
+    from sim_engine.vessel.build import build_vessel
+
+    scene = task.scene
+    names = ("angular_velocity", "max_angle", "x_offset", "height")
+    action = style.display_values({name: getattr(task.action, name) for name in names})
+    outcome = result.outcome
+    title = (
+        f"{scene.pourer.name} into {scene.receiver.name}: {100 * outcome.received:.1f} % received, "
+        f"{100 * outcome.spilled:.1f} % spilled, {100 * outcome.retained:.1f} % retained"
+    )
+    if outcome.invalid is not None:
+        title += f"   [not valid: {outcome.invalid}]"
+    note = f"{action}; {outcome.particles:,} particles, seed {outcome.seed}".replace(",", " ", 0)
+    return draw_pour(
+        path,
+        result,
+        build_vessel(scene.pourer),
+        build_vessel(scene.receiver),
+        receiver_shift=0.0 if task.pose_error is None else task.pose_error.x,
+        title=title,
+        note=note,
+    )
+
+
+def draw_pour(
+    path: Path,
+    result: SimulationResult,
+    pourer: Solid,
+    receiver: Solid,
+    *,
+    title: str,
+    note: str = "",
+    receiver_shift: float = 0.0,
+    snapshots: int = 4,
+) -> Path:
+    """Snapshots of a pour seen from the side (vessels cut open at y = 0), above the shares of the liquid over time.
+
+    Args:
+        path: PNG to write.
+        result: a simulated pour with frames.
+        pourer: its surface.
+        receiver: its surface; it stands on the table at x = `receiver_shift` [m].
+        title: first line.
+        note: second line.
+        receiver_shift: see above.
+        snapshots: how many moments.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: the result has no frames.
+    """
+    frames = result.frames
+    if frames is None or len(frames.times) == 0:
+        raise ValueError("this simulation kept no frames to draw; simulate it with a record rate above 0")
+    times = np.asarray(frames.times, dtype=float)
+    shares = _shares(frames.states)
+    chosen = _moments(times, shares, snapshots)
+    outlines = [section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)]
+    stand = UPRIGHT + np.array([receiver_shift, 0, 0, 0, 0, 0, 0])
+    window = _window(outlines, np.asarray(frames.pourer_poses, float)[chosen], stand)
+    aspect = (window[3] - window[2]) / (window[1] - window[0])
+    width = 3.1 * snapshots
+    figure, grid = style.new_figure(
+        2,
+        snapshots,
+        size=(width, 3.0 * min(max(aspect, 0.7), 1.9) + 2.6),
+        height_ratios=[3.0 * min(max(aspect, 0.7), 1.9), 1.5],
+        squeeze=False,
+    )
+    figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.01, ha="left")
+    for axes, index in zip(grid[0], chosen, strict=True):
+        _snapshot(
+            axes,
+            np.asarray(frames.positions[index], float),
+            np.asarray(frames.states[index]),
+            [
+                [place(loop, np.asarray(frames.pourer_poses[index], float)) for loop in outlines[0]],
+                [place(loop, stand) for loop in outlines[1]],
+            ],
+            window,
+            result.outcome.spacing,
+        )
+        axes.set_title(f"{times[index]:.2f} s", fontsize=10.5, loc="left", color=style.INK)
+    _scale_bar(grid[0, 0], window)
+    for axes in grid[1, 1:]:
+        axes.remove()
+    timeline = grid[1, 0]
+    timeline.set_subplotspec(timeline.get_gridspec()[1, :])
+    _timeline(timeline, times, shares, times[chosen])
+    if note:
+        figure.supxlabel(note, fontsize=8.5, color=style.GREY, x=0.01, ha="left")
+    return style.save(figure, path)
+
+
+def _shares(states: Any) -> Floats:
+    """(F, 5) fraction of the particles in every state."""
+    return np.array([np.bincount(np.asarray(s, dtype=int), minlength=5)[:5] / len(s) for s in states])
+
+
+def _moments(times: Floats, shares: Floats, count: int) -> NDArray[np.intp]:
+    """Frames worth a picture: when shares 1/8 … 7/8 of what will leave had left, and the end."""
+    left = 1.0 - shares[:, IN_POURER]
+    if left[-1] < 0.01:
+        return np.unique(np.linspace(0, len(times) - 1, count).astype(int)).repeat(1)[:count]
+    wanted = np.linspace(0.0, 1.0, 2 * count - 1)[1::2][: count - 1] * left.max()
+    picked = [int(np.argmax(left >= level)) for level in wanted]
+    return np.array([*picked, len(times) - 1])
+
+
+def _window(outlines: list[list[Floats]], poses: Floats, stand: Floats) -> tuple[float, float, float, float]:
+    """x and z range that shows both vessels in all snapshots and some table on either side."""
+    corners = [place(loop, pose) for pose in poses for loop in outlines[0]]
+    corners += [place(loop, stand) for loop in outlines[1]]
+    everything = np.concatenate(corners)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    margin = 0.12 * float(max(high - low))
+    return low[0] - margin, high[0] + 2 * margin, min(low[1], 0.0) - 0.4 * margin, high[1] + 0.5 * margin
+
+
+def _snapshot(
+    axes: Axes,
+    positions: Floats,
+    states: NDArray[Any],
+    vessels: list[list[Floats]],
+    window: tuple[float, float, float, float],
+    spacing: float,
+) -> None:
+    from matplotlib.collections import EllipseCollection
+
+    axes.set_xlim(window[0], window[1])
+    axes.set_ylim(window[2], window[3])
+    axes.set_aspect("equal")
+    axes.axis("off")
+    axes.axhline(0.0, color=style.GREY, linewidth=1.0, zorder=0)
+    # Far particles first, so that what is near covers what is far, as an eye at −y would see it.
+    order = np.argsort(-positions[:, 1])
+    palette = np.array([colour for _, colour in style.PARTICLE_STATES])
+    axes.add_collection(
+        EllipseCollection(
+            widths=[spacing],
+            heights=[spacing],
+            angles=[0.0],
+            units="xy",
+            offsets=positions[order][:, [0, 2]],
+            offset_transform=axes.transData,
+            facecolors=palette[np.minimum(states[order], 4)].tolist(),
+            edgecolors=(1.0, 1.0, 1.0, 0.35),
+            linewidths=0.2,
+            zorder=1,
+        )
+    )
+    for loops in vessels:
+        fill_section(axes, loops, facecolor=style.INK, edgecolor=style.INK, linewidth=0.4, zorder=2)
+
+
+def _scale_bar(axes: Axes, window: tuple[float, float, float, float]) -> None:
+    length = 0.05
+    right = window[1] - 0.04 * (window[1] - window[0])
+    top = window[3] - 0.05 * (window[3] - window[2])
+    axes.plot([right - length, right], [top, top], color=style.INK, linewidth=2.0, solid_capstyle="butt")
+    axes.text(right - length / 2, top, "50 mm", ha="center", va="bottom", fontsize=8, color=style.INK)
+
+
+def _timeline(axes: Axes, times: Floats, shares: Floats, marks: Floats) -> None:
+    shown = [i for i in (2, SPILLED, 1, IN_POURER, 4) if i != 4 or shares[:, 4].max() > 0]
+    axes.stackplot(
+        times,
+        *(100 * shares[:, i] for i in shown),
+        colors=[style.PARTICLE_STATES[i][1] for i in shown],
+        labels=[style.PARTICLE_STATES[i][0] for i in shown],
+        linewidth=0,
+        alpha=0.9,
+    )
+    for mark in marks:
+        axes.axvline(mark, color="white", linewidth=1.6)
+        axes.axvline(mark, color=style.INK, linewidth=0.7, linestyle=(0, (4, 2)))
+    style.dress(axes, x="time [s]", y="liquid [%]", grid=None)
+    axes.set_xlim(times[0], max(times[-1], times[0] + 1e-6))
+    axes.set_ylim(0, 100)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8.5, frameon=False, reverse=True)

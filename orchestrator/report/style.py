@@ -1,0 +1,120 @@
+"""How figures look: one palette that colour-blind readers can tell apart, units as people read them, Agg only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.liquid import SimulationParameters
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DPI = 150
+
+# Okabe and Ito's palette; each colour means one thing in every figure.
+INK = "#222222"
+GREY = "#8c8c8c"
+PALE = "#d9d9d9"
+MEASURED = "#0072b2"
+PREDICTED = "#e69f00"
+BEST = "#d55e00"
+GOOD = "#009e73"
+SPILLED = "#d55e00"
+RECEIVED = "#009e73"
+FALLING = "#56b4e9"
+POURER = "#0072b2"
+ESCAPED = "#cc79a7"
+
+PARTICLE_STATES: tuple[tuple[str, str], ...] = (
+    ("in the pourer", POURER),
+    ("falling", FALLING),
+    ("received", RECEIVED),
+    ("spilled", SPILLED),
+    ("escaped through a wall", ESCAPED),
+)
+"""Meaning and colour of `sim_engine.fluid.state.ParticleState`, by its value."""
+
+PARAMETER_NAMES = {"particles": "number of particles", "friction": "wall friction"}
+
+
+def label(name: str) -> str:
+    """Axis label of an action dimension or simulation parameter: its name in words and its display unit."""
+    unit = display_unit(name)
+    words = PARAMETER_NAMES.get(name, name.replace("_", " "))
+    return f"{words} [{unit}]" if unit else words
+
+
+def display_unit(name: str) -> str:
+    """Unit that people see ('' for pure numbers and for names that are neither action nor parameter)."""
+    if name in ACTION_DIMENSIONS:
+        return ACTION_DIMENSIONS[name].display_unit.replace("^2", "²")
+    info = SimulationParameters.info().get(name)
+    return "" if info is None or info.unit == "1" else info.unit
+
+
+def display_factor(name: str) -> float:
+    """SI value of one display unit; 1 for simulation parameters, which are shown in SI."""
+    return ACTION_DIMENSIONS[name].factor if name in ACTION_DIMENSIONS else 1.0
+
+
+def display_value(name: str, value: float | None) -> str:
+    """One quantity as people read it, from its SI value: '41.2 deg/s', '1 840', '0.032 N/m'; '—' for None."""
+    if value is None:
+        return "—"
+    if name == "particles":
+        return f"{round(value):,}".replace(",", " ")
+    return f"{value / display_factor(name):.3g} {display_unit(name)}".rstrip()
+
+
+def display_values(values: dict[str, float | None]) -> str:
+    """Several named quantities in one line, from SI values: 'angular velocity 41.2 deg/s, x offset 104 mm'."""
+    return ", ".join(f"{name.replace('_', ' ')} {display_value(name, value)}" for name, value in values.items())
+
+
+def new_figure(rows: int = 1, columns: int = 1, *, size: tuple[float, float], **kwargs: Any) -> tuple[Figure, Any]:
+    """A figure of our look, without a window system.
+
+    Args:
+        size: width and height [inch].
+
+    Returns:
+        The figure and what `Figure.subplots` returns (axes, or an array of them).
+    """
+    # Figure is used without pyplot: nothing global, no backend to choose, no figures that live on in a daemon.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, **kwargs)
+
+
+def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "", grid: str | None = "y") -> None:
+    """Title, labels, thin grid; no box."""
+    axes.set_title(title, fontsize=11, loc="left", color=INK, pad=8)
+    axes.set_xlabel(x, fontsize=9.5, color=INK)
+    axes.set_ylabel(y, fontsize=9.5, color=INK)
+    axes.tick_params(labelsize=8.5, colors=INK)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(GREY)
+    axes.set_axisbelow(True)
+    if grid == "both":
+        axes.grid(True, color=PALE, linewidth=0.6)
+    elif grid in ("x", "y"):
+        axes.grid(True, axis="x" if grid == "x" else "y", color=PALE, linewidth=0.6)
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a PNG; the folder is made if needed.
+
+    Raises:
+        OSError: the file can't be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=DPI, facecolor="white")
+    return path
