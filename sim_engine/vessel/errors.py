@@ -1,0 +1,7 @@
+"""What is wrong with a vessel, in words for the person who described it."""
+
+from __future__ import annotations
+
+
+class VesselError(ValueError):
+    """A vessel that can't be built or used; the message says why and what would be right."""

@@ -1,0 +1,191 @@
+"""A vessel as the rest of the simulator sees it: solid, distance grid, cavity, opening and lip.
+
+Vessel frame: z up along the vessel's axis, the underside at z = 0, x = y = 0 at the centre of the opening.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.vessel import profile as profiles
+from sim_engine.vessel.errors import VesselError
+from sim_engine.vessel.sdf import SignedDistanceGrid
+from sim_engine.vessel.spec import ProfileShape, VesselSpec
+from sim_engine.vessel.surface import sample_surface
+
+Floats = NDArray[np.float64]
+
+QUADRATURE_POINTS = 120_000
+"""Points that `Vessel.cavity_points` aims at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vessel:
+    """One vessel, ready for the solver. Build it with `sim_engine.vessel.build.build_vessel`.
+
+    Attributes:
+        spec: what it was built from.
+        solid_vertices: of the closed surface of the solid, shape (V, 3) [m].
+        solid_faces: triangles of it, normals outwards, shape (F, 3).
+        grid: signed distance to the solid and the cavity's mask.
+        inner_floor: lowest z of the cavity [m].
+        rim_height: z of the lip's lowest point [m].
+        opening_radius: radius of the largest circle that fits the opening [m].
+        outer_radius: largest distance of solid material from the axis [m].
+        capacity: volume of the cavity below the rim, upright [m³].
+        wall_thickness: smallest thickness of the solid [m].
+        meridians: curves on the cavity's surface from its bottom to the lip's crest, in half planes through the axis at
+            equal angles from +x, shape (directions, points, 3) [m]. Liquid that leaves crosses one of them.
+    """
+
+    spec: VesselSpec
+    solid_vertices: Floats
+    solid_faces: NDArray[np.int64]
+    grid: SignedDistanceGrid
+    inner_floor: float
+    rim_height: float
+    opening_radius: float
+    outer_radius: float
+    capacity: float
+    wall_thickness: float
+    meridians: Floats
+
+    @property
+    def name(self) -> str:
+        """Name from the spec."""
+        return self.spec.name
+
+    def lip_point(self, direction: float = 0.0) -> Floats:
+        """The inner lip's point in a horizontal direction: where liquid leaves when the vessel tips that way.
+
+        Args:
+            direction: angle from +x in the xy plane [rad].
+
+        Returns:
+            Shape (3,) [m]. Between the stored directions it is interpolated in angle, radius and height.
+        """
+        crest = self.meridians[:, -1]
+        place = (direction / (2.0 * np.pi)) % 1.0 * len(crest)
+        first = int(place) % len(crest)
+        second = (first + 1) % len(crest)
+        part = place - int(place)
+        radius = np.hypot(crest[:, 0], crest[:, 1])
+        r = (1.0 - part) * radius[first] + part * radius[second]
+        z = (1.0 - part) * crest[first, 2] + part * crest[second, 2]
+        return np.array([r * np.cos(direction), r * np.sin(direction), z])
+
+    def surface_points(self, count: int) -> Floats:
+        """Points on the solid's surface for contact checks: a third on its sharp edges, the others even by area.
+
+        Args:
+            count: how many, at least 10.
+
+        Returns:
+            Shape (count, 3) [m]; the same points at every call.
+        """
+        return sample_surface(self.solid_vertices, self.solid_faces, count)
+
+    @cached_property
+    def bounding_sphere(self) -> tuple[Floats, float]:
+        """Centre (3,) and radius of a sphere around the solid [m]."""
+        low, high = self.solid_vertices.min(axis=0), self.solid_vertices.max(axis=0)
+        centre = (low + high) / 2.0
+        return centre, float(np.linalg.norm(self.solid_vertices - centre, axis=1).max())
+
+    def cavity_points(self) -> tuple[Floats, float]:
+        """Midpoint quadrature of the cavity below the rim, upright.
+
+        The lattice is cubic up to the stretch in z that lets the floor's and the rim's planes fall between its layers.
+
+        Returns:
+            Points, shape (M, 3) [m], and the volume that each stands for [m³]; together they make the capacity.
+        """
+        return self._quadrature
+
+    @cached_property
+    def _quadrature(self) -> tuple[Floats, float]:
+        points, _ = lattice(self.spec, self.grid, self.inner_floor, self.rim_height, QUADRATURE_POINTS)
+        return points, self.capacity / len(points)
+
+
+def lattice(
+    spec: VesselSpec, grid: SignedDistanceGrid, inner_floor: float, rim_height: float, count: int
+) -> tuple[Floats, float]:
+    """Lattice points inside a cavity.
+
+    Args:
+        spec: for profile vessels, whose cavity is known exactly.
+        grid: for the others.
+        inner_floor: [m].
+        rim_height: [m].
+        count: roughly how many points.
+
+    Returns:
+        Points, shape (M, 3) [m], and the volume of one lattice cell [m³].
+    """
+    nodes = np.argwhere(grid.cavity)
+    if len(nodes) == 0:
+        raise VesselError(f"{spec.name} has no cavity of at least {1e3 * grid.spacing:.2g} mm")
+    low = grid.origin + grid.spacing * (nodes.min(axis=0) - 1)
+    high = grid.origin + grid.spacing * (nodes.max(axis=0) + 1)
+    step = float(np.cbrt(len(nodes) * grid.spacing**3 / count))
+    layers = max(1, round((rim_height - inner_floor) / step))
+    thickness = (rim_height - inner_floor) / layers
+    z: Floats = inner_floor + (np.arange(layers) + 0.5) * thickness
+    half = np.ceil(np.abs([low[:2], high[:2]]).max(axis=0) / step) + 1.0
+    x, y = ((np.arange(-n, n) + 0.5) * step for n in half)
+    if isinstance(spec.shape, ProfileShape):
+        inner = np.array(spec.shape.inner) + np.array([0.0, inner_floor])
+        polygon = np.vstack([inner, [0.0, inner[-1, 1]]])
+        inside = profiles.contains(polygon, np.hypot(x[:, None], y)[..., None], z)
+        i, j, k = np.nonzero(inside)
+        return np.column_stack([x[i], y[j], z[k]]), step * step * thickness
+    grid_points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid_points = grid_points[np.all((grid_points >= low) & (grid_points <= high), axis=1)]
+    return grid_points[in_cavity(grid, grid_points)], step * step * thickness
+
+
+def in_cavity(grid: SignedDistanceGrid, points: Floats) -> NDArray[np.bool_]:
+    """Whether free points belong to the cavity rather than to the outside or the solid.
+
+    A point counts when the node next to it does, or, close to a wall where that node may lie in solid, when the node
+    next to where the wall's normal leads does.
+
+    Args:
+        grid: of the vessel.
+        points: shape (N, 3) [m].
+
+    Returns:
+        Shape (N,).
+    """
+    free = grid.sample(points) > 0.0
+    away = grid.gradient(points)
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    top = int(np.flatnonzero(grid.cavity.any(axis=(0, 1)))[-1])
+    result = np.zeros(len(points), dtype=bool)
+    for shift in (0.0, 0.75 * grid.spacing):
+        index = np.rint((points + shift * away - grid.origin) / grid.spacing).astype(np.int64)
+        index[:, 2] = np.minimum(index[:, 2], top)
+        index = np.clip(index, 0, np.array(grid.shape) - 1)
+        result |= grid.cavity[index[:, 0], index[:, 1], index[:, 2]].astype(bool)
+    return free & result
+
+
+def check_holds(vessel: Vessel, volume: float) -> None:
+    """Refuse a load that the vessel can't hold.
+
+    Args:
+        vessel: the pourer, or the receiver of all of it.
+        volume: of the liquid [m³].
+
+    Raises:
+        VesselError: it would overflow.
+    """
+    if volume > vessel.capacity:
+        raise VesselError(
+            f"{vessel.name} holds {1e6 * vessel.capacity:.3g} mL to the brim, {1e6 * volume:.3g} mL asked for"
+        )
