@@ -1,0 +1,52 @@
+"""A loss as people read it: fractions in percent, masses in grams."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sim_engine.losses import Loss
+
+
+@dataclass(frozen=True)
+class LossUnit:
+    """How a loss is shown.
+
+    Attributes:
+        label: what an axis says, with the unit.
+        unit: '%', 'g' or 'particles'.
+        factor: shown value over the loss' own value.
+    """
+
+    label: str
+    unit: str
+    factor: float
+
+    def text(self, value: float, deviation: float | None = None) -> str:
+        """A value for people, from the loss' own unit: '1.2 %' or '1.2 ± 0.9 %'."""
+        number = f"{self.factor * value:.{self.decimals}f}"
+        if deviation is not None:
+            number += f" ± {self.factor * deviation:.{self.decimals}f}"
+        return f"{number} {self.unit}"
+
+    @property
+    def decimals(self) -> int:
+        """Places after the point that mean something: 0.01 % or g (20 mg of 200 g), whole particles."""
+        return 0 if self.unit == "particles" else 2
+
+
+def loss_unit(loss: Loss) -> LossUnit:
+    """How to show a deployment loss."""
+    match loss.name:
+        case "spilled_and_retained":
+            retained = "retained" if loss.retained_weight == 1.0 else f"{loss.retained_weight:g} × retained"
+            return LossUnit(f"(spilled + {retained}) / loaded [%]", "%", 100.0)
+        case "normalised":
+            return LossUnit("spilled / poured [%]", "%", 100.0)
+        case "grams":
+            return LossUnit("spilled [g]", "g", 1.0)
+        case "particles":
+            return LossUnit("spilled [particles]", "particles", 1.0)
+
+
+DISCREPANCY = LossUnit("|measured − simulated| spillage [%]", "%", 100.0)
+"""How a discrepancy Δ is shown."""
