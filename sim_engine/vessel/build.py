@@ -81,7 +81,7 @@ def _profile_grid(polygon: Floats, inner: Floats, spacing: float) -> SignedDista
     steps = np.arange(-half, half + 1)
     below = int(np.ceil(MARGIN / spacing))
     layers = below + int(np.ceil((polygon[:, 1].max() + MARGIN) / spacing)) + 1
-    z: Floats = (np.arange(layers) - below) * spacing
+    z = np.asarray((np.arange(layers) - below) * spacing, dtype=np.float64)
     squares, place = np.unique(steps[:, None] ** 2 + steps**2, return_inverse=True)
     r = np.sqrt(squares)[:, None] * spacing
     values = profiles.distance(polygon, r, z).astype(np.float32)

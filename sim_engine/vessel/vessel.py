@@ -135,7 +135,7 @@ def lattice(
     step = float(np.cbrt(len(nodes) * grid.spacing**3 / count))
     layers = max(1, round((rim_height - inner_floor) / step))
     thickness = (rim_height - inner_floor) / layers
-    z: Floats = inner_floor + (np.arange(layers) + 0.5) * thickness
+    z = np.asarray(inner_floor + (np.arange(layers) + 0.5) * thickness, dtype=np.float64)
     half = np.ceil(np.abs([low[:2], high[:2]]).max(axis=0) / step) + 1.0
     x, y = ((np.arange(-n, n) + 0.5) * step for n in half)
     if isinstance(spec.shape, ProfileShape):
