@@ -65,7 +65,7 @@ def campaign_blueprint(receivers: tuple[str, ...], loss_label: str) -> rrb.Bluep
         )
         for name in receivers
     ]
-    losses.append(rrb.TimeSeriesView(origin="/calibration/loss", name="Calibration: discrepancy [%]"))
+    losses.append(rrb.TimeSeriesView(origin="/calibration/loss", name="Calibration pours: spilled / poured [%]"))
     maps = []
     for place, title in (
         ("/maps/calibration", "Discrepancy"),

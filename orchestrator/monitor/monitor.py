@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orchestrator.events import (
     CampaignClosed,
@@ -25,10 +25,9 @@ from orchestrator.monitor.streams import Streams
 from orchestrator.monitor.worker import Worker
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
-from orchestrator.report.units import DISCREPANCY, loss_unit
+from orchestrator.report.units import DISCREPANCY, is_calibration, loss_of_pour, loss_unit, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated, Suggest, Suggested
 from sim_engine.action import ACTION_DIMENSIONS
-from sim_engine.losses import normalised_spillage
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
@@ -121,10 +120,8 @@ class _Translator:
                 if records is not None:
                     self._scenes[records.scene.name] = records.scene
             self._scenes[plan.calibration.scene.name] = plan.calibration.scene
-        self._deployed: set[str] = set()
         if plan.deployment is not None:
             self._scenes.update({scene.name: scene for scene in plan.deployment.scenes})
-            self._deployed = {scene.name for scene in plan.deployment.scenes}
         self._scene_of_stage: dict[str, str] = {}
         self._best: dict[str, float] = {}
         self._running: set[int] = set()
@@ -198,7 +195,7 @@ class _Translator:
             case Pour() as pour:
                 expected = ""
                 if pour.predicted is not None:
-                    unit = self._unit(event.stage, pour.scene)
+                    unit = unit_of_pour(self._plan, event.stage, pour.scene)
                     expected = f", predicted {unit.text(pour.predicted.mean, pour.predicted.deviation)}"
                 self._say(f"pour {pour.number}: {self._action(event.stage, pour)}{expected}", source=event.stage)
 
@@ -244,15 +241,10 @@ class _Translator:
         self._pours += 1
         self.streams.at(wall=event.time, pour=self._pours)
         measured = outcome.measurement
-        unit = self._unit(event.stage, request.scene)
-        calibrating = self._calibrating(event.stage, request.scene)
-        if calibrating or self._plan.deployment is None:
-            value, place = normalised_spillage(measured.fractions), "/calibration/loss"
-        else:
-            value = self._plan.deployment.loss(
-                measured.fractions, loaded_mass=measured.loaded, particles=self._plan.parameters.particles
-            )
-            place = f"/pours/{entity_name(request.scene)}"
+        unit = unit_of_pour(self._plan, event.stage, request.scene)
+        value = loss_of_pour(self._plan, event.stage, request.scene, measured)
+        calibrating = is_calibration(self._plan, event.stage, request.scene)
+        place = "/calibration/loss" if calibrating else f"/pours/{entity_name(request.scene)}"
         if value is None:
             self._say(f"pour {request.number}: too little was poured for a loss", "warning", event.stage)
             return
@@ -290,14 +282,6 @@ class _Translator:
         self._about[f"map {place.removeprefix('/maps/')}"] = f"{unit.label}: {said}"
         self._page()
 
-    def _calibrating(self, stage: str, scene: str) -> bool:
-        return scene not in self._deployed or stage.startswith("calibration")
-
-    def _unit(self, stage: str, scene: str) -> Any:
-        if self._plan.deployment is None or self._calibrating(stage, scene):
-            return DISCREPANCY
-        return loss_unit(self._plan.deployment.loss)
-
     def _action(self, stage: str, pour: Pour) -> str:
-        plan = self._plan.calibration if self._calibrating(stage, pour.scene) else self._plan.deployment
+        plan = self._plan.calibration if is_calibration(self._plan, stage, pour.scene) else self._plan.deployment
         return pour.action.display(*(plan.actions.names if plan is not None else ()))

@@ -24,7 +24,6 @@ from sim_engine.vessel.spec import VesselSpec
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 if TYPE_CHECKING:
-
     from actors.optimizer.core.problem import SurrogateMap
     from actors.protocols import Frames
     from orchestrator.report.section import Solid

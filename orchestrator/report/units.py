@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sim_engine.losses import Loss
+from orchestrator.plan import CampaignPlan
+from sim_engine.losses import Loss, normalised_spillage
+from sim_engine.outcome import PourMeasurement
 
 
 @dataclass(frozen=True)
@@ -50,3 +52,26 @@ def loss_unit(loss: Loss) -> LossUnit:
 
 DISCREPANCY = LossUnit("|measured − simulated| spillage [%]", "%", 100.0)
 """How a discrepancy Δ is shown."""
+
+SPILLAGE = LossUnit("spilled / poured [%]", "%", 100.0)
+"""How a calibration pour's spillage r is shown."""
+
+
+def is_calibration(plan: CampaignPlan, stage: str, scene: str) -> bool:
+    """Whether a pour serves calibration: it is compared with simulations, not minimised."""
+    deployed = {s.name for s in plan.deployment.scenes} if plan.deployment is not None else set()
+    return scene not in deployed or stage.startswith("calibration")
+
+
+def unit_of_pour(plan: CampaignPlan, stage: str, scene: str) -> LossUnit:
+    """How the loss of a pour is shown."""
+    if plan.deployment is None or is_calibration(plan, stage, scene):
+        return SPILLAGE
+    return loss_unit(plan.deployment.loss)
+
+
+def loss_of_pour(plan: CampaignPlan, stage: str, scene: str, measured: PourMeasurement) -> float | None:
+    """Measured loss of a pour in its own unit; None where it is undefined (too little poured)."""
+    if plan.deployment is None or is_calibration(plan, stage, scene):
+        return normalised_spillage(measured.fractions)
+    return plan.deployment.loss(measured.fractions, loaded_mass=measured.loaded, particles=plan.parameters.particles)

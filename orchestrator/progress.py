@@ -1,0 +1,201 @@
+"""The live display in the terminal: bars for the stages, the running pour, the pool, the best so far.
+
+Goes to stderr, so that stdout stays for results. Where stderr is not a terminal (CI, a log file) it writes plain lines,
+at most one every two seconds.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from orchestrator.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    Event,
+    LogLine,
+    RequestFinished,
+    StageClosed,
+    StageOpened,
+)
+from orchestrator.plan import CampaignPlan
+from orchestrator.requests import Pour
+from orchestrator.tally import CHECKPOINT_WORDS, StageTally, Tally
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.live import Live
+
+INTERVAL = 2.0
+"""Least seconds between two plain lines of progress."""
+
+_LEVEL_STYLE = {"info": "", "warning": "yellow", "error": "bold red"}
+
+
+class ProgressDisplay:
+    """A watcher that shows a campaign in the terminal. Use as a context manager.
+
+    Args:
+        plan: of the campaign.
+        console: where to write; by default stderr.
+        clock: seconds, monotonic, for the plain lines.
+    """
+
+    def __init__(
+        self, plan: CampaignPlan, *, console: Console | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        if console is None:
+            from rich.console import Console
+
+            console = Console(stderr=True, highlight=False)
+        self._console = console
+        self._clock = clock
+        self._tally = Tally(plan)
+        self._live: Live | None = None
+        self._lock = threading.Lock()
+        self._last_line = -float("inf")
+
+    def __enter__(self) -> ProgressDisplay:
+        if self._console.is_terminal:
+            from rich.live import Live
+
+            # Rich draws in a thread of its own, four times a second, whatever the rate of events.
+            self._live = Live(console=self._console, get_renderable=self._render, refresh_per_second=4, transient=False)
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def __call__(self, event: Event) -> None:
+        """Take note of an event. Returns at once."""
+        with self._lock:
+            self._tally(event)
+        self._say(event)
+
+    def _say(self, event: Event) -> None:
+        """Lines that stay on the screen, and in plain mode the progress in between."""
+        match event:
+            case CampaignOpened():
+                goes = "goes on" if event.resumed else "begins"
+                self._print(f"{event.name} {goes}: {', '.join(event.stages)}; mode {event.mode}; {event.run_directory}")
+            case CampaignStateChanged() if event.reason:
+                self._print(f"{event.before} → {event.after}: {event.reason}")
+            case CampaignClosed():
+                self._print(f"campaign {event.state}; {self._tally.pool_line()}")
+            case LogLine():
+                self._print(event.text, _LEVEL_STYLE[event.level])
+            case _ if event.replayed:
+                return  # an earlier run has told it
+            case StageOpened() if self._live is None:
+                self._print(f"{event.stage}: stage {event.index} of {event.count}")
+            case StageClosed() if self._live is None:
+                self._print(f"{event.stage}: done")
+            case RequestFinished(request=Pour()):
+                line = self._tally.pour_line()
+                if line is not None:
+                    self._print(line)
+            case _ if self._live is None:
+                self._plain(event)
+
+    def _plain(self, event: Event) -> None:
+        now = self._clock()
+        if now - self._last_line < INTERVAL:
+            return
+        stage = self._tally.stages.get(event.stage)
+        if stage is None or stage.total == 0:
+            return
+        self._last_line = now
+        remaining = stage.remaining(event.time)
+        eta = f"  about {_duration(remaining)} left" if remaining is not None else ""
+        self._print(f"{stage.name} {stage.done}/{stage.total}  {self._tally.pool_line()}{eta}")
+
+    def _print(self, text: str, look: str = "") -> None:
+        from rich.text import Text
+
+        self._console.print(Text(text, style=look), soft_wrap=True)
+
+    def _render(self) -> RenderableType:
+        from rich.console import Group
+        from rich.text import Text
+
+        with self._lock:
+            tally = self._tally
+            rows: list[RenderableType] = [self._stages()]
+            pour = tally.pour
+            if pour is not None and not pour.result:
+                rows.append(Text(tally.pour_line() or "", style="bold"))
+                rows.append(self._pour_bar())
+            rows.append(Text(f"  {tally.pool_line()}", style="dim"))
+            return Group(*rows)
+
+    def _stages(self) -> RenderableType:
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table.grid(padding=(0, 2))
+        for stage in self._tally.stages.values():
+            waiting = stage.opened_at is None and stage.total == 0
+            done = stage.closed_at is not None
+            table.add_row(
+                Text(stage.name, style="dim" if waiting else ""),
+                ProgressBar(total=max(stage.total, 1), completed=max(stage.total, 1) if done else stage.done, width=30),
+                Text(f"{stage.done}/{stage.total}" if stage.total else "", justify="right"),
+                Text(_stage_note(stage), style="dim"),
+            )
+        return table
+
+    def _pour_bar(self) -> RenderableType:
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        pour = self._tally.pour
+        assert pour is not None
+        progress = pour.progress
+        fraction = 0.0 if progress is None else progress.fraction
+        note = [f"{100 * fraction:3.0f} %", f"{max(time.time() - pour.started_at, 0.0):.1f} s"]
+        if progress is not None and progress.tilt is not None:
+            note.append(f"tilt {progress.tilt * 57.29577951:.0f} deg")
+        if progress is not None and progress.balance is not None:
+            note.append(f"balance {progress.balance * 1e3:.1f} g")
+        table = Table.grid(padding=(0, 2))
+        table.add_row(
+            Text(
+                "  "
+                + ("starting" if progress is None else CHECKPOINT_WORDS.get(progress.checkpoint, progress.checkpoint))
+            ),
+            ProgressBar(total=1.0, completed=fraction, width=30),
+            Text("   ".join(note)),
+        )
+        return table
+
+
+def _stage_note(stage: StageTally) -> str:
+    if stage.closed_at is not None:
+        return "done"
+    if stage.opened_at is None:
+        return "" if stage.total else "waiting"
+    now = time.time()
+    remaining = stage.remaining(now)
+    spent = _duration(now - stage.opened_at)
+    return spent if remaining is None else f"{spent}, about {_duration(remaining)} left"
+
+
+def _duration(seconds: float) -> str:
+    """'8 s', '3 min 20 s', '2 h 05 min'."""
+    whole = max(round(seconds), 0)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

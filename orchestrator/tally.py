@@ -1,0 +1,223 @@
+"""What a person wants to know of a running campaign, counted from its events: no terminal, no clock of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from actors.protocols import PourProgress
+from orchestrator.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    Event,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
+from orchestrator.report.units import LossUnit, is_calibration, loss_of_pour, unit_of_pour
+from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
+
+CHECKPOINT_WORDS = {
+    "operator": "waiting for the operator",
+    "tare": "taring",
+    "approach": "moving to start",
+    "tilt": "tilting",
+    "hold": "holding",
+    "return": "returning upright",
+    "settle": "settling",
+    "weigh": "weighing",
+    "record": "recording",
+}
+
+
+@dataclass
+class StageTally:
+    """Progress of one stage.
+
+    Attributes:
+        done, total: steps.
+        opened_at, closed_at: times of these events; a replayed opening has none.
+        replayed: steps that an earlier run had done.
+    """
+
+    name: str
+    done: int = 0
+    total: int = 0
+    opened_at: float | None = None
+    closed_at: float | None = None
+    replayed: int = 0
+
+    def remaining(self, now: float) -> float | None:
+        """Estimated seconds to its end at the pace so far; None before there is a pace."""
+        fresh = self.done - self.replayed
+        if self.opened_at is None or self.closed_at is not None or fresh <= 0 or self.total <= 0:
+            return None
+        return (now - self.opened_at) / fresh * max(self.total - self.done, 0)
+
+
+@dataclass
+class PourTally:
+    """The pour that runs, or the last one."""
+
+    number: int
+    stage: str
+    scene: str
+    action: str
+    predicted: str
+    started_at: float
+    progress: PourProgress | None = None
+    result: str = ""
+
+
+@dataclass
+class Best:
+    """The smallest measured loss of a receiver, in the loss' own unit."""
+
+    loss: float
+    pour: int
+    unit: LossUnit
+
+
+@dataclass
+class Tally:
+    """Counts a campaign's events.
+
+    Attributes:
+        plan: the campaign.
+        simulators: members of the pool.
+        running: ids of simulations that run.
+        simulations, failed_simulations: finished ones.
+        simulation_seconds: wall seconds that finished simulations took, all together (replayed ones not counted).
+        timed_simulations: how many these were.
+        best: by receiver.
+    """
+
+    plan: CampaignPlan
+    mode: str = ""
+    state: str = ""
+    simulators: int = 0
+    stages: dict[str, StageTally] = field(default_factory=dict)
+    running: set[int] = field(default_factory=set)
+    simulations: int = 0
+    failed_simulations: int = 0
+    simulation_seconds: float = 0.0
+    timed_simulations: int = 0
+    pour: PourTally | None = None
+    best: dict[str, Best] = field(default_factory=dict)
+
+    def __call__(self, event: Event) -> None:
+        """Count an event."""
+        match event:
+            case CampaignOpened():
+                self.mode, self.simulators = event.mode, event.simulators
+                self.stages = {name: StageTally(name) for name in event.stages}
+            case CampaignStateChanged():
+                self.state = event.after
+            case CampaignClosed():
+                self.state = event.state
+            case StageOpened():
+                stage = self._stage(event.stage)
+                # A stage that is being replayed has no pace; the first live event starts its clock.
+                stage.opened_at = None if event.replayed else event.time
+            case StageClosed():
+                self._stage(event.stage).closed_at = event.time
+            case StrategyProgressed():
+                stage = self._stage(event.stage)
+                stage.done, stage.total = event.done, event.total
+                if event.replayed:
+                    stage.replayed = event.done
+                elif stage.opened_at is None:
+                    stage.opened_at = event.time
+                    stage.replayed = event.done
+            case RequestStarted():
+                self._started(event)
+            case RequestFinished():
+                self._finished(event)
+            case PourProgressed() if self.pour is not None:
+                self.pour.progress = event.progress
+
+    def _stage(self, name: str) -> StageTally:
+        return self.stages.setdefault(name, StageTally(name))
+
+    def _started(self, event: RequestStarted) -> None:
+        match event.request:
+            case Simulate():
+                self.running.add(event.id)
+            case Pour() as pour:
+                space = self.plan.deployment
+                if is_calibration(self.plan, event.stage, pour.scene) and self.plan.calibration is not None:
+                    names = self.plan.calibration.actions.names
+                else:
+                    names = space.actions.names if space is not None else ("angular_velocity", "x_offset")
+                predicted = ""
+                if pour.predicted is not None:
+                    unit = unit_of_pour(self.plan, event.stage, pour.scene)
+                    predicted = unit.text(pour.predicted.mean, pour.predicted.deviation)
+                self.pour = PourTally(
+                    pour.number,
+                    event.stage,
+                    pour.scene,
+                    style.display_values({name: getattr(pour.action, name) for name in names}),
+                    predicted,
+                    event.time,
+                )
+
+    def _finished(self, event: RequestFinished) -> None:
+        match event.request, event.outcome:
+            case Simulate(), outcome:
+                self.running.discard(event.id)
+                if isinstance(outcome, Simulated):
+                    self.simulations += 1
+                    if event.seconds > 0.0:
+                        self.simulation_seconds += event.seconds
+                        self.timed_simulations += 1
+                else:
+                    self.failed_simulations += 1
+            case Pour() as pour, Poured() as outcome:
+                unit = unit_of_pour(self.plan, event.stage, pour.scene)
+                loss = loss_of_pour(self.plan, event.stage, pour.scene, outcome.measurement)
+                if self.pour is not None:
+                    self.pour.result = "too little was poured" if loss is None else unit.text(loss)
+                if loss is not None and not is_calibration(self.plan, event.stage, pour.scene):
+                    best = self.best.get(pour.scene)
+                    if best is None or loss < best.loss:
+                        self.best[pour.scene] = Best(loss, pour.number, unit)
+            case Pour(), Failed() as failed:
+                if self.pour is not None:
+                    self.pour.result = f"failed: {failed.reason}"
+
+    def pool_line(self, scene: str | None = None) -> str:
+        """'pool 2/2 busy · 214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
+        parts = [f"pool {len(self.running)}/{self.simulators} busy"] if self.simulators else []
+        each = f", {self.simulation_seconds / self.timed_simulations:.1f} s each" if self.timed_simulations else ""
+        parts.append(f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}")
+        if self.failed_simulations:
+            parts.append(f"{self.failed_simulations} failed")
+        wanted = self.pour.scene if scene is None and self.pour is not None else scene
+        if wanted is not None and wanted in self.best:
+            best = self.best[wanted]
+            parts.append(f"best so far {best.unit.text(best.loss)} (pour {best.pour})")
+        return " · ".join(parts)
+
+    def pour_line(self) -> str | None:
+        """'pour 7/15 into narrow  angular velocity 41.2 deg/s, x offset 104 mm  predicted 0.80 ± 0.90 %'."""
+        pour = self.pour
+        if pour is None:
+            return None
+        total = None
+        if is_calibration(self.plan, pour.stage, pour.scene):
+            total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
+        elif self.plan.deployment is not None:
+            total = self.plan.deployment.pours
+        of = f"/{total}" if total else ""
+        line = f"pour {pour.number}{of} into {pour.scene}  {pour.action}"
+        if pour.predicted:
+            line += f"  predicted {pour.predicted}"
+        if pour.result:
+            line += f"  measured {pour.result}"
+        return line
