@@ -1,0 +1,1 @@
+"""Pure decision makers: what to simulate, pour and ask next."""

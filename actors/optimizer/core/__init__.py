@@ -1,0 +1,1 @@
+"""The optimiser itself: pure functions of a question, without Ray."""

@@ -46,14 +46,19 @@ class SuggestProblem:
         space: searched box.
         data: what was observed of the cost.
         pending: points asked for and not answered yet.
-        count: how many points are wanted.
+        count: how many points are wanted; 0 asks for `best_point`, map and predictions only.
         seed: of every random choice in the answer.
         mean: prior mean of the surrogate: 'constant' (fitted), 'zero' (the paper's), 'simulated' (posterior mean of a
             GP over `simulated`, the paper's D3).
         simulated: cheap observations of the same cost, for `mean='simulated'`.
-        acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x); 'random' and 'sobol' only draw.
+        acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
+            answer the penalised 'lcb'); 'random' and 'sobol' only draw.
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has two dimensions, the answer carries the surrogate on a square grid.
+        predict_at: further points at which the posterior is wanted (a regression, with `count=0`).
+        context: if given, the observations depend on further coordinates that nobody chooses (in calibration: the
+            action that was simulated), and what is minimised is the mean over these places of the context's unit
+            cube. The points of `data` then have `space.dimension` coordinates followed by those of the context.
     """
 
     space: Space
@@ -66,6 +71,8 @@ class SuggestProblem:
     acquisition: AcquisitionName = "lcb"
     kappa: float = 2.0
     map_resolution: int = 0
+    predict_at: tuple[Point, ...] = ()
+    context: tuple[Point, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -84,11 +91,14 @@ class Suggestion:
         points: `count` proposals in the unit cube.
         means: posterior means there; NaN-free; empty if no surrogate was fitted (too few data, or only drawn).
         deviations: posterior standard deviations of the noise-free cost there.
-        best_point: minimiser of the posterior mean over the observed points; None without a surrogate.
+        best_point: minimiser of the posterior mean over the observed points (the simulated ones while nothing else was
+            observed); None without a surrogate.
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
-        hyperparameters: fitted values by name (for people and plots).
+        hyperparameters: fitted values by name (for people and plots); 'noise' and 'signal' in the cost's unit.
         surrogate: see `SuggestProblem.map_resolution`.
+        predictions: posterior means at `SuggestProblem.predict_at`; empty without a surrogate.
+        prediction_deviations: their standard deviations.
         seconds: CPU seconds it took.
     """
 
@@ -101,3 +111,5 @@ class Suggestion:
     hyperparameters: dict[str, float] | None = None
     surrogate: SurrogateMap | None = None
     seconds: float = 0.0
+    predictions: tuple[float, ...] = ()
+    prediction_deviations: tuple[float, ...] = ()

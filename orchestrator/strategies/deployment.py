@@ -1,0 +1,284 @@
+"""What the deployment strategies share: asking, pouring, counting, reporting."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
+from orchestrator.plan import DeploymentPlan
+from orchestrator.requests import (
+    Decision,
+    Failed,
+    Outcome,
+    Pour,
+    Poured,
+    Prediction,
+    Request,
+    Simulate,
+    Slots,
+    Suggest,
+)
+from orchestrator.strategies.asking import Questions
+from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.display import described_action, displayed_action, displayed_map
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.trials import Trial, Trials
+from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import normalised_spillage
+from sim_engine.outcome import PourMeasurement
+from sim_engine.task import Scene
+
+MAX_REFUSED = 20
+"""Pours that may be refused (touching vessels) before a strategy gives up."""
+
+MAP_RESOLUTION = 25
+
+TRUST_POURS = 5
+TRUST_LIMIT = 3.0
+"""Mean |z| of the first pours above which the predictions are called untrustworthy."""
+
+
+@dataclass
+class PourTrial:
+    """A real pour: what was chosen and expected, and what came of it.
+
+    Attributes:
+        cost: what enters the data; None: nothing does.
+        status: 'pouring', 'weighed', 'refused' (an invalid action: nothing was poured) or 'failed'.
+    """
+
+    number: int
+    point: Point
+    values: dict[str, float]
+    predicted: Prediction | None
+    noise: float
+    cost: float | None = None
+    status: str = "pouring"
+    reason: str = ""
+    measurement: PourMeasurement | None = None
+
+
+class Deployment:
+    """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
+
+    An invalid action, simulated or poured, gets the worst cost; refused pours don't count against the budget of
+    pours, but only so many are tried. A pour that failed after something had moved counts, and enters the data
+    with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
+    """
+
+    NAME = ""
+
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        self._plan = plan
+        self._scene = scene
+        self._parameters = parameters
+        self._costing = Costing(plan.loss, scene, parameters)
+        self._seeds = SeedStream(seed, f"{self.NAME} {scene.name}")
+        self._questions = Questions(self._seeds)
+        self._trials = Trials()
+        self._width_known = False
+        self._pours: list[PourTrial] = []
+        self._queued_pour: Pour | None = None
+        self._pouring: Pour | None = None
+        self._final: Suggestion | None = None
+        self._latest_map: Suggestion | None = None
+        self._finished = False
+        self.decisions: list[Decision] = []
+
+    # -- asking and listening --------------------------------------------------------------------------------------
+
+    @property
+    def finished(self) -> bool:
+        """Nothing more to ask, nothing more to wait for."""
+        return self._finished and self._pouring is None and self._trials.idle
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """What is queued, and a question about what comes next as soon as its premises are known."""
+        if not self._width_known and slots.simulations > 0:
+            self._trials.width, self._width_known = slots.simulations, True
+        simulations = self._trials.issue(slots.simulations)
+        pours: list[Pour] = []
+        if self._queued_pour is not None and slots.pours > 0:
+            pours, self._pouring, self._queued_pour = [self._queued_pour], self._queued_pour, None
+        if not self._finished and not self._questions.out and not self._trials.queued and self._queued_pour is None:
+            self._next(slots.simulations - len(simulations))
+        # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
+        return [*self._questions.issue(), *pours, *simulations]
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a question, a simulation or a pour."""
+        if isinstance(request, Suggest):
+            self._questions.answer(request, outcome)
+        elif isinstance(request, Simulate):
+            self._trials.settle(request, self._costing.simulated(outcome))
+        elif request == self._pouring:
+            self._pouring = None
+            self._weigh(self._pours[-1], outcome)
+        else:
+            raise ValueError(f"this pour was not asked for: {request}")
+
+    def _next(self, free_simulations: int) -> None:
+        """Put the next question, or finish. Nothing is queued and no question is out when this is called."""
+        raise NotImplementedError
+
+    def _weigh(self, trial: PourTrial, outcome: Outcome) -> None:
+        match outcome:
+            case Poured(measurement):
+                trial.cost, trial.status, trial.measurement = self._costing.poured(measurement), "weighed", measurement
+                self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
+            case Failed("invalid_action", reason):
+                trial.cost, trial.status, trial.reason = self._costing.worst, "refused", reason
+            case Failed(kind, reason):
+                trial.cost = self._costing.worst if self._plan.on_failed_pour == "penalise" else None
+                trial.status, trial.reason = "failed", f"{kind}: {reason}"
+            case _:
+                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+
+    # -- pieces for subclasses -------------------------------------------------------------------------------------
+
+    def _simulate(self, suggestion: Suggestion, purpose: str, *, first: int = 0, repeats: int = 1) -> None:
+        """Queue simulations of the suggested points, from the `first`."""
+        for i, point in enumerate(suggestion.points[first:], start=first):
+            values = self._plan.actions.decode(point)
+            action = self._scene.action(values)
+            requests = tuple(
+                Simulate(self._scene.name, action, self._parameters, self._seeds.next(), purpose)
+                for _ in range(repeats)
+            )
+            self._trials.add(Trial(point, requests))
+            self._decide(f"simulate ({purpose})", values, suggestion, i)
+
+    def _pour(self, suggestion: Suggestion, point: Point, prediction: Prediction | None) -> None:
+        """Queue a pour."""
+        values = self._plan.actions.decode(point)
+        noise = (suggestion.hyperparameters or {}).get("noise", 0.0)
+        trial = PourTrial(self._counted + 1, point, values, prediction, noise)
+        self._pours.append(trial)
+        action = self._scene.action(values)
+        self._queued_pour = Pour(self._scene.name, action, trial.number, self._seeds.next(), prediction)
+        text = f"pour {trial.number}/{self._plan.pours}  {described_action(dict(values), self._plan.actions.names)}"
+        if prediction is None:
+            self.decisions.append(Decision(text))
+        else:
+            expected = {"mean": prediction.mean, "sd": prediction.deviation}
+            text += f"  predicted {prediction.mean:.4g} ± {prediction.deviation:.2g}"
+            self.decisions.append(Decision(text, expected))
+
+    def _pour_first(self, suggestion: Suggestion) -> None:
+        """Queue a pour of the first suggested point, with the surrogate's prediction where there is one."""
+        self._latest_map = suggestion if suggestion.surrogate is not None else self._latest_map
+        known = Prediction(suggestion.means[0], suggestion.deviations[0]) if suggestion.means else None
+        self._pour(suggestion, suggestion.points[0], known)
+
+    def _real(self) -> Data:
+        """Observations of the real cost."""
+        observed = [(p.point, p.cost) for p in self._pours if p.cost is not None]
+        return Data(tuple(point for point, _ in observed), tuple(cost for _, cost in observed))
+
+    @property
+    def _counted(self) -> int:
+        """Pours that count against the budget."""
+        return sum(p.status in ("weighed", "failed") for p in self._pours)
+
+    @property
+    def _refused(self) -> int:
+        return sum(p.status == "refused" for p in self._pours)
+
+    @property
+    def _pours_left(self) -> bool:
+        return self._counted < self._plan.pours and self._refused < MAX_REFUSED
+
+    def _conclude(self, suggestion: Suggestion) -> None:
+        self._final = suggestion
+        self._finished = True
+
+    def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
+        text = f"{what}  {described_action(dict(values), self._plan.actions.names)}"
+        if suggestion.means:
+            mean, deviation = suggestion.means[index], suggestion.deviations[index]
+            self.decisions.append(
+                Decision(f"{text}  predicted {mean:.4g} ± {deviation:.2g}", {"mean": mean, "sd": deviation})
+            )
+        else:
+            self.decisions.append(Decision(f"{text}  (no surrogate yet)"))
+
+    def _problem(self, data: Data, **changes: object) -> SuggestProblem:
+        return SuggestProblem(self._plan.actions, data, kappa=self._plan.kappa, **changes)  # type: ignore[arg-type]
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    @property
+    def best_values(self) -> dict[str, float] | None:
+        """The action to use from now on, by posterior mean [SI]; None before the end, or if nothing was learnt."""
+        if self._final is not None and self._final.best_point is not None:
+            return self._plan.actions.decode(self._final.best_point)
+        return None
+
+    def progress(self) -> tuple[int, int]:
+        """Steps done, steps in all."""
+        return self._counted, self._plan.pours
+
+    def result(self) -> dict[str, object]:
+        """What was learnt so far; actions in display units and in SI."""
+        weighed = [p for p in self._pours if p.status == "weighed" and p.cost is not None]
+        result: dict[str, object] = {
+            "strategy": self.NAME,
+            "scene": self._scene.name,
+            "loss": self._plan.loss.name,
+            "simulations": self._trials.answered,
+            "simulations_lost": self._trials.lost,
+            "pours": [self._row(p) for p in self._pours if p.status != "pouring"],
+            "refused_pours": self._refused,
+            "failed_pours": sum(p.status == "failed" for p in self._pours),
+            "trust": self._trust(weighed),
+        }
+        if weighed:
+            best = min(weighed, key=lambda p: p.cost if p.cost is not None else math.inf)
+            for name, trial in (("first", weighed[0]), ("best", best), ("latest", weighed[-1])):
+                result[f"{name}_loss"] = trial.cost
+                result[f"{name}_spillage"] = self._row(trial)["spillage"]
+        if self._refused >= MAX_REFUSED:
+            result["gave_up"] = f"{self._refused} pours were refused as invalid; the action space hardly allows any"
+        latest = self._final or self._latest_map
+        if latest is not None and latest.surrogate is not None:
+            result["map"] = displayed_map(latest.surrogate, self._plan.actions)
+        values = self.best_values
+        if values is not None and self._final is not None:
+            result |= {
+                "action": displayed_action(dict(values)),
+                "action_si": values,
+                "predicted_loss": self._final.best_mean,
+                "predicted_deviation": self._final.best_deviation,
+                "hyperparameters": self._final.hyperparameters,
+            }
+        return result
+
+    def _row(self, trial: PourTrial) -> dict[str, object]:
+        weighed = trial.measurement
+        return {
+            "number": trial.number,
+            "status": trial.status,
+            "reason": trial.reason,
+            "action": displayed_action(dict(trial.values)),
+            "action_si": trial.values,
+            "predicted": None if trial.predicted is None else trial.predicted.mean,
+            "predicted_deviation": None if trial.predicted is None else trial.predicted.deviation,
+            "loss": trial.cost,
+            "spillage": None if weighed is None else normalised_spillage(weighed.fractions),
+            "spilled_g": None if weighed is None else weighed.spilled * 1e3,
+            "retained_g": None if weighed is None else weighed.retained * 1e3,
+        }
+
+    def _trust(self, weighed: list[PourTrial]) -> dict[str, object]:
+        """How far the first pours were from what was predicted, in predicted deviations (noise included).
+
+        A prior from an untrustworthy simulation makes D3 worse than no prior at all, so people should be told.
+        """
+        scores = []
+        for trial in weighed[:TRUST_POURS]:
+            if trial.predicted is not None and trial.cost is not None:
+                spread = math.hypot(trial.predicted.deviation, trial.noise)
+                scores.append((trial.cost - trial.predicted.mean) / max(spread, 1e-9))
+        mean = sum(map(abs, scores)) / len(scores) if scores else None
+        return {"z_scores": scores, "alarm": bool(len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)}

@@ -1,0 +1,68 @@
+"""D1: plan in simulation only."""
+
+from __future__ import annotations
+
+import math
+
+from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
+from orchestrator.requests import Prediction
+from orchestrator.strategies.deployment import MAP_RESOLUTION, Deployment
+
+
+class OneShotPlanning(Deployment):
+    """D1: minimise the simulated loss, then pour once. Needs no sensor.
+
+    Bayesian optimisation of f̄_s(a) = 1/m1 Σ_j f_s(a, seed_j), with m1 simulations an iteration, started at Sobol points
+    in place of random ones. The last iteration simulates the minimiser of the posterior mean over the whole box;
+    what is recommended, and poured if there is a budget for it, is the best simulated action by posterior mean: an
+    action that was at least tried in simulation, and not merely the luckiest.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D1); that m1 simulations are averaged is our reading.
+    Limitations: an error of the simulator is an error of the plan.
+    """
+
+    NAME = "D1"
+
+    def _next(self, free_simulations: int) -> None:
+        done, wanted = len(self._trials), max(self._plan.iterations, 1)
+        repeats = max(self._plan.simulations_per_iteration, 1)
+        if self._width_known and self._trials.all == []:
+            # slots count simulations, a trial takes `repeats` of them
+            self._trials.width = math.ceil(self._trials.width / repeats)
+
+        def simulate(suggestion: Suggestion) -> None:
+            self._simulate(suggestion, "plan", repeats=repeats)
+
+        if self._final is not None:
+            self._finished = self._pouring is None  # the one pour has been weighed
+        elif done == 0:
+            count = min(max(self._plan.initial, 1), max(wanted - 1, 1))
+            self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
+        elif done < wanted - 1:
+            if self._trials.ready:
+                self._questions.put(self._model(), "plan", simulate)
+        elif done < wanted:
+            if self._trials.idle:
+                self._questions.put(self._model(everything=True, acquisition="posterior_minimum"), "plan", simulate)
+        elif self._trials.idle:
+            problem = self._model(everything=True, count=0, map_resolution=MAP_RESOLUTION)
+            self._questions.put(problem, "conclude", self._recommend)
+
+    def _model(self, *, everything: bool = False, **changes: object) -> SuggestProblem:
+        data = self._trials.data(everything=everything)
+        return self._problem(data, pending=self._trials.pending(everything=everything), **changes)
+
+    def _recommend(self, suggestion: Suggestion) -> None:
+        self._final = suggestion
+        if suggestion.best_point is None or suggestion.best_mean is None or suggestion.best_deviation is None:
+            self._finished = True  # too few simulations succeeded; the result says how many were lost
+        elif self._plan.pours < 1:
+            self._finished = True
+        else:
+            self._pour(suggestion, suggestion.best_point, Prediction(suggestion.best_mean, suggestion.best_deviation))
+
+    def progress(self) -> tuple[int, int]:
+        """Simulations and pours done, and in all."""
+        repeats = max(self._plan.simulations_per_iteration, 1)
+        pours = 1 if self._plan.pours else 0
+        return self._trials.answered + self._counted, max(self._plan.iterations, 1) * repeats + pours

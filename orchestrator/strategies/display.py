@@ -1,0 +1,44 @@
+"""Actions and surrogate maps as results show them: units in the keys, JSON-ready."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from actors.optimizer.core.problem import SurrogateMap
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.space import Space
+
+_SUFFIX = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}
+
+
+def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Action dimensions [SI] in the units that people read: {'angular_velocity_deg_s': 41.2, …}."""
+    shown: dict[str, float | None] = {}
+    for name, value in values.items():
+        dimension = ACTION_DIMENSIONS[name]
+        shown[f"{name}_{_SUFFIX[dimension.display_unit]}"] = None if value is None else value / dimension.factor
+    return shown
+
+
+def described_action(values: Mapping[str, float | None], names: tuple[str, ...]) -> str:
+    """For a log line: 'angular_velocity 41.2 deg/s  x_offset 104 mm'."""
+    parts = []
+    for name in names:
+        value, dimension = values[name], ACTION_DIMENSIONS[name]
+        parts.append(
+            f"{name} —" if value is None else f"{name} {value / dimension.factor:.4g} {dimension.display_unit}"
+        )
+    return "  ".join(parts)
+
+
+def displayed_map(surrogate: SurrogateMap | None, space: Space) -> dict[str, object] | None:
+    """A 2-D surrogate with its axes' values [SI]: row i of mean and deviation is the second axis' i-th value."""
+    if surrogate is None:
+        return None
+    size = len(surrogate.mean)
+    places = [i / (size - 1) if size > 1 else 0.5 for i in range(size)]
+    return {
+        "axes": {axis.name: [axis.decode(u) for u in places] for axis in space.axes},
+        "mean": [list(row) for row in surrogate.mean],
+        "deviation": [list(row) for row in surrogate.deviation],
+    }

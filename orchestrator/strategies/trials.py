@@ -1,0 +1,124 @@
+"""Simulated trials in the order in which they were asked for, so that decisions don't depend on who finishes first."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from actors.optimizer.core.problem import Data, Point
+from orchestrator.requests import Simulate
+
+
+@dataclass
+class Trial:
+    """One searched point and the simulations that judge it.
+
+    Attributes:
+        point: in the searched space's unit cube.
+        requests: to be averaged over.
+        costs: of each request: a number, None if it came to nothing; missing while its answer is out.
+        context: further coordinates of the observation; see `SuggestProblem.context`.
+    """
+
+    point: Point
+    requests: tuple[Simulate, ...]
+    context: Point = ()
+    costs: dict[int, float | None] = field(default_factory=dict)
+
+    @property
+    def closed(self) -> bool:
+        """All answers are in."""
+        return len(self.costs) == len(self.requests)
+
+    @property
+    def cost(self) -> float | None:
+        """Mean cost of the simulations that gave one; None if none did."""
+        known = [cost for _, cost in sorted(self.costs.items()) if cost is not None]
+        return sum(known) / len(known) if known else None
+
+
+class Trials:
+    """A window of trials: simulations run several at a time, their outcomes count in the order of asking.
+
+    With `width` trials in flight, trial t is chosen from the outcomes of the trials up to t − width; later ones are
+    pending even if they have been answered. So the requests of a seeded campaign depend on no stopwatch.
+    """
+
+    def __init__(self) -> None:
+        self.width = 1
+        self.all: list[Trial] = []
+        self._unissued: deque[tuple[int, int]] = deque()
+        self._open: dict[Simulate, deque[tuple[int, int]]] = {}
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    def add(self, trial: Trial) -> None:
+        """Queue a trial's simulations."""
+        self._unissued.extend((len(self.all), i) for i in range(len(trial.requests)))
+        self.all.append(trial)
+
+    def issue(self, limit: int) -> list[Simulate]:
+        """The next simulations to ask for, at most `limit`."""
+        issued = []
+        for _ in range(min(limit, len(self._unissued))):
+            trial, index = self._unissued.popleft()
+            request = self.all[trial].requests[index]
+            self._open.setdefault(request, deque()).append((trial, index))
+            issued.append(request)
+        return issued
+
+    def settle(self, request: Simulate, cost: float | None) -> Trial:
+        """Enter what came of a simulation (None: nothing).
+
+        Raises:
+            ValueError: it was not asked for, or has been answered already.
+        """
+        waiting = self._open.get(request)
+        if not waiting:
+            raise ValueError(f"this simulation was not asked for, or has been answered already: {request}")
+        trial, index = waiting.popleft()
+        if not waiting:
+            del self._open[request]
+        self.all[trial].costs[index] = cost
+        return self.all[trial]
+
+    @property
+    def idle(self) -> bool:
+        """Nothing queued and nothing in flight."""
+        return not self._unissued and not self._open
+
+    @property
+    def queued(self) -> bool:
+        """Simulations wait to be asked for."""
+        return bool(self._unissued)
+
+    @property
+    def ready(self) -> bool:
+        """Everything that the choice of the next trial depends on has been answered."""
+        return not self._unissued and all(trial.closed for trial in self.all[: self._horizon])
+
+    @property
+    def _horizon(self) -> int:
+        return max(0, len(self.all) - self.width + 1)
+
+    def data(self, *, everything: bool = False) -> Data:
+        """Observations that the next choice may use; `everything`: all answers that are in."""
+        trials = self.all if everything else self.all[: self._horizon]
+        observed = [(t, cost) for t in trials if t.closed and (cost := t.cost) is not None]
+        return Data(tuple((*t.point, *t.context) for t, _ in observed), tuple(cost for _, cost in observed))
+
+    def pending(self, *, everything: bool = False) -> tuple[Point, ...]:
+        """Points whose answers are out, or don't count yet."""
+        trials = self.all if everything else self.all[self._horizon :]
+        return tuple(t.point for t in trials if not (everything and t.closed))
+
+    @property
+    def answered(self) -> int:
+        """Simulations answered."""
+        return sum(len(trial.costs) for trial in self.all)
+
+    @property
+    def lost(self) -> int:
+        """Simulations that came to nothing."""
+        return sum(cost is None for trial in self.all for cost in trial.costs.values())
