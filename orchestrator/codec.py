@@ -159,7 +159,7 @@ def from_json(data: Any, hint: Any = Any) -> Any:
 
 def _dataclass_from_json(data: Any, hint: type[Any]) -> Any:
     _expect(data, dict)
-    hints = _fields(hint)
+    hints = _fields(typing.cast(typing.Hashable, hint))
     if unknown := set(data) - set(hints) - {_TYPE}:
         raise CodecError(
             f"{hint.__name__} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"

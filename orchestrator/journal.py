@@ -22,6 +22,7 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from orchestrator.codec import canonical, digest, first_difference
+from orchestrator.errors import RunError
 from orchestrator.states import State
 
 FORMAT = 1
@@ -68,7 +69,7 @@ class Kind(StrEnum):
 _DURABLE = frozenset({Kind.POUR_STARTED, Kind.POUR_FINISHED, Kind.OPERATOR_ANSWERED})
 
 
-class JournalError(Exception):
+class JournalError(RunError):
     """The journal can't be used; the text says why and what to do."""
 
 

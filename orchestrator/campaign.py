@@ -1,0 +1,299 @@
+"""Runs the stages of a campaign on a laboratory, and resumes them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from actors.protocols import Laboratory
+from orchestrator.errors import RunError
+from orchestrator.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    StageClosed,
+    StageOpened,
+    Watcher,
+    Watchers,
+)
+from orchestrator.fingerprint import fingerprint
+from orchestrator.journal import JOURNAL_NAME, Header, Journal, JournalReader, Kind
+from orchestrator.lanes import Deadlines, LaneError, Lanes
+from orchestrator.plan import CampaignPlan
+from orchestrator.replay import StageHistory, read_history
+from orchestrator.runs import write_provenance
+from orchestrator.scheduler import StageScheduler
+from orchestrator.stages import StageDefinition, scenes_of, stage_seed, stages_of
+from orchestrator.states import RESTING, State, check_transition
+from orchestrator.unknown import AskOperator, settle_unknown_pours
+
+
+@dataclass(frozen=True)
+class CampaignResult:
+    """What a campaign came to.
+
+    Attributes:
+        results: of the closed stages by name, in order.
+        simulations: finished ones, failed ones included.
+        pours: finished ones, failed ones included.
+        cpu_s: CPU seconds of all simulations and suggestions.
+        seconds: wall time of this process' part of the run.
+    """
+
+    name: str
+    directory: Path
+    state: State
+    results: dict[str, dict[str, Any]] = field(default_factory=dict)
+    simulations: int = 0
+    pours: int = 0
+    cpu_s: float = 0.0
+    seconds: float = 0.0
+
+
+async def run_campaign(
+    plan: CampaignPlan,
+    laboratory: Laboratory,
+    run_directory: Path,
+    *,
+    resume: bool = False,
+    watchers: Sequence[Watcher] = (),
+    ask_operator: AskOperator | None = None,
+    stages: Sequence[StageDefinition] | None = None,
+    deadlines: Deadlines | None = None,
+) -> CampaignResult:
+    """Run a campaign to its end, or go on with one.
+
+    Cancelling the awaiting task pauses the run: simulations are dropped, a pour that has begun is finished and
+    weighed, then `asyncio.CancelledError` is raised. Cancelling it again gives the pour up, too; it is UNKNOWN then.
+
+    Args:
+        laboratory: not opened yet; it is opened here, after everything that can be checked without it was, and closed.
+        run_directory: where the journal is, or will be.
+        resume: go on with the journal in `run_directory`; without, there must be none.
+        ask_operator: asked about pours whose outcome is unknown; None if nobody is there.
+        stages: in place of those that the plan asks for.
+        deadlines: other than the usual ones.
+
+    Raises:
+        RunError: the run can't begin or go on: another process runs it (JournalLockedError), its journal doesn't fit
+            (JournalError, ReplayError), a person is needed (OperatorNeededError), the laboratory or a strategy fails.
+        LaboratoryError: the laboratory can't be opened.
+    """
+    run = _Run(
+        plan,
+        laboratory,
+        run_directory,
+        Watchers(watchers),
+        ask_operator,
+        tuple(stages_of(plan) if stages is None else stages),
+        deadlines or Deadlines(),
+    )
+    return await run.run(resume)
+
+
+class _Run:
+    """One process' part of a campaign's run."""
+
+    def __init__(
+        self,
+        plan: CampaignPlan,
+        laboratory: Laboratory,
+        directory: Path,
+        watchers: Watchers,
+        ask_operator: AskOperator | None,
+        stages: tuple[StageDefinition, ...],
+        deadlines: Deadlines,
+    ) -> None:
+        self._plan = plan
+        self._laboratory = laboratory
+        self._directory = directory
+        self._watchers = watchers
+        self._ask_operator = ask_operator
+        self._stages = stages
+        self._deadlines = deadlines
+        self._scenes = scenes_of(plan)
+        self._state = State.QUEUED
+        self._unknown_pours = False
+        self._begin = time.monotonic()
+        names = [stage.name for stage in stages]
+        if not names or len(set(names)) != len(names):
+            raise RunError(f"a campaign needs stages with different names, got: {', '.join(names) or 'none'}")
+
+    async def run(self, resume: bool) -> CampaignResult:
+        path, header = self._directory / JOURNAL_NAME, Header(self._plan.name, fingerprint(self._plan))
+        self._journal = Journal.resume(path, header) if resume else Journal.create(path, header)
+        try:
+            if not resume:
+                write_provenance(self._directory, self._plan)
+            self._state = self._journal.state()
+            if self._state is State.FINISHED:
+                return self._close()
+            try:
+                await self._run_stages(resume)
+            except asyncio.CancelledError:
+                if not self._is_finished():
+                    self._come_to_rest(State.PAUSED, "paused on request")
+                raise
+            except Exception as error:
+                if self._is_finished():  # the results are safe; only the tidying up went wrong
+                    self._watchers.log("warning", f"while closing the laboratory: {error}")
+                else:
+                    self._come_to_rest(State.FAILED, f"{type(error).__name__}: {error}")
+                    raise
+            return self._close()
+        finally:
+            self._journal.close()
+
+    async def _run_stages(self, resume: bool) -> None:
+        histories = {stage.name: read_history(self._journal, stage.name) for stage in self._stages}
+        self._unknown_pours = any(history.unknown_pours() for history in histories.values())
+        if self._state not in RESTING:
+            found = State.UNKNOWN if self._unknown_pours else State.PAUSED
+            self._enter(found, "found interrupted: its process ended without a word")
+        self._enter(State.PREPARING, "resumed" if resume else "begun")
+        for stage in self._stages:
+            if histories[stage.name].unknown_pours():
+                histories[stage.name] = await self._settle(stage, histories[stage.name])
+        async with self._laboratory as laboratory:
+            self._check_bench(laboratory, histories)
+            lanes = Lanes(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
+            opened = CampaignOpened(
+                name=self._plan.name,
+                run_directory=self._directory,
+                stages=tuple(stage.name for stage in self._stages),
+                mode=laboratory.bench.mode if laboratory.bench is not None else "none",
+                simulators=laboratory.simulators.size,
+                resumed=resume,
+            )
+            self._watchers.emit(opened)
+            self._enter(State.RUNNING)
+            results: dict[str, Mapping[str, Any]] = {}
+            for index, stage in enumerate(self._stages, start=1):
+                results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, lanes)
+            self._enter(State.FINISHED)
+
+    async def _run_stage(
+        self,
+        stage: StageDefinition,
+        index: int,
+        history: StageHistory,
+        results: Mapping[str, Mapping[str, Any]],
+        lanes: Lanes,
+    ) -> dict[str, Any]:
+        done = history.result is not None
+        opened = StageOpened(
+            stage=stage.name,
+            index=index,
+            count=len(self._stages),
+            resumed=history.seed is not None,
+            replayed=done,
+        )
+        self._watchers.emit(opened)
+        if history.result is not None:
+            self._watchers.emit(StageClosed(stage=stage.name, replayed=True, result=history.result))
+            return history.result
+        seed = stage_seed(self._plan.seed, stage.name)
+        if history.seed is None:
+            self._journal.append(Kind.STAGE_OPENED, {"seed": seed}, stage=stage.name)
+        scheduler = StageScheduler(
+            stage.name,
+            stage.build(results, seed),
+            journal=self._journal,
+            lanes=lanes,
+            watchers=self._watchers,
+            capacity=self._plan.parallel_simulations,
+            order=stage.order,
+            recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.record_rate > 0.0 else 0,
+            on_pausing=lambda reason: self._enter(State.PAUSING, reason),
+            on_stopping=lambda reason: self._enter(State.STOPPING, reason),
+        )
+        scheduler.restore(history)
+        try:
+            result = await scheduler.run()
+        finally:
+            self._unknown_pours = bool(scheduler.unknown_pours)
+        self._watchers.emit(StageClosed(stage=stage.name, result=result))
+        return result
+
+    async def _settle(self, stage: StageDefinition, history: StageHistory) -> StageHistory:
+        await settle_unknown_pours(
+            self._journal,
+            history,
+            stage.name,
+            plan=self._plan,
+            scenes=self._scenes,
+            ask=self._ask_operator,
+            on_waiting=lambda question: self._enter(State.WAITING_FOR_OPERATOR, question),
+        )
+        if self._state is State.WAITING_FOR_OPERATOR:
+            self._enter(State.PREPARING, "answered")
+        self._unknown_pours = False
+        return read_history(self._journal, stage.name)
+
+    def _check_bench(self, laboratory: Laboratory, histories: Mapping[str, StageHistory]) -> None:
+        needing = [s.name for s in self._stages if s.pours and histories[s.name].result is None]
+        if not needing:
+            return
+        if laboratory.bench is None:
+            raise LaneError(
+                f"stage {needing[0]} pours, but the laboratory '{self._plan.laboratory.name}' has no bench; add one to "
+                "its file, or calibrate on records"
+            )
+        if laboratory.bench.mode != self._plan.laboratory.mode:
+            raise LaneError(
+                f"the plan is for a {self._plan.laboratory.mode} bench, but the laboratory's is {laboratory.bench.mode}"
+            )
+
+    def _enter(self, state: State, reason: str = "") -> None:
+        if state is self._state:
+            return
+        check_transition(self._state, state)
+        before, self._state = self._state, state
+        body = {"before": str(before), "after": str(state), "reason": reason, "pid": os.getpid()}
+        self._journal.append(Kind.CAMPAIGN_STATE, body)
+        self._watchers.emit(CampaignStateChanged(before=str(before), after=str(state), reason=reason))
+
+    def _is_finished(self) -> bool:
+        return self._state is State.FINISHED
+
+    def _come_to_rest(self, state: State, reason: str) -> None:
+        self._enter(State.UNKNOWN if self._unknown_pours else state, reason)
+        self._watchers.emit(CampaignClosed(state=str(self._state), results=self._journal.stage_results()))
+
+    def _close(self) -> CampaignResult:
+        result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)
+        self._watchers.emit(CampaignClosed(state=str(result.state), results=result.results))
+        return result
+
+
+def read_result(journal: JournalReader, directory: Path, *, seconds: float = 0.0) -> CampaignResult:
+    """What the journal of a run, finished or not, says it came to."""
+    simulations = pours = 0
+    cpu_s = 0.0
+    for entry in journal.entries(kinds=[Kind.FINISHED, Kind.POUR_FINISHED]):
+        outcome = entry.body["outcome"]
+        match outcome["type"]:
+            case "Suggested":
+                cpu_s += outcome["suggestion"]["seconds"]
+                continue
+            case "Simulated":
+                cpu_s += outcome["outcome"]["cpu_s"]
+        if entry.kind == Kind.POUR_FINISHED:
+            pours += 1
+        else:
+            simulations += 1
+    return CampaignResult(
+        journal.header.name,
+        directory,
+        journal.state(),
+        journal.stage_results(),
+        simulations,
+        pours,
+        cpu_s,
+        seconds,
+    )

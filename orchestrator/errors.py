@@ -1,0 +1,13 @@
+"""The base of what may end a run, and the exit codes that people and scripts see."""
+
+from __future__ import annotations
+
+
+class RunError(Exception):
+    """A run can't begin or go on. The text is for the person who can mend it.
+
+    Attributes:
+        exit_code: of the command line: 1 failed, 3 an answer of a person is needed.
+    """
+
+    exit_code = 1

@@ -1,0 +1,42 @@
+"""What of a plan decides which requests are made: a run may only be resumed with the same."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, cast
+
+from orchestrator.codec import to_json
+from orchestrator.plan import CampaignPlan
+from sim_engine.vessel.spec import MeshShape
+
+_FREE = ("source", "outputs", "resolved", "on_unknown")
+"""Fields of a plan that may be changed between two parts of a run."""
+
+_MACHINE = ("simulators", "in_process", "object_store_mb")
+"""Fields of a laboratory that belong to the machine, not to the campaign."""
+
+
+def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
+    """JSON-ready copy of everything that matters; meshes by content, so that the project may be moved.
+
+    Raises:
+        OSError: a mesh file can't be read.
+    """
+    data = cast("dict[str, Any]", to_json(plan, CampaignPlan))
+    for name in _FREE:
+        data.pop(name, None)
+    for name in _MACHINE:
+        data["laboratory"].pop(name, None)
+    return cast("dict[str, Any]", _by_content(data))
+
+
+def _by_content(data: Any) -> Any:
+    if isinstance(data, list):
+        return [_by_content(value) for value in data]
+    if not isinstance(data, dict):
+        return data
+    if data.get("kind") == "mesh" and set(data) == set(MeshShape.model_fields):
+        return {**data, "path": hashlib.sha256(Path(data["path"]).read_bytes()).hexdigest()}
+    # Where records came from does not matter: they are in the plan.
+    return {key: _by_content(value) for key, value in data.items() if key != "path"}

@@ -1,0 +1,160 @@
+"""How one request is run on the laboratory: scenes, deadlines, and what counts as an answer.
+
+Three lanes: the real one of width one (there is one arm), the optimiser's of width one, and that of simulations, whose
+width is the number of free slots that strategies are shown.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from actors.protocols import (
+    Bench,
+    Frames,
+    InvalidActionError,
+    Laboratory,
+    LaboratoryError,
+    ProgressCallback,
+    SimulationError,
+)
+from orchestrator.errors import RunError
+from orchestrator.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
+from sim_engine.task import PourTask, Scene
+
+
+class LaneError(RunError):
+    """The laboratory can't serve the campaign any longer, or was asked for something it can't know."""
+
+
+@dataclass(frozen=True)
+class Deadlines:
+    """When a request that has not answered is given up [s of wall time].
+
+    Attributes:
+        simulate: time in the pool's queue included. A pour of 50 000 particles takes minutes on one core; half an
+            hour means that the pool is dead, not slow.
+        suggest: a fit to some hundred points takes seconds.
+        pour: 90 s in a laboratory, but an operator may be fetched from another room first. After it the outcome is
+            not waited for and the pour counts as failed.
+        pour_grace: how long a pause waits for a pour that has begun.
+        cleanup: how long cancelled requests may take to let go.
+    """
+
+    simulate: float = 1800.0
+    suggest: float = 300.0
+    pour: float = 3600.0
+    pour_grace: float = 300.0
+    cleanup: float = 20.0
+
+
+class Lanes:
+    """Runs requests on a laboratory; turns what may go wrong with one of them into its outcome."""
+
+    def __init__(
+        self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, record_rate: float
+    ) -> None:
+        self._laboratory = laboratory
+        self._scenes = scenes
+        self.deadlines = deadlines
+        self._record_rate = record_rate
+        self._real = asyncio.Lock()
+        self._optimiser = asyncio.Lock()
+
+    async def simulate(
+        self, request: Simulate, *, record: bool, started: Callable[[], None]
+    ) -> tuple[Outcome, Frames | None]:
+        """Run a simulation.
+
+        Args:
+            record: whether frames are kept; changes nothing about the outcome.
+            started: called when it is handed to the pool.
+        """
+        rate = self._record_rate if record else 0.0
+        task = PourTask(self._scene(request.scene), request.action, request.parameters, request.seed, record_rate=rate)
+        started()
+        try:
+            async with asyncio.timeout(self.deadlines.simulate):
+                result = await self._laboratory.simulators.simulate(task)
+        except InvalidActionError as error:
+            return Failed("invalid_action", str(error)), None
+        except SimulationError as error:
+            _raise_if_cancelled()
+            return Failed("simulation", str(error)), None
+        except TimeoutError:
+            return Failed("simulation", f"no result within {self.deadlines.simulate:g} s"), None
+        if result.outcome.invalid is not None:
+            return Failed("simulation", result.outcome.invalid), result.frames
+        return Simulated(result.outcome), result.frames
+
+    async def pour(self, request: Pour, *, started: Callable[[], None], progress: ProgressCallback) -> Outcome:
+        """Pour once.
+
+        Args:
+            started: called when nothing stands between the request and the arm any more; must have made a durable
+                record of it when it returns.
+            progress: handed to the bench.
+
+        Raises:
+            LaneError: there is no bench.
+        """
+        bench, scene = self.bench, self._scene(request.scene)
+        async with self._real:
+            started()
+            try:
+                async with asyncio.timeout(self.deadlines.pour):
+                    measurement = await bench.pour(scene, request.action, seed=request.seed, progress=progress)
+            except InvalidActionError as error:
+                return Failed("invalid_action", str(error))
+            except LaboratoryError as error:
+                _raise_if_cancelled()
+                return Failed("pour_failed", str(error))
+            except TimeoutError:
+                return Failed("pour_failed", f"not weighed within {self.deadlines.pour:g} s")
+        return Poured(measurement)
+
+    async def suggest(
+        self, request: Suggest, *, started: Callable[[], None], retrying: Callable[[str], None]
+    ) -> Outcome:
+        """Ask the optimiser, twice if need be: the question is idempotent, and an actor may die of bad luck once.
+
+        Raises:
+            LaneError: it failed twice. Nothing is made up in its place.
+        """
+        async with self._optimiser:
+            started()
+            for attempt in (1, 2):
+                try:
+                    async with asyncio.timeout(self.deadlines.suggest):
+                        return Suggested(await self._laboratory.optimizer.suggest(request.problem))
+                except Exception as error:
+                    reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+                    if attempt == 2:
+                        raise LaneError(
+                            f"the optimiser failed twice on the same question ({reason}); nothing is lost: mend the "
+                            "cause and resume the run"
+                        ) from error
+                    retrying(f"the optimiser failed ({reason}); it is asked once more")
+        raise AssertionError("unreachable")
+
+    @property
+    def bench(self) -> Bench:
+        """The bench. Raises LaneError if there is none."""
+        if self._laboratory.bench is None:
+            raise LaneError("a pour is asked for, but this laboratory has no bench; add one to the laboratory's file")
+        return self._laboratory.bench
+
+    def _scene(self, name: str) -> Scene:
+        try:
+            return self._scenes[name]
+        except KeyError:
+            known = ", ".join(sorted(self._scenes)) or "none"
+            raise LaneError(f"a request names the scene '{name}', but the plan has {known}") from None
+
+
+def _raise_if_cancelled() -> None:
+    """An error that comes of our own cancelling says nothing about the request: it has no outcome."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError

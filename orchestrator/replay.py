@@ -1,0 +1,137 @@
+"""Resuming a stage: a fresh strategy is asked and told what the journal says the interrupted one was asked and told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from orchestrator.codec import canonical, decode_outcome, decode_request, encode_request, first_difference
+from orchestrator.errors import RunError
+from orchestrator.journal import JournalReader, Kind
+from orchestrator.requests import Outcome, Request, Slots
+from orchestrator.strategies.protocol import Strategy
+
+
+class ReplayError(RunError):
+    """The strategy doesn't ask again for what the journal says it asked for."""
+
+
+@dataclass(frozen=True)
+class AskedStep:
+    """The strategy was asked, with these slots, and answered with these requests."""
+
+    slots: Slots
+    ids: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ToldStep:
+    """The strategy was told the outcome of a request."""
+
+    id: int
+    t: float
+
+
+@dataclass
+class StageHistory:
+    """What the journal knows of one stage.
+
+    Attributes:
+        seed: of the stage; None if it was never opened.
+        steps: asks and tells in their order.
+        requests: JSON of each request by id, in the order in which they were asked for.
+        outcomes: outcome by id, in the order in which they were finished.
+        started: ids that had begun to run at least once.
+        pour_attempts: how often each pour was begun.
+        decisions: number of decisions written.
+        result: of a closed stage.
+    """
+
+    seed: int | None = None
+    steps: list[AskedStep | ToldStep] = field(default_factory=list)
+    requests: dict[int, dict[str, Any]] = field(default_factory=dict)
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+    started: set[int] = field(default_factory=set)
+    pour_attempts: dict[int, int] = field(default_factory=dict)
+    decisions: int = 0
+    result: dict[str, Any] | None = None
+
+    @property
+    def ask_is_due(self) -> bool:
+        """Whether the strategy was told something (or nothing at all happened) since it was asked last."""
+        return not self.steps or isinstance(self.steps[-1], ToldStep)
+
+    def request(self, key: int) -> Request:
+        """The request of that id."""
+        return decode_request(self.requests[key])
+
+    def unknown_pours(self) -> list[int]:
+        """Pours that had begun and have no outcome."""
+        return [key for key in self.pour_attempts if key not in self.outcomes]
+
+
+def read_history(journal: JournalReader, stage: str) -> StageHistory:
+    """Everything that the journal holds about a stage."""
+    history = StageHistory()
+    for entry in journal.entries(stage=stage):
+        body = entry.body
+        match entry.kind:
+            case Kind.STAGE_OPENED:
+                history.seed = body["seed"]
+            case Kind.ASKED:
+                history.steps.append(AskedStep(Slots(body["simulations"], body["pours"]), tuple(body["ids"])))
+            case Kind.REQUESTED:
+                history.requests[body["id"]] = body["request"]
+            case Kind.STARTED:
+                history.started.add(body["id"])
+            case Kind.POUR_STARTED:
+                history.started.add(body["id"])
+                history.pour_attempts[body["id"]] = body["attempt"]
+            case Kind.FINISHED | Kind.POUR_FINISHED:
+                history.outcomes[body["id"]] = decode_outcome(body["outcome"])
+            case Kind.TOLD:
+                history.steps.append(ToldStep(body["id"], entry.t))
+            case Kind.DECISION:
+                history.decisions += 1
+            case Kind.STAGE_CLOSED:
+                history.result = body["result"]
+    return history
+
+
+def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, Request]:
+    """Bring a fresh strategy to where the journal ends.
+
+    Returns:
+        The requests that it has not been told the outcome of, by id, in the order in which they were asked for.
+
+    Raises:
+        ReplayError: it asks for something else than the journal says.
+    """
+    untold: dict[int, Request] = {}
+    for step in history.steps:
+        if isinstance(step, ToldStep):
+            strategy.tell(untold.pop(step.id), history.outcomes[step.id])
+            continue
+        requests = strategy.ask(step.slots)
+        for key, request in zip(step.ids, requests, strict=False):
+            _check_same(history.requests[key], encode_request(request), key, stage)
+            untold[key] = request
+        if len(requests) != len(step.ids):
+            raise ReplayError(
+                f"stage {stage}: the journal has {len(step.ids)} request(s) from {step.ids[:1] or 'none'} on, "
+                f"the replayed strategy asks for {len(requests)}. {_ADVICE}"
+            )
+    return untold
+
+
+_ADVICE = (
+    "The program or its numerical libraries have changed since the run began; go on with the versions written in "
+    "versions.json beside the journal, or begin a new run"
+)
+
+
+def _check_same(written: dict[str, Any], now: dict[str, Any], key: int, stage: str) -> None:
+    if canonical(written) != canonical(now):
+        raise ReplayError(
+            f"stage {stage}: request {key} differs from the journal's at {first_difference(written, now)}. {_ADVICE}"
+        )

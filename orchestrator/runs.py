@@ -1,0 +1,106 @@
+"""Run directories: their names, what is kept in them beside the journal, and how an unfinished one is found again."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import re
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from orchestrator.codec import digest, to_json
+from orchestrator.fingerprint import fingerprint
+from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader
+from orchestrator.plan import CampaignPlan
+from orchestrator.states import State
+
+
+class RunNotFoundError(JournalError):
+    """There is no run to resume."""
+
+
+def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
+    """Make the directory of a new run: ROOT/NAME-DATE-N, N counting the day's runs.
+
+    Args:
+        root: where runs are kept; the plan's output directory if not given.
+    """
+    parent = root or plan.outputs.directory
+    parent.mkdir(parents=True, exist_ok=True)
+    stem = f"{plan.name}-{time.strftime('%Y%m%d')}"
+    number = 1 + max(
+        (int(m[1]) for p in parent.iterdir() if (m := re.fullmatch(rf"{re.escape(stem)}-(\d+)", p.name))), default=0
+    )
+    while True:
+        directory = parent / f"{stem}-{number}"
+        try:
+            directory.mkdir()  # two runs begun at the same moment get two directories
+            return directory
+        except FileExistsError:
+            number += 1
+
+
+def write_provenance(directory: Path, plan: CampaignPlan) -> None:
+    """Keep with the run what is needed to reproduce it: resolved.json (the plan) and versions.json."""
+    resolved = plan.resolved or to_json(plan, CampaignPlan)
+    _write_json(directory / "resolved.json", resolved)
+    _write_json(directory / "versions.json", {"campaign": str(plan.source), "seed": plan.seed, **versions()})
+
+
+def versions() -> dict[str, Any]:
+    """Versions of Python, platform, Decant and what it is built on."""
+    packages: dict[str, str] = {}
+    names = ["decant"]
+    try:
+        names += [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in importlib.metadata.requires("decant") or []]
+    except importlib.metadata.PackageNotFoundError:
+        names += ["numpy", "scipy", "scikit-learn", "taichi", "ray", "trimesh"]
+    for name in names:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            packages[name] = "not installed"
+    return {
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        "packages": packages,
+    }
+
+
+def find_run(plan: CampaignPlan, run_id: str | None = None, root: Path | None = None) -> Path:
+    """The run to resume: the one named, or the campaign's newest unfinished one.
+
+    Among several, one that was begun with the same settings is preferred; if there is none, the newest is returned,
+    so that resuming it can say what was changed.
+
+    Raises:
+        RunNotFoundError: no such run, or none that is unfinished.
+    """
+    parent = root or plan.outputs.directory
+    if run_id is not None:
+        directory = parent / run_id
+        if not (directory / JOURNAL_NAME).is_file():
+            known = sorted(p.parent.name for p in parent.glob(f"*/{JOURNAL_NAME}"))
+            raise RunNotFoundError(f"{directory}: no such run; known: {', '.join(known) or 'none'}")
+        return directory
+    mine = digest(fingerprint(plan))
+    found: list[tuple[bool, float, Path]] = []
+    for path in parent.glob(f"*/{JOURNAL_NAME}") if parent.is_dir() else ():
+        try:
+            with JournalReader(path) as journal:
+                if journal.header.name == plan.name and journal.state() is not State.FINISHED:
+                    same = digest(journal.header.fingerprint) == mine
+                    found.append((same, journal.header.created, path.parent))
+        except JournalError:
+            continue  # another program's, or another version's: not to be resumed by us
+    if not found:
+        raise RunNotFoundError(f"{parent}: no unfinished run of campaign '{plan.name}'; begin one without --resume")
+    return max(found)[2]
+
+
+def _write_json(path: Path, data: Any) -> None:
+    path.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")

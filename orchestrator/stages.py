@@ -1,0 +1,151 @@
+"""The stages of a campaign: which strategy comes next, and what it is given of those before it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orchestrator.errors import RunError
+from orchestrator.flights import Order
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
+from orchestrator.strategies.calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.deployment import Deployment
+from orchestrator.strategies.deployment_d1 import OneShotPlanning
+from orchestrator.strategies.deployment_d2 import RealOnly
+from orchestrator.strategies.deployment_d3 import Hybrid
+from orchestrator.strategies.design import DesignedPours, MeasuredPour
+from orchestrator.strategies.evaluation import ScoredPour, random_parameters
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.scorecard import Scorecard
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import Scene
+
+POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
+"""Names of a calibration's stages."""
+
+_DEPLOYMENTS: dict[str, type[Deployment]] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
+
+Results = Mapping[str, Mapping[str, Any]]
+"""Results of the stages before, by name, as they are in the journal."""
+
+
+@dataclass(frozen=True)
+class StageDefinition:
+    """One stage.
+
+    Attributes:
+        name: unique in the campaign; part of the stage's seed.
+        build: makes the strategy from the former stages' results and the stage's seed.
+        order: in which outcomes are told.
+        pours: whether it needs a bench.
+    """
+
+    name: str
+    build: Callable[[Results, int], Strategy]
+    order: Order = "logical"
+    pours: bool = False
+
+
+def stage_seed(seed: int, stage: str) -> int:
+    """The seed of a stage: the same anywhere, and independent of the other stages'."""
+    words = np.frombuffer(hashlib.sha256(stage.encode()).digest(), dtype="<u4")
+    high, low = np.random.SeedSequence([seed, *(int(w) for w in words)]).generate_state(2, dtype=np.uint32)
+    return (int(high) >> 1) << 32 | int(low)
+
+
+def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
+    """All scenes of a plan by name.
+
+    Raises:
+        RunError: two different scenes bear the same name.
+    """
+    found: list[Scene] = []
+    if plan.calibration is not None:
+        found.append(plan.calibration.scene)
+        found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
+    if plan.deployment is not None:
+        found += plan.deployment.scenes
+    scenes: dict[str, Scene] = {}
+    for scene in found:
+        if scenes.setdefault(scene.name, scene) != scene:
+            raise RunError(f"two different scenes are both named '{scene.name}'; give one of the vessels another name")
+    return scenes
+
+
+def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
+    """All stages of a campaign in order: pours, calibration, evaluation, then a deployment for each receiver."""
+    stages: list[StageDefinition] = []
+    if plan.calibration is not None:
+        stages += calibration_stages(plan.calibration)
+    if plan.deployment is not None:
+        stages += deployment_stages(plan, plan.deployment)
+    return tuple(stages)
+
+
+def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
+    """Pours (unless records take their place), C4, and what came of it beside its rivals."""
+    stages = []
+    if plan.pour_count > 0:
+
+        def pours(results: Results, seed: int) -> Strategy:
+            return DesignedPours(plan.scene, plan.actions, plan.pour_count, plan.holdout, seed)
+
+        stages.append(StageDefinition(POURS, pours, pours=True))
+
+    def calibration(results: Results, seed: int) -> Strategy:
+        return ContinuousBayesianCalibration(plan, [scored.pour for scored in measured_pours(plan, results)], seed)
+
+    def evaluation(results: Results, seed: int) -> Strategy:
+        theta = SimulationParameters.model_validate(results[CALIBRATION]["theta"])
+        rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
+        pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
+        return Scorecard(theta, rivals, pours, plan.actions, seed)
+
+    return [*stages, StageDefinition(CALIBRATION, calibration), StageDefinition(EVALUATION, evaluation)]
+
+
+def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
+    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated)."""
+    receivers = [scene.receiver.name for scene in deployment.scenes]
+    distinct = len(set(receivers)) == len(receivers)
+    # Only where simulations go on for as long as a pour takes does the clock decide what is asked for.
+    free = deployment.strategy == "D3" and deployment.per_pour is None
+
+    def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            theta = plan.parameters
+            if CALIBRATION in results:
+                theta = SimulationParameters.model_validate(results[CALIBRATION]["theta"])
+            return _DEPLOYMENTS[deployment.strategy](deployment, scene, theta, seed)
+
+        return build
+
+    return [
+        StageDefinition(
+            f"deployment:{scene.receiver.name if distinct else scene.name}",
+            build_for(scene),
+            order="completion" if free else "logical",
+            pours=deployment.pours > 0,
+        )
+        for scene in deployment.scenes
+    ]
+
+
+def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
+    """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
+    made = []
+    for row in results[POURS]["pours"] if POURS in results else ():
+        if "action_si" in row:  # a pour that was given up has none
+            action = plan.scene.action(row["action_si"])
+            made.append(ScoredPour(plan.scene.name, MeasuredPour(action, row["spillage"], row["poured"], row["split"])))
+    return [*made, *_recorded(plan.records)]
+
+
+def _recorded(records: RecordSet | None) -> list[ScoredPour]:
+    if records is None:
+        return []
+    return [ScoredPour(records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]
