@@ -41,11 +41,19 @@ class RecordedPour:
 
 @dataclass(frozen=True)
 class RecordSet:
-    """Weighed pours in one scene."""
+    """Weighed pours in one scene.
+
+    Attributes:
+        path: the CSV file.
+        lip_radius: what turned the file's lip_to_receiver_axis_mm into x_offset [m]; None if it has x_offset_mm.
+        columns: columns that have another name in the file, {name that Decant knows: name in the file}.
+    """
 
     scene: Scene
     pours: tuple[RecordedPour, ...]
     path: Path
+    lip_radius: float | None = None
+    columns: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,241 @@
+"""Campaigns as written in files: the sections, their keys and what they mean. `resolve` makes plans of them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from orchestrator.config.laboratory import LaboratoryFile
+from orchestrator.config.motion import Actions as ActionsModel
+from orchestrator.config.motion import Motion as MotionModel
+from orchestrator.config.motion import Parameters as ParametersModel
+from orchestrator.config.quantities import Quantity
+from orchestrator.config.sections import Count, Name, PathOr, PositiveCount, Section, Switch, Text
+from orchestrator.config.vessel import LiquidFile, VesselFile
+from sim_engine.losses import LossName
+
+# Built at import from the declarations in sim_engine; a type checker sees them as Any.
+Actions: Any = ActionsModel
+Motion: Any = MotionModel
+Parameters: Any = ParametersModel
+
+Kappa = Annotated[float, Quantity("1", "2.0", 0.0, 100.0)]
+
+
+class TransferSection(Section):
+    """Weighed pours in another scene, for scoring what was calibrated; never fitted."""
+
+    required: ClassVar[dict[str, str]] = {"from": "transfer.csv", "receiver": "cone.yaml"}
+
+    source: Text | None = Field(default=None, alias="from")
+    """CSV file."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """Its receiver."""
+
+    motion: Motion | None = None
+    """What its motion has otherwise than calibration's."""
+
+
+class PoursSection(Section):
+    """Pours to calibrate on: to be made (`count`), or weighed already (`from`)."""
+
+    count: PositiveCount | None = None
+    """Pours to make on the bench."""
+
+    holdout: Count | None = None
+    """How many of them are kept for testing; an eighth unless given."""
+
+    source: Text | None = Field(default=None, alias="from")
+    """CSV file of weighed pours; its column `split` says which are kept for testing."""
+
+    lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
+    """The pourer's inner radius at the lip, where the CSV has lip_to_receiver_axis_mm in place of x_offset_mm."""
+
+    columns: dict[Text, Text] = Field(default_factory=dict)
+    """Columns that have another name in the CSV: {name that Decant knows: name in the file}."""
+
+    transfer: TransferSection | None = None
+    """Weighed pours in another scene, scored only."""
+
+
+class CalibrationSection(Section):
+    """Which parameters of the simulator reproduce the weighed spills."""
+
+    required: ClassVar[dict[str, str]] = {"pours": "{count: 32, holdout: 4}", "simulations": "108"}
+
+    strategy: Literal["C4"] = "C4"
+    """C4: Bayesian optimisation of the mean discrepancy over the actions."""
+
+    pourer: PathOr[VesselFile] | None = None
+    """The campaign's unless given."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """The campaign's unless given."""
+
+    motion: Motion | None = None
+    """What has other values than in the campaign's `motion`."""
+
+    actions: Actions | None = None
+    """Searched dimensions; the campaign's `actions` unless given."""
+
+    pours: PoursSection | None = None
+    """Pours to calibrate on."""
+
+    simulations: PositiveCount | None = None
+    """Budget of simulations."""
+
+    initial: PositiveCount = 8
+    """Random parameters before the surrogate takes over."""
+
+    kappa: Kappa = 2.0
+    """κ of the lower confidence bound."""
+
+    random_baseline: Count = 0
+    """Random parameters that are scored for comparison."""
+
+
+class LossSection(Section):
+    """What deployment minimises."""
+
+    name: LossName = "spilled_and_retained"
+    """(spilled + w·retained) / loaded; or the paper's: normalised, grams, particles."""
+
+    retained_weight: Annotated[float, Quantity("1", "1.0", 0.0, 100.0)] | None = None
+    """w; 1 unless given."""
+
+
+class DeploymentSection(Section):
+    """How to pour into vessels that calibration never saw."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "D3"}
+
+    strategy: Literal["D1", "D2", "D3"] | None = None
+    """D1: plan in simulation; D2: learn on real pours; D3: real pours with a simulated prior."""
+
+    pourer: PathOr[VesselFile] | None = None
+    """The campaign's unless given."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """The campaign's unless given."""
+
+    receivers: list[PathOr[VesselFile]] | None = None
+    """Several receivers, one after the other."""
+
+    motion: Motion | None = None
+    """What has other values than in the campaign's `motion`."""
+
+    actions: Actions | None = None
+    """Searched dimensions; the campaign's `actions` unless given."""
+
+    loss: LossSection = LossSection()
+    """What is minimised."""
+
+    pours: Count | None = None
+    """Real pours per receiver; D1: 1 unless given, 0 only plans."""
+
+    iterations: PositiveCount | None = None
+    """D1: iterations of the optimiser; 15 unless given."""
+
+    simulations_per_iteration: PositiveCount | None = None
+    """D1: simulations averaged in each; 2 unless given."""
+
+    prior_simulations: Count | None = None
+    """D3: simulations before the first pour; 37 unless given."""
+
+    per_pour: Annotated[Count | Literal["free"], Field(union_mode="left_to_right")] | None = None
+    """D3: simulations told between two pours, 2 unless given; 'free': as many as the wall clock allows."""
+
+    mean: Literal["constant", "zero"] | None = None
+    """D2: prior mean of the surrogate; the paper's is 'zero'."""
+
+    kappa: Kappa = 2.0
+    """κ of the lower confidence bound."""
+
+    initial: PositiveCount = 3
+    """Random actions before the surrogate takes over."""
+
+    on_failed_pour: Literal["penalise", "ignore"] = "penalise"
+    """How a failed pour enters the data."""
+
+
+class SimulatorSection(Section):
+    """The simulator."""
+
+    parameters: Parameters | None = None
+    """Parameters θ: a value fixes one, a range has it searched by calibration; the others have their defaults."""
+
+
+class OutputsSection(Section):
+    """What is written beside the journal."""
+
+    directory: Text | None = None
+    """Where runs go; 'runs' in the working directory unless given."""
+
+    rrd: Switch = True
+    """Write a recording for the viewer."""
+
+    figures: Switch = True
+    """Write figures at the end."""
+
+    record_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
+    """Frames of particles per simulated second."""
+
+    recorded_simulations: Count = 6
+    """How many simulations are recorded with their particles."""
+
+
+class CampaignFile(Section):
+    """A campaign: calibrate the simulator, deploy what was learnt, or both."""
+
+    required: ClassVar[dict[str, str]] = {
+        "name": "narrow-cup",
+        "laboratory": "../laboratories/virtual.yaml",
+        "liquid": "{name: water, mass: 200 g}",
+    }
+
+    name: Name | None = None
+    """Its name in run directories and figures."""
+
+    seed: Count = 0
+    """Of every random choice: same campaign, seed and outcomes → same requests."""
+
+    laboratory: PathOr[LaboratoryFile] | None = None
+    """Where it runs."""
+
+    liquid: PathOr[LiquidFile] | None = None
+    """What is poured."""
+
+    pourer: PathOr[VesselFile] | None = None
+    """The vessel in the robot's hand."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """The vessel on the table."""
+
+    receivers: list[PathOr[VesselFile]] | None = None
+    """Several receivers for deployment, one after the other."""
+
+    motion: Motion | None = None
+    """Values of the motion that are not searched, for all sections."""
+
+    actions: Actions | None = None
+    """Searched dimensions, for sections that name none of their own."""
+
+    simulator: SimulatorSection = SimulatorSection()
+    """The simulator."""
+
+    calibration: CalibrationSection | None = None
+    """Which parameters of the simulator reproduce the weighed spills."""
+
+    deployment: DeploymentSection | None = None
+    """How to pour into vessels that calibration never saw."""
+
+    on_unknown: Literal["ask", "repeat"] = "ask"
+    """What happens on resume to a pour that had started and has no outcome; 'repeat' on a virtual bench only."""
+
+    parallel_simulations: Annotated[PositiveCount, Field(le=256)] = 2
+    """Logical slots of the simulation lane, whatever the machine: the same seed asks for the same things anywhere."""
+
+    outputs: OutputsSection = OutputsSection()
+    """What is written beside the journal."""

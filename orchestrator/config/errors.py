@@ -1,0 +1,78 @@
+"""Problems of campaign files, told with their place to the person who can mend them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong in one place.
+
+    Attributes:
+        path: file it stands in.
+        line: from 1; 0 where a file as a whole is meant.
+        column: from 1.
+        where: dotted location in the file, e.g. 'deployment.pours'; empty for the whole file.
+        message: what is wrong; what would be right.
+        source_line: the line as it stands in the file.
+    """
+
+    path: Path
+    line: int
+    column: int
+    where: str
+    message: str
+    source_line: str = ""
+
+    def __str__(self) -> str:
+        """`path:line:col: where: message` with the source line and a caret below."""
+        place = shown_path(self.path) if self.line == 0 else f"{shown_path(self.path)}:{self.line}:{self.column}"
+        head = ": ".join(part for part in (place, self.where, self.message) if part)
+        if not self.source_line.strip():
+            return head
+        # Tabs would move the caret: both lines are shown with each tab as one space.
+        source = self.source_line.replace("\t", " ").rstrip()
+        return f"{head}\n{self.line:5d} | {source}\n      | {' ' * (self.column - 1)}^"
+
+
+class ConfigError(Exception):
+    """A campaign, vessel, laboratory, record or parameter file can't be used; its text is the whole report.
+
+    Attributes:
+        problems: everything found, in the order of the files and lines.
+    """
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems: tuple[Problem, ...] = tuple(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+def shown_path(path: Path) -> str:
+    """A path as people like to read it: relative to the working directory where it lies below it."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def dotted(loc: Iterable[str | int]) -> str:
+    """`('pours', 0, 'mass')` → 'pours[0].mass'."""
+    text = ""
+    for part in loc:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str | None:
+    """The known word that a misspelt one most resembles, if any does."""
+    candidates = list(known)
+    matches = difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
+    if matches:
+        return matches[0]
+    lowered = {candidate.lower(): candidate for candidate in candidates}
+    matches = difflib.get_close_matches(word.lower(), list(lowered), n=1, cutoff=0.6)
+    return lowered[matches[0]] if matches else None

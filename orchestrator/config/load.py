@@ -1,0 +1,130 @@
+"""Campaigns, vessels, laboratories and parameters from files. Everything that is wrong comes as one `ConfigError`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import create_model
+
+from actors.spec import LaboratorySpec
+from orchestrator.config.campaign import CampaignFile
+from orchestrator.config.errors import ConfigError, Problem
+from orchestrator.config.laboratory import LaboratoryFile, resolve_laboratory
+from orchestrator.config.motion import parameter_quantity
+from orchestrator.config.quantities import Quantity
+from orchestrator.config.references import References
+from orchestrator.config.resolve import resolve_campaign
+from orchestrator.config.resolved import campaign_as_file
+from orchestrator.config.sections import Section
+from orchestrator.config.validate import validate
+from orchestrator.config.vessel import MESH_SUFFIXES, VesselFile, resolve_vessel
+from orchestrator.config.yaml_source import Document, Place, Report
+from orchestrator.plan import CampaignPlan
+from sim_engine.liquid import SimulationParameters
+from sim_engine.vessel.spec import VesselSpec
+
+
+def load_campaign(path: Path) -> CampaignPlan:
+    """The plan of a campaign file, with everything that it refers to.
+
+    Raises:
+        ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
+    """
+    report = Report()
+    place = Place(Document.read(path.resolve()))
+    section = validate(CampaignFile, place, report)
+    plan = None if section is None else resolve_campaign(section, place, report)
+    report.raise_if_any()
+    assert plan is not None, "a campaign without problems has a plan"
+    return dataclasses.replace(plan, resolved=campaign_as_file(plan))
+
+
+def load_vessel(path: Path) -> VesselSpec:
+    """The vessel of a file (its shape is built and checked by `sim_engine.vessel`).
+
+    Raises:
+        ConfigError: anything is wrong with it.
+    """
+    report = Report()
+    if path.suffix.lower() in MESH_SUFFIXES:
+        message = f"is a mesh; describe the vessel in a YAML file: {{name: {path.stem}, mesh: {path.name}, unit: mm}}"
+        raise ConfigError([Problem(path.resolve(), 0, 0, "", message)])
+    found = References(report).file(path.resolve(), VesselFile)
+    vessel = None if found is None else resolve_vessel(*found, report)
+    report.raise_if_any()
+    assert vessel is not None, "a vessel without problems has a spec"
+    return vessel
+
+
+def load_laboratory(path: Path) -> LaboratorySpec:
+    """The laboratory of a file.
+
+    Raises:
+        ConfigError: anything is wrong with it.
+    """
+    report = Report()
+    found = References(report).file(path.resolve(), LaboratoryFile)
+    laboratory = None if found is None else resolve_laboratory(found[0])
+    report.raise_if_any()
+    assert laboratory is not None, "a laboratory without problems has a spec"
+    return laboratory
+
+
+class _LooseQuantity(Quantity):
+    """A quantity in which a bare number is in SI units: as programs write them."""
+
+    def parse(self, value: Any) -> float | str:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and self.unit != "1":
+            return super().parse(f"{value!r} {self.unit}")
+        return super().parse(value)
+
+
+class _ThetaBase(Section):
+    """Parameters as `decant calibrate` writes them: numbers in SI, or quantities with units."""
+
+
+def _theta_model() -> type[_ThetaBase]:
+    fields: Any = {}
+    for name in SimulationParameters.info():
+        q = parameter_quantity(name)
+        loose = _LooseQuantity(q.unit, q.example, q.lower, q.upper, whole=q.whole)
+        fields[name] = (Annotated[float, loose] | None, None)
+    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, **fields)
+    return model
+
+
+_Theta = _theta_model()
+
+THETA_KEYS = ("theta", "parameters")
+
+
+def load_parameters(path: Path, base: SimulationParameters | None = None) -> SimulationParameters:
+    """θ from a file: what `decant calibrate --json` prints, or written by hand.
+
+    The file is JSON or YAML: a mapping of parameter names, or one that has such a mapping under `theta` (or
+    `parameters`) beside whatever else. Values are numbers in SI units (cohesion in N/m, viscosity in 1/s) or quantities
+    with units.
+
+    Args:
+        path: the file.
+        base: values of the parameters that the file does not name; the simulator's defaults unless given.
+
+    Raises:
+        ConfigError: anything is wrong with it.
+    """
+    report = Report()
+    document = Document.read(path.resolve())
+    place = Place(document)
+    if isinstance(document.data, dict):
+        place = next((place.at(key) for key in THETA_KEYS if key in document.data), place)
+    section = validate(_Theta, place, report)
+    values: dict[str, float] = (base or SimulationParameters()).model_dump()
+    if section is not None:
+        given = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
+        if not given and not report.problems:
+            report.add(place, f"names no parameter; known are {', '.join(values)}")
+        values |= given
+    report.raise_if_any()
+    return SimulationParameters.from_values(values)

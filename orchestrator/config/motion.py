@@ -1,0 +1,264 @@
+"""Motions, action spaces and parameter spaces as written in files, derived from the declarations in `sim_engine`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Discriminator, Field, Tag, create_model, model_validator
+from pydantic_core import PydanticCustomError
+
+from orchestrator.config.quantities import Quantity, format_quantity
+from orchestrator.config.sections import Section
+from sim_engine.action import ACTION_DIMENSIONS, Dimension
+from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis, Scale, Space
+from sim_engine.task import Pivot
+
+SWITCHED_OFF = {"angular_acceleration": "step", "hold_time": "until_flow_ends", "return_velocity": "none"}
+"""The words that switch an optional dimension off (None in an `Action`)."""
+
+EXAMPLES = {
+    "angular_velocity": "40 deg/s",
+    "max_angle": "110 deg",
+    "angular_acceleration": "600 deg/s^2",
+    "hold_time": "1.5 s",
+    "return_velocity": "90 deg/s",
+    "x_offset": "90 mm",
+    "y_offset": "0 mm",
+    "height": "60 mm",
+    "particles": "1500",
+    "cohesion": "0.02 N/m",
+    "viscosity": "3 1/s",
+    "friction": "0.05",
+}
+
+
+def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity:
+    """Annotation of an action dimension; with `words`, those that switch it off are allowed."""
+    return Quantity(
+        dimension.unit,
+        EXAMPLES[dimension.name],
+        dimension.lower,
+        dimension.upper,
+        words=(SWITCHED_OFF[dimension.name],) if words and dimension.optional else (),
+    )
+
+
+def parameter_quantity(name: str) -> Quantity:
+    """Annotation of a simulation parameter."""
+    info = SimulationParameters.info()[name]
+    return Quantity(info.unit, EXAMPLES[name], info.lower, info.upper, whole=info.integer)
+
+
+class RangeSection(Section):
+    """Bounds of a searched quantity: `[lowest, highest]`, or with a scale `{range: [...], scale: log}`."""
+
+    required: ClassVar[dict[str, str]] = {"range": "[lowest, highest]"}
+
+    range: tuple[Any, Any] | None = None
+    """[lowest, highest]"""
+
+    scale: Scale = "linear"
+    """How the search spreads over the range."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, data: Any) -> Any:
+        if isinstance(data, Mapping):
+            data = dict(data)
+        elif isinstance(data, list):
+            data = {"range": data}
+        else:
+            raise PydanticCustomError("range", "should be a range [lowest, highest]")
+        bounds = data.get("range")
+        if bounds is not None and not (isinstance(bounds, list) and len(bounds) == 2):
+            raise PydanticCustomError("range", "a range has two ends: [lowest, highest]")
+        return data
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.range is not None and not self.range[0] < self.range[1]:
+            raise PydanticCustomError("range", "bounds should increase: [lowest, highest]")
+        if self.range is not None and self.scale == "log" and self.range[0] <= 0.0:
+            raise PydanticCustomError("range", "a log scale needs a lowest value above 0")
+        return self
+
+    def axis(self, name: str, *, integer: bool = False) -> Axis:
+        """The axis of a space."""
+        assert self.range is not None
+        return Axis(name, float(self.range[0]), float(self.range[1]), self.scale, integer)
+
+
+def _range_model(name: str, quantity: Quantity) -> type[RangeSection]:
+    end = Annotated[float, quantity]
+    fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]"))}
+    model: type[RangeSection] = create_model(
+        f"{name.title().replace('_', '')}Range", __base__=RangeSection, __doc__=RangeSection.__doc__, **fields
+    )
+    return model
+
+
+class PivotPoint(Section):
+    """A horizontal line, given in the frame of the upright pourer."""
+
+    required: ClassVar[dict[str, str]] = {"x": "0 mm", "z": "50 mm"}
+
+    x: Annotated[float, Quantity("m", "0 mm", -1.0, 1.0)] | None = None
+    """From the pourer's axis towards the receiver."""
+
+    z: Annotated[float, Quantity("m", "50 mm", -1.0, 1.0)] | None = None
+    """Above the pourer's underside."""
+
+
+def _pivot_form(value: Any) -> str:
+    return "word" if isinstance(value, str) else "point"
+
+
+class MotionBase(Section):
+    """Values of the motion that are not searched."""
+
+    pivot: (
+        Annotated[
+            Annotated[Literal["lip"], Tag("word")] | Annotated[PivotPoint, Tag("point")], Discriminator(_pivot_form)
+        ]
+        | None
+    ) = None
+    """Line about which the pourer turns: 'lip', or {x: ..., z: ...} in the frame of the upright pourer."""
+
+    hold_cap: Annotated[float, Quantity("s", "5 s", 0.0, 60.0)] | None = None
+    """Longest hold 'until_flow_ends'."""
+
+    def fixed(self) -> dict[str, float | None]:
+        """Dimensions given here, SI; None for those that are switched off."""
+        given = {name: self.value(name) for name in ACTION_DIMENSIONS}
+        return {
+            name: None if isinstance(value, str) else float(value) for name, value in given.items() if value is not None
+        }
+
+    def pivot_value(self) -> Pivot | None:
+        """The pivot given here, if any."""
+        if self.pivot is None:
+            return None
+        if isinstance(self.pivot, str):
+            return Pivot()
+        if self.pivot.x is None or self.pivot.z is None:
+            return None
+        return Pivot("point", self.pivot.x, self.pivot.z)
+
+
+def _motion_model() -> type[MotionBase]:
+    fields: Any = {
+        name: (
+            Annotated[float | str, dimension_quantity(dimension, words=True)] | None,
+            Field(default=None, description=dimension.meaning),
+        )
+        for name, dimension in ACTION_DIMENSIONS.items()
+    }
+    model: type[MotionBase] = create_model("Motion", __base__=MotionBase, __doc__=MotionBase.__doc__, **fields)
+    return model
+
+
+class ActionsBase(Section):
+    """Searched dimensions of the motion, each with its range; any subset."""
+
+    def space(self) -> Space | None:
+        """The action space, axes in the order of the declarations; None if nothing is searched."""
+        axes = tuple(
+            section.axis(name)
+            for name in ACTION_DIMENSIONS
+            if (section := self.value(name)) is not None and section.range is not None
+        )
+        return Space(axes) if axes else None
+
+
+def _actions_model() -> type[ActionsBase]:
+    fields: Any = {
+        name: (
+            _range_model(name, dimension_quantity(dimension)) | None,
+            Field(default=None, description=dimension.meaning),
+        )
+        for name, dimension in ACTION_DIMENSIONS.items()
+    }
+    model: type[ActionsBase] = create_model("Actions", __base__=ActionsBase, __doc__=ActionsBase.__doc__, **fields)
+    return model
+
+
+def _parameter_form(value: Any) -> str:
+    return "searched" if isinstance(value, (list, Mapping)) else "fixed"
+
+
+class ParametersBase(Section):
+    """Parameters of the simulator: a value fixes one, a range has it searched by calibration."""
+
+    def fixed(self) -> dict[str, float]:
+        """Parameters with a value, SI."""
+        return {name: float(v) for name in self.written_keys() if isinstance(v := self.value(name), (int, float))}
+
+    def searched(self) -> dict[str, Axis]:
+        """Parameters with a range."""
+        info = SimulationParameters.info()
+        return {
+            name: section.axis(name, integer=info[name].integer)
+            for name in self.written_keys()
+            if isinstance(section := self.value(name), RangeSection) and section.range is not None
+        }
+
+
+def _parameters_model() -> type[ParametersBase]:
+    fields: Any = {}
+    for name, info in SimulationParameters.info().items():
+        quantity = parameter_quantity(name)
+        form: Any = Annotated[
+            Annotated[float, quantity, Tag("fixed")] | Annotated[_range_model(name, quantity), Tag("searched")],
+            Discriminator(_parameter_form),
+        ]
+        fields[name] = (form | None, Field(default=None, description=info.meaning or None))
+    model: type[ParametersBase] = create_model(
+        "Parameters", __base__=ParametersBase, __doc__=ParametersBase.__doc__, **fields
+    )
+    return model
+
+
+Motion = _motion_model()
+Actions = _actions_model()
+Parameters = _parameters_model()
+
+
+def fixed_as_file(fixed: Mapping[str, float | None], pivot: Pivot, hold_cap: float) -> dict[str, object]:
+    """A `motion:` section, JSON-ready."""
+    section: dict[str, object] = {
+        "pivot": "lip"
+        if pivot.kind == "lip"
+        else {"x": format_quantity(pivot.x, "m", "mm"), "z": format_quantity(pivot.z, "m", "mm")},
+        "hold_cap": format_quantity(hold_cap, "s", "s"),
+    }
+    for name, value in fixed.items():
+        dimension = ACTION_DIMENSIONS[name]
+        section[name] = (
+            SWITCHED_OFF[name] if value is None else format_quantity(value, dimension.unit, dimension.display_unit)
+        )
+    return section
+
+
+def space_as_file(space: Space) -> dict[str, object]:
+    """An `actions:` or `parameters:` section, JSON-ready."""
+    info = SimulationParameters.info()
+    section: dict[str, object] = {}
+    for axis in space.axes:
+        if axis.name in ACTION_DIMENSIONS:
+            dimension = ACTION_DIMENSIONS[axis.name]
+            unit, display = dimension.unit, dimension.display_unit
+        else:
+            unit = display = info[axis.name].unit
+        ends = [value_as_file(value, unit, display, whole=axis.integer) for value in (axis.lower, axis.upper)]
+        section[axis.name] = {"range": ends, "scale": axis.scale}
+    return section
+
+
+def value_as_file(value: float, unit: str, display: str, *, whole: bool = False) -> object:
+    """A value as a file would have it: a plain number where it has no unit."""
+    if unit == "1":
+        return round(value) if whole or math.isclose(value, round(value), abs_tol=0.0) else value
+    return format_quantity(value, unit, display)

@@ -1,0 +1,95 @@
+"""Values that may stand in a file of their own: vessels, liquids, laboratories. Each file is read once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from orchestrator.config.errors import ConfigError
+from orchestrator.config.laboratory import LaboratoryFile, resolve_laboratory
+from orchestrator.config.sections import Section
+from orchestrator.config.validate import validate
+from orchestrator.config.vessel import (
+    MESH_SUFFIXES,
+    LiquidFile,
+    VesselFile,
+    missing_file,
+    resolve_liquid,
+    resolve_vessel,
+)
+from orchestrator.config.yaml_source import Document, Place, Report
+from sim_engine.liquid import Liquid
+from sim_engine.vessel.spec import VesselSpec
+
+S = TypeVar("S", bound=Section)
+
+YAML_SUFFIXES = (".yaml", ".yml", ".json")
+
+
+@dataclass
+class References:
+    """Follows paths from files to files; problems in any of them go to the report with their own place."""
+
+    report: Report
+    _read: dict[tuple[Path, type[Section]], tuple[Section, Place] | None] = field(default_factory=dict)
+    _vessels: dict[tuple[Path, Any], VesselSpec | None] = field(default_factory=dict)
+
+    def section(self, value: Any, place: Place, model: type[S]) -> tuple[S, Place] | None:
+        """The section behind a path, or the inline one, with its place; None where there is none to look at."""
+        if isinstance(value, model):
+            return value, place
+        if not isinstance(value, str):
+            return None
+        path = (place.directory / value).resolve()
+        if path.suffix.lower() in MESH_SUFFIXES and model is VesselFile:
+            self.report.add(
+                place, f"is a mesh; write {{name: {path.stem}, mesh: {value}, unit: mm}} with the unit that it is in"
+            )
+            return None
+        if not path.is_file():
+            self.report.add(place, missing_file(path))
+            return None
+        if path.suffix.lower() not in YAML_SUFFIXES:
+            self.report.add(place, f"{path.name} is no YAML file; its name should end in .yaml")
+            return None
+        return self.file(path, model)
+
+    def file(self, path: Path, model: type[S]) -> tuple[S, Place] | None:
+        """The section that a whole file holds."""
+        key = (path, model)
+        if key not in self._read:
+            try:
+                place = Place(Document.read(path))
+            except ConfigError as error:
+                self.report.problems.extend(error.problems)
+                self._read[key] = None
+            else:
+                read = validate(model, place, self.report)
+                self._read[key] = None if read is None else (read, place)
+        found = self._read[key]
+        if found is None:
+            return None
+        section, place = found
+        assert isinstance(section, model)
+        return section, place
+
+    def vessel(self, value: Any, place: Place) -> VesselSpec | None:
+        """A vessel; None where something is wrong with it (which is reported)."""
+        found = self.section(value, place, VesselFile)
+        if found is None:
+            return None
+        key = (found[1].document.path, found[1].loc)
+        if key not in self._vessels:
+            self._vessels[key] = resolve_vessel(*found, self.report)
+        return self._vessels[key]
+
+    def liquid(self, value: Any, place: Place) -> Liquid | None:
+        """A liquid; None where something is wrong with it."""
+        found = self.section(value, place, LiquidFile)
+        return None if found is None else resolve_liquid(found[0])
+
+    def laboratory(self, value: Any, place: Place) -> Any:
+        """A `LaboratorySpec`; None where something is wrong with it."""
+        found = self.section(value, place, LaboratoryFile)
+        return None if found is None else resolve_laboratory(found[0])

@@ -1,0 +1,49 @@
+"""JSON schemas of the files people write, for editors that complete and check while one types."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from orchestrator.config.campaign import CampaignFile
+from orchestrator.config.laboratory import LaboratoryFile
+from orchestrator.config.sections import SchemaGenerator, Section
+from orchestrator.config.vessel import VesselFile
+
+
+def campaign_schema() -> dict[str, Any]:
+    """Schema of campaign files."""
+    return _schema(CampaignFile, "Campaign")
+
+
+def vessel_schema() -> dict[str, Any]:
+    """Schema of vessel files."""
+    return _schema(VesselFile, "Vessel")
+
+
+def laboratory_schema() -> dict[str, Any]:
+    """Schema of laboratory files."""
+    return _schema(LaboratoryFile, "Laboratory")
+
+
+def write_schemas(directory: Path) -> list[Path]:
+    """Write campaign.json, vessel.json and laboratory.json into a directory; the paths written."""
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = []
+    tables = (("campaign", campaign_schema), ("vessel", vessel_schema), ("laboratory", laboratory_schema))
+    for name, schema in tables:
+        path = directory / f"{name}.json"
+        path.write_text(schema_text(schema()), encoding="utf-8")
+        paths.append(path)
+    return paths
+
+
+def schema_text(schema: dict[str, Any]) -> str:
+    """The schema as it stands in its file."""
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+
+
+def _schema(model: type[Section], title: str) -> dict[str, Any]:
+    schema = model.model_json_schema(by_alias=True, schema_generator=SchemaGenerator)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": title}

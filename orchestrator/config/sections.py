@@ -1,0 +1,81 @@
+"""What the sections of all files have in common: strict keys, required keys, values that may stand in another file."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+
+Count = Annotated[int, Strict(), Field(ge=0)]
+"""A whole number, 0 or more."""
+
+PositiveCount = Annotated[int, Strict(), Field(ge=1)]
+"""A whole number, 1 or more."""
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+"""A plain number without a unit."""
+
+Switch = Annotated[bool, Strict()]
+"""true or false."""
+
+Name = Annotated[str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=60)]
+"""A name that is also good as a part of a file's name."""
+
+Text = Annotated[str, Strict(), Field(min_length=1)]
+
+
+class Section(BaseModel):
+    """A mapping in a file.
+
+    Every field is optional to pydantic, and the keys that must be there are named in `required`: so that a section
+    with one bad value still takes part in the checks of the others, and all errors of a file come at once.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=False, use_attribute_docstrings=True)
+
+    required: ClassVar[dict[str, str]] = {}
+    """Keys that must be given, each with an example."""
+
+    @classmethod
+    def written_keys(cls) -> dict[str, str]:
+        """Keys as written in files, mapped to field names."""
+        return {field.alias or name: name for name, field in cls.model_fields.items()}
+
+    def value(self, key: str) -> Any:
+        """Value of a key as written in files; None where it was not given."""
+        return getattr(self, self.written_keys()[key])
+
+
+S = TypeVar("S", bound=Section)
+
+
+def _form(value: Any) -> str:
+    return "path" if isinstance(value, str) else "inline"
+
+
+PathOr = Annotated[Annotated[Text, Tag("path")] | Annotated[S, Tag("inline")], Discriminator(_form)]
+"""The path of a file that holds the section (relative to the file that names it), or the section itself."""
+
+
+class SchemaGenerator(GenerateJsonSchema):
+    """JSON schema of sections: required keys as declared there, and no null (an empty value is an error)."""
+
+    def nullable_schema(self, schema: Any) -> JsonSchemaValue:
+        """The schema without null."""
+        return self.generate_inner(schema["schema"])
+
+    def default_schema(self, schema: Any) -> JsonSchemaValue:
+        """The schema without 'default: null'."""
+        form = super().default_schema(schema)
+        if "default" in form and form["default"] is None:
+            form.pop("default")
+        return form
+
+    def model_schema(self, schema: Any) -> JsonSchemaValue:
+        """The schema with the keys that the section requires."""
+        form = super().model_schema(schema)
+        required = getattr(schema["cls"], "required", {})
+        if required:
+            form["required"] = list(required)
+        return form

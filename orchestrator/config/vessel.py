@@ -1,0 +1,185 @@
+"""Vessels and liquids as written in files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from orchestrator.config.errors import did_you_mean
+from orchestrator.config.quantities import Quantity, format_quantity, parse_quantity
+from orchestrator.config.sections import Name, Number, Section, Text
+from orchestrator.config.yaml_source import Place, Report
+from sim_engine.liquid import Liquid
+from sim_engine.vessel.spec import LengthUnit, MeshShape, ProfileShape, VesselSpec
+
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
+
+Thickness = Annotated[float, Quantity("m", "4 mm", lower=2e-4, upper=0.1)]
+
+Point = Annotated[tuple[Number, Number], Field(description="[r, z]")]
+
+
+class ProfileSection(Section):
+    """A surface of revolution."""
+
+    required: ClassVar[dict[str, str]] = {
+        "unit": "mm",
+        "inner": "[[0, 0], [40, 0], [40, 100]]",
+        "wall": "4 mm",
+        "floor": "4 mm",
+    }
+
+    unit: LengthUnit | None = None
+    """Unit of the numbers in `inner`."""
+
+    inner: tuple[Point, ...] | None = None
+    """The inner surface as [r, z] points, from the axis at the inner floor to the rim."""
+
+    wall: Thickness | None = None
+    """Thickness of the wall, outwards."""
+
+    floor: Thickness | None = None
+    """Thickness of the floor, downwards."""
+
+
+class VesselFile(Section):
+    """A vessel: a profile of [r, z] points, or a mesh of its solid."""
+
+    required: ClassVar[dict[str, str]] = {"name": "beaker"}
+
+    name: Name | None = None
+    """Its name in figures and journals."""
+
+    profile: ProfileSection | None = None
+    """A surface of revolution; or give `mesh`."""
+
+    mesh: Text | None = None
+    """A closed mesh of the vessel's solid: path of an STL, OBJ, PLY or GLB file; or give `profile`."""
+
+    unit: LengthUnit | None = None
+    """Unit of the mesh's coordinates."""
+
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Axis of the mesh that points out of the opening; z unless given."""
+
+
+class LiquidFile(Section):
+    """What is poured."""
+
+    required: ClassVar[dict[str, str]] = {"mass": "200 g"}
+
+    name: Text = "water"
+    """For people."""
+
+    mass: Annotated[float, Quantity("kg", "200 g", positive=True, upper=20.0)] | None = None
+    """Mass that is loaded into the pourer."""
+
+    density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] = 998.0
+    """Density; water's at 20 °C unless given."""
+
+
+def resolve_vessel(section: VesselFile, place: Place, report: Report) -> VesselSpec | None:
+    """The vessel of a file; problems go to the report, and then the answer is None."""
+    before = len(report.problems)
+    shape: ProfileShape | MeshShape | None = None
+    if section.profile is not None and section.mesh is not None:
+        report.add(place.at("mesh"), "the vessel has a profile already; keep one of 'profile' and 'mesh'", key=True)
+    elif section.profile is not None:
+        for key in ("unit", "up"):
+            if section.value(key) is not None:
+                report.add(place.at(key), "belongs to a mesh; a profile has its own 'unit' inside", key=True)
+        shape = _profile(section.profile, place.at("profile"), report)
+    elif section.mesh is not None:
+        shape = _mesh(section, place, report)
+    elif not any(report.is_broken(place.at(key)) for key in ("profile", "mesh")):
+        report.add(place, "has no shape; add 'profile:' with [r, z] points, or 'mesh:' with the path of a file")
+    if shape is None or section.name is None or len(report.problems) > before:
+        return None
+    return VesselSpec(name=section.name, shape=shape)
+
+
+def _profile(section: ProfileSection, place: Place, report: Report) -> ProfileShape | None:
+    if section.unit is None or section.inner is None or section.wall is None or section.floor is None:
+        return None
+    points = tuple(
+        (parse_quantity(f"{r} {section.unit}", "m", "40 mm"), parse_quantity(f"{z} {section.unit}", "m", "40 mm"))
+        for r, z in section.inner
+    )
+    inner = place.at("inner")
+    before = len(report.problems)
+    if len(points) < 2:
+        report.add(inner, "needs at least two [r, z] points: from the axis at the floor to the rim")
+        return None
+    if points[0] != (0.0, 0.0):
+        report.add(inner.at(0), "the first point is the inner floor on the axis and should be [0, 0]")
+    for i, (r, _) in enumerate(points):
+        if i > 0 and r <= 0.0:
+            report.add(
+                inner.at(i), f"r = {section.inner[i][0]:g} should be above 0; only the first point is on the axis"
+            )
+        if i > 0 and points[i] == points[i - 1]:
+            report.add(inner.at(i), "is the same point as the one before; remove it")
+    if points[-1][1] <= max(z for _, z in points[:-1]):
+        report.add(inner.at(len(points) - 1), "the last point is the rim and should be higher than all others")
+    largest = max(max(r, z) for r, z in points)
+    if not 0.005 <= largest <= 1.0:
+        report.add(
+            place.at("unit"),
+            f"in {section.unit} the vessel would be {largest * 1e3:g} mm large; vessels are 5 mm … 1 m. Is it right?",
+        )
+    return (
+        ProfileShape(inner=points, wall=section.wall, floor=section.floor) if len(report.problems) == before else None
+    )
+
+
+def _mesh(section: VesselFile, place: Place, report: Report) -> MeshShape | None:
+    path = (place.directory / str(section.mesh)).resolve()
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        report.add(place.at("mesh"), f"{path.suffix or 'a file without suffix'} is no mesh; use STL, OBJ, PLY or GLB")
+        return None
+    if not path.is_file():
+        report.add(place.at("mesh"), missing_file(path))
+        return None
+    return MeshShape(path=path, unit=section.unit, up=section.up or "z")
+
+
+def missing_file(path: Path) -> str:
+    """What to say about a file that is not there."""
+    if path.is_dir():
+        return f"{path} is a directory; name a file in it"
+    neighbours = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    guess = did_you_mean(path.name, neighbours)
+    hint = f"did you mean '{guess}'?" if guess else "paths are relative to the directory of the file they stand in"
+    return f"no such file: {path}; {hint}"
+
+
+def resolve_liquid(section: LiquidFile) -> Liquid | None:
+    """The liquid of a file, None if its mass is missing (which is reported already)."""
+    return None if section.mass is None else Liquid(name=section.name, mass=section.mass, density=section.density)
+
+
+def vessel_as_file(spec: VesselSpec) -> dict[str, object]:
+    """The vessel as a file would have it, JSON-ready, mesh paths absolute."""
+    if isinstance(spec.shape, MeshShape):
+        mesh: dict[str, object] = {"name": spec.name, "mesh": str(spec.shape.path), "up": spec.shape.up}
+        return mesh if spec.shape.unit is None else mesh | {"unit": spec.shape.unit}
+    return {
+        "name": spec.name,
+        "profile": {
+            "unit": "m",
+            "inner": [list(point) for point in spec.shape.inner],
+            "wall": format_quantity(spec.shape.wall, "m", "mm"),
+            "floor": format_quantity(spec.shape.floor, "m", "mm"),
+        },
+    }
+
+
+def liquid_as_file(liquid: Liquid) -> dict[str, object]:
+    """The liquid as a file would have it, JSON-ready."""
+    return {
+        "name": liquid.name,
+        "mass": format_quantity(liquid.mass, "kg", "g"),
+        "density": format_quantity(liquid.density, "kg/m^3", "kg/m^3"),
+    }
