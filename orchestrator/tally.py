@@ -70,6 +70,7 @@ class PourTally:
     action: str
     predicted: str
     started_at: float
+    calibrating: bool
     progress: PourProgress | None = None
     result: str = ""
 
@@ -150,13 +151,13 @@ class Tally:
                 self.running.add(event.id)
             case Pour() as pour:
                 space = self.plan.deployment
-                if is_calibration(self.plan, event.stage, pour.scene) and self.plan.calibration is not None:
+                if is_calibration(self.plan, pour) and self.plan.calibration is not None:
                     names = self.plan.calibration.actions.names
                 else:
                     names = space.actions.names if space is not None else ("angular_velocity", "x_offset")
                 predicted = ""
                 if pour.predicted is not None:
-                    unit = unit_of_pour(self.plan, event.stage, pour.scene)
+                    unit = unit_of_pour(self.plan, pour)
                     predicted = unit.text(pour.predicted.mean, pour.predicted.deviation)
                 self.pour = PourTally(
                     pour.number,
@@ -165,6 +166,7 @@ class Tally:
                     style.display_values({name: getattr(pour.action, name) for name in names}),
                     predicted,
                     event.time,
+                    is_calibration(self.plan, pour),
                 )
 
     def _finished(self, event: RequestFinished) -> None:
@@ -179,11 +181,11 @@ class Tally:
                 else:
                     self.failed_simulations += 1
             case Pour() as pour, Poured() as outcome:
-                unit = unit_of_pour(self.plan, event.stage, pour.scene)
-                loss = loss_of_pour(self.plan, event.stage, pour.scene, outcome.measurement)
+                unit = unit_of_pour(self.plan, pour)
+                loss = loss_of_pour(self.plan, pour, outcome.measurement)
                 if self.pour is not None:
                     self.pour.result = "too little was poured" if loss is None else unit.text(loss)
-                if loss is not None and not is_calibration(self.plan, event.stage, pour.scene):
+                if loss is not None and not is_calibration(self.plan, pour):
                     best = self.best.get(pour.scene)
                     if best is None or loss < best.loss:
                         self.best[pour.scene] = Best(loss, pour.number, unit)
@@ -210,7 +212,7 @@ class Tally:
         if pour is None:
             return None
         total = None
-        if is_calibration(self.plan, pour.stage, pour.scene):
+        if pour.calibrating:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
             total = self.plan.deployment.pours

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from orchestrator.report.style import safe_name
+
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
-
-
-def entity_name(name: str) -> str:
-    """A name that is safe as one part of an entity path."""
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "_"
 
 
 def _scene() -> Any:
@@ -61,7 +58,7 @@ def campaign_blueprint(receivers: tuple[str, ...], loss_label: str) -> rrb.Bluep
 
     losses = [
         rrb.TimeSeriesView(
-            origin=f"/pours/{entity_name(name)}", name=f"{name}: {loss_label}", plot_legend=rrb.Corner2D.RightTop
+            origin=f"/pours/{safe_name(name)}", name=f"{name}: {loss_label}", plot_legend=rrb.Corner2D.RightTop
         )
         for name in receivers
     ]
@@ -69,7 +66,7 @@ def campaign_blueprint(receivers: tuple[str, ...], loss_label: str) -> rrb.Bluep
     maps = []
     for place, title in (
         ("/maps/calibration", "Discrepancy"),
-        *((f"/maps/{entity_name(name)}", name) for name in receivers),
+        *((f"/maps/{safe_name(name)}", name) for name in receivers),
     ):
         for which, meaning in (("mean", "mean"), ("deviation", "± 1 σ")):
             maps.append(
@@ -83,7 +80,7 @@ def campaign_blueprint(receivers: tuple[str, ...], loss_label: str) -> rrb.Bluep
         rrb.TensorView(origin=f"{place}/mean/values", name=f"{title}: numbers")
         for place, title in (
             ("/maps/calibration", "Discrepancy"),
-            *((f"/maps/{entity_name(name)}", name) for name in receivers),
+            *((f"/maps/{safe_name(name)}", name) for name in receivers),
         )
     ]
     return rrb.Blueprint(

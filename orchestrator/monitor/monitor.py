@@ -20,11 +20,11 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.monitor.blueprint import entity_name
 from orchestrator.monitor.streams import Streams
 from orchestrator.monitor.worker import Worker
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
+from orchestrator.report.style import safe_name
 from orchestrator.report.units import DISCREPANCY, is_calibration, loss_of_pour, loss_unit, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated, Suggest, Suggested
 from sim_engine.action import ACTION_DIMENSIONS
@@ -176,7 +176,7 @@ class _Translator:
                 self._say(event.text, event.level, event.stage)
 
     def _say(self, text: str, level: str = "info", source: str = "") -> None:
-        self.streams.line(text, level, entity_name(source or "campaign"))
+        self.streams.line(text, level, safe_name(source or "campaign"))
 
     def _page(self) -> None:
         rows = "\n".join(f"| {name} | {value} |" for name, value in self._about.items())
@@ -195,9 +195,9 @@ class _Translator:
             case Pour() as pour:
                 expected = ""
                 if pour.predicted is not None:
-                    unit = unit_of_pour(self._plan, event.stage, pour.scene)
+                    unit = unit_of_pour(self._plan, pour)
                     expected = f", predicted {unit.text(pour.predicted.mean, pour.predicted.deviation)}"
-                self._say(f"pour {pour.number}: {self._action(event.stage, pour)}{expected}", source=event.stage)
+                self._say(f"pour {pour.number}: {self._action(pour)}{expected}", source=event.stage)
 
     def _finished(self, event: RequestFinished) -> None:
         if isinstance(event.outcome, Failed):
@@ -241,10 +241,10 @@ class _Translator:
         self._pours += 1
         self.streams.at(wall=event.time, pour=self._pours)
         measured = outcome.measurement
-        unit = unit_of_pour(self._plan, event.stage, request.scene)
-        value = loss_of_pour(self._plan, event.stage, request.scene, measured)
-        calibrating = is_calibration(self._plan, event.stage, request.scene)
-        place = "/calibration/loss" if calibrating else f"/pours/{entity_name(request.scene)}"
+        unit = unit_of_pour(self._plan, request)
+        value = loss_of_pour(self._plan, request, measured)
+        calibrating = is_calibration(self._plan, request)
+        place = "/calibration/loss" if calibrating else f"/pours/{safe_name(request.scene)}"
         if value is None:
             self._say(f"pour {request.number}: too little was poured for a loss", "warning", event.stage)
             return
@@ -276,12 +276,14 @@ class _Translator:
         # A space of actions belongs to the receiver in question, one of simulation parameters to the calibration.
         acting = problem.space.names[0] in ACTION_DIMENSIONS
         scene = self._scene_of_stage.get(event.stage)
-        place = f"/maps/{entity_name(scene)}" if acting and scene is not None else "/maps/calibration"
+        place = f"/maps/{safe_name(scene)}" if acting and scene is not None else "/maps/calibration"
         unit = loss_unit(self._plan.deployment.loss) if acting and self._plan.deployment else DISCREPANCY
-        said = self.streams.surrogate(place, problem.space, suggestion.surrogate, problem.data.points, unit.factor)
+        # Points may carry further coordinates behind those of the space (see SuggestProblem.context).
+        points = tuple(point[: problem.space.dimension] for point in problem.data.points)
+        said = self.streams.surrogate(place, problem.space, suggestion.surrogate, points, unit.factor)
         self._about[f"map {place.removeprefix('/maps/')}"] = f"{unit.label}: {said}"
         self._page()
 
-    def _action(self, stage: str, pour: Pour) -> str:
-        plan = self._plan.calibration if is_calibration(self._plan, stage, pour.scene) else self._plan.deployment
+    def _action(self, pour: Pour) -> str:
+        plan = self._plan.calibration if is_calibration(self._plan, pour) else self._plan.deployment
         return pour.action.display(*(plan.actions.names if plan is not None else ()))

@@ -35,7 +35,7 @@ class SurrogatePicture:
         best_name: what it is called: 'θ*', 'best action'.
         mean: (R, R) surrogate mean over the unit square, row i at the second axis' i-th place; None without a map.
         deviation: (R, R) its standard deviation.
-        numbered: points carry their number (pours) in place of being dots (simulations).
+        numbers: what to write on the points (pours); None: they are dots (simulations).
     """
 
     title: str
@@ -47,7 +47,7 @@ class SurrogatePicture:
     best_name: str = "θ*"
     mean: NDArray[np.float64] | None = None
     deviation: NDArray[np.float64] | None = None
-    numbered: bool = False
+    numbers: Sequence[int] | None = None
 
 
 def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
@@ -94,7 +94,8 @@ def _map_panel(
     costs = np.asarray(picture.costs, dtype=float)
     if grid is not None:
         values = np.asarray(grid, dtype=float)
-        low, high = _limits(values, costs if name == "mean" else values)
+        # The surrogate's own range: single observations, far noisier, would flatten it.
+        low, high = _limits(values)
         places = np.linspace(0.0, 1.0, values.shape[0])
         mesh: Any = axes.contourf(
             _decode(x_axis, places),
@@ -114,17 +115,17 @@ def _map_panel(
                 alpha=0.6,
             )
     else:
-        low, high = _limits(costs, costs)
+        low, high = _limits(costs)
         mesh = axes.scatter([], [], c=[], cmap=colours, vmin=low, vmax=high)
     if len(xs):
         # Observations are filled with their own cost on the same scale: where one stands out, the surrogate disagrees.
         filled: dict[str, Any] = (
             {"c": costs, "cmap": colours, "vmin": low, "vmax": high} if name != "standard deviation" else {"c": "white"}
         )
-        size = 130 if picture.numbered else 26
+        size = 26 if picture.numbers is None else 130
         axes.scatter(xs, ys, s=size, edgecolors="white", linewidths=1.0, zorder=3, clip_on=False, **filled)
-        if picture.numbered:
-            for number, (x, y, cost) in enumerate(zip(xs, ys, costs, strict=True), start=1):
+        if picture.numbers is not None:
+            for number, x, y, cost in zip(picture.numbers, xs, ys, costs, strict=True):
                 dark = name != "standard deviation" and cost < 0.6 * low + 0.4 * high
                 axes.annotate(
                     str(number),
@@ -154,7 +155,7 @@ def _map_panel(
 
 
 def _panel_title(name: str, picture: SurrogatePicture) -> str:
-    things = "pours" if picture.numbered else "simulations"
+    things = "simulations" if picture.numbers is None else "pours"
     match name:
         case "mean":
             return f"surrogate mean, {len(picture.points)} {things}"
@@ -229,11 +230,10 @@ def _column(points: Sequence[Values], axis: Axis) -> NDArray[np.float64]:
     return np.array([float(point[axis.name] or 0.0) / factor for point in points], dtype=float)
 
 
-def _limits(values: NDArray[np.float64], also: NDArray[np.float64]) -> tuple[float, float]:
-    """Colour range of the values; single far-off observations don't flatten everything else."""
-    merged = np.concatenate([values.ravel(), also.ravel()])
-    low, high = float(np.min(merged)), float(np.percentile(merged, 99.0))
-    return (low, high) if high > low else (low - 0.5, low + 0.5)
+def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Colour range of the values, never empty."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return (low, high) if high - low > 1e-12 else (low - 0.5, low + 0.5)
 
 
 def _scale(axes: Axes, axis: Axis, which: str) -> None:

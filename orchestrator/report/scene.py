@@ -47,7 +47,7 @@ def simulation_png(path: Path, task: PourTask, result: SimulationResult) -> Path
     )
     if outcome.invalid is not None:
         title += f"   [not valid: {outcome.invalid}]"
-    note = f"{action}; {outcome.particles:,} particles, seed {outcome.seed}".replace(",", " ", 0)
+    note = f"{action}; {style.display_value('particles', outcome.particles)} particles, seed {outcome.seed}"
     return draw_pour(
         path,
         result,

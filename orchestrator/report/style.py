@@ -74,6 +74,11 @@ def display_values(values: dict[str, float | None]) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {display_value(name, value)}" for name, value in values.items())
 
 
+def safe_name(name: str) -> str:
+    """A name that can be part of a file's name or of an entity's path."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "_"
+
+
 def new_figure(rows: int = 1, columns: int = 1, *, size: tuple[float, float], **kwargs: Any) -> tuple[Figure, Any]:
     """A figure of our look, without a window system.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from orchestrator.plan import CampaignPlan
+from orchestrator.requests import Pour
 from sim_engine.losses import Loss, normalised_spillage
 from sim_engine.outcome import PourMeasurement
 
@@ -57,21 +58,21 @@ SPILLAGE = LossUnit("spilled / poured [%]", "%", 100.0)
 """How a calibration pour's spillage r is shown."""
 
 
-def is_calibration(plan: CampaignPlan, stage: str, scene: str) -> bool:
+def is_calibration(plan: CampaignPlan, pour: Pour) -> bool:
     """Whether a pour serves calibration: it is compared with simulations, not minimised."""
-    deployed = {s.name for s in plan.deployment.scenes} if plan.deployment is not None else set()
-    return scene not in deployed or stage.startswith("calibration")
+    deployed = {scene.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
+    return pour.purpose == "calibration" or pour.scene not in deployed
 
 
-def unit_of_pour(plan: CampaignPlan, stage: str, scene: str) -> LossUnit:
+def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:
     """How the loss of a pour is shown."""
-    if plan.deployment is None or is_calibration(plan, stage, scene):
+    if plan.deployment is None or is_calibration(plan, pour):
         return SPILLAGE
     return loss_unit(plan.deployment.loss)
 
 
-def loss_of_pour(plan: CampaignPlan, stage: str, scene: str, measured: PourMeasurement) -> float | None:
+def loss_of_pour(plan: CampaignPlan, pour: Pour, measured: PourMeasurement) -> float | None:
     """Measured loss of a pour in its own unit; None where it is undefined (too little poured)."""
-    if plan.deployment is None or is_calibration(plan, stage, scene):
+    if plan.deployment is None or is_calibration(plan, pour):
         return normalised_spillage(measured.fractions)
     return plan.deployment.loss(measured.fractions, loaded_mass=measured.loaded, particles=plan.parameters.particles)

@@ -1,0 +1,73 @@
+"""All figures of a run, under its directory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from orchestrator.plan import CampaignPlan
+from orchestrator.report.figures import draw_discrepancy, draw_spillage
+from orchestrator.report.maps import draw_surrogate
+from orchestrator.report.results import (
+    Results,
+    calibration_of,
+    calibration_picture,
+    deployment_picture,
+    deployments_of,
+    discrepancy_groups,
+    evaluation_of,
+    pour_series,
+)
+from orchestrator.report.style import safe_name
+from orchestrator.report.units import loss_unit
+
+_log = logging.getLogger(__name__)
+
+
+def draw_figures(
+    directory: Path,
+    plan: CampaignPlan,
+    results: Results,
+    *,
+    baselines: Mapping[str, Mapping[str, float | None]] | None = None,
+) -> dict[str, Path]:
+    """Draw what the results allow: discrepancy map, test discrepancy, spillage against pours, loss maps.
+
+    A figure that can't be drawn is reported and left out: days of pouring don't end in a traceback about a picture.
+
+    Args:
+        directory: where the PNGs go.
+        plan: of the campaign.
+        results: stage name → the strategy's result.
+        baselines: 'mean_predictor' and 'regression' by split ('train', 'test'), where they were computed.
+
+    Returns:
+        Name of each figure → its file.
+    """
+    jobs: dict[str, Callable[[], Path]] = {}
+    calibration, evaluation = calibration_of(results), evaluation_of(results)
+    if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
+        jobs["discrepancy map"] = lambda p=picture: draw_surrogate(directory / "discrepancy-map.png", p)  # type: ignore[misc]
+    if evaluation is not None and (groups := discrepancy_groups(evaluation, baselines)):
+        jobs["test discrepancy"] = lambda: draw_discrepancy(
+            directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the scale: {plan.name}"
+        )
+    if plan.deployment is not None:
+        unit = loss_unit(plan.deployment.loss)
+        if series := pour_series(results, unit):
+            jobs["spillage against pours"] = lambda: draw_spillage(
+                directory / "spillage.png", series, cost=unit.label, title=f"Spillage against pours: {plan.name}"
+            )
+        for scene, result in deployments_of(results).items():
+            if (picture := deployment_picture(plan, result)) is not None:
+                jobs[f"loss map {scene}"] = lambda p=picture, s=scene: draw_surrogate(  # type: ignore[misc]
+                    directory / f"loss-map-{safe_name(s)}.png", p
+                )
+    drawn: dict[str, Path] = {}
+    for name, job in jobs.items():
+        try:
+            drawn[name] = job()
+        except Exception as error:
+            _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
+    return drawn

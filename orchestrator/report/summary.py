@@ -1,0 +1,233 @@
+"""What a run came to: a table for people, `summary.json` for programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
+from orchestrator.report.results import (
+    SPLITS,
+    Result,
+    Results,
+    calibrated_label,
+    calibration_of,
+    deployments_of,
+    evaluation_of,
+    weighed,
+)
+from orchestrator.report.units import LossUnit, loss_unit
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+SUMMARY_NAME = "summary.json"
+
+
+def summarise(
+    plan: CampaignPlan,
+    results: Results,
+    *,
+    figures: Mapping[str, Path] | None = None,
+    recording: Path | None = None,
+    dropped_events: int = 0,
+    baselines: Mapping[str, Mapping[str, float | None]] | None = None,
+    totals: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The summary of a run, JSON-ready; whatever a run hasn't got is None or empty.
+
+    Args:
+        plan: of the campaign.
+        results: stage name → the strategy's result.
+        figures: name → file.
+        recording: the `.rrd`.
+        dropped_events: that are missing in it.
+        baselines: 'mean_predictor' and 'regression' by split.
+        totals: further facts of the run (state, simulations, pours, cpu_s, …), taken over as they are.
+
+    Returns:
+        'theta' with 'predicted_discrepancy'; 'discrepancy' by split and predictor (fractions of what was poured);
+        'receivers' with first and best losses (the loss' own unit, named in 'loss'), spillage r = spilled / poured, and
+        the best actions in display units and SI; 'figures', 'recording', and `totals`.
+    """
+    calibration = calibration_of(results)
+    return {
+        "campaign": plan.name,
+        "seed": plan.seed,
+        **(totals or {}),
+        "theta": None if calibration is None else dict(calibration["theta"]),
+        "predicted_discrepancy": None if calibration is None else calibration.get("predicted_discrepancy"),
+        "predicted_deviation": None if calibration is None else calibration.get("predicted_deviation"),
+        "discrepancy": _discrepancies(evaluation_of(results), baselines or {}),
+        "loss": None if plan.deployment is None else plan.deployment.loss.name,
+        "receivers": {scene: _receiver(result) for scene, result in deployments_of(results).items()},
+        "figures": {name: str(path) for name, path in (figures or {}).items()},
+        "recording": None if recording is None else str(recording),
+        "dropped_events": dropped_events,
+    }
+
+
+def _discrepancies(
+    evaluation: Result | None, baselines: Mapping[str, Mapping[str, float | None]]
+) -> dict[str, dict[str, float | None]]:
+    table: dict[str, dict[str, float | None]] = {}
+    label = None if evaluation is None else calibrated_label(evaluation)
+    for split in SPLITS:
+        row: dict[str, float | None] = {}
+        if evaluation is not None and label is not None and split in evaluation["discrepancy"][label]:
+            row["calibrated"] = evaluation["discrepancy"][label][split]
+            row["random_theta"] = evaluation["random_median"].get(split)
+        row |= {name: baselines[split].get(name) for name in ("mean_predictor", "regression") if split in baselines}
+        if row:
+            table[split] = row
+    return table
+
+
+def _receiver(result: Result) -> dict[str, Any]:
+    pours = weighed(result)
+    best = min(pours, key=lambda p: float(p["loss"]), default=None)
+    return {
+        "strategy": result["strategy"],
+        "pours": len(pours),
+        "failed_pours": result.get("failed_pours", 0),
+        "refused_pours": result.get("refused_pours", 0),
+        "simulations": result.get("simulations", 0),
+        "first_loss": pours[0]["loss"] if pours else None,
+        "first_spillage": pours[0]["spillage"] if pours else None,
+        "best_loss": None if best is None else best["loss"],
+        "best_spillage": None if best is None else best["spillage"],
+        "best_pour": None if best is None else best["number"],
+        "best_measured_action": None if best is None else best["action"],
+        "best_action": result.get("action"),
+        "best_action_si": result.get("action_si"),
+        "predicted_loss": result.get("predicted_loss"),
+        "predicted_deviation": result.get("predicted_deviation"),
+        "untrustworthy_simulation": bool(result.get("trust", {}).get("alarm", False)),
+        "gave_up": result.get("gave_up"),
+    }
+
+
+def write_summary(directory: Path, summary: Mapping[str, Any]) -> Path:
+    """Write `summary.json`, whole or not at all.
+
+    Raises:
+        OSError: the file can't be written.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    path = directory / SUMMARY_NAME
+    draft = path.with_suffix(".json.part")
+    draft.write_text(json.dumps(summary, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    draft.replace(path)
+    return path
+
+
+def summary_table(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableType:
+    """The summary for the terminal: θ*, discrepancies, losses and best actions by receiver, files."""
+    from rich.console import Group
+    from rich.text import Text
+
+    parts: list[RenderableType] = [Text(f"\n{summary['campaign']}  seed {summary['seed']}", style="bold")]
+    if summary["theta"] is not None:
+        parts.append(_theta_line(plan, summary))
+    if summary["discrepancy"]:
+        parts.append(_discrepancy_table(summary["discrepancy"]))
+    if summary["receivers"] and plan.deployment is not None:
+        parts.append(_receiver_table(summary["receivers"], loss_unit(plan.deployment.loss)))
+        parts += _remarks(summary["receivers"])
+    files = [*summary["figures"].items(), *([("recording", summary["recording"])] if summary["recording"] else [])]
+    if files:
+        width = max(len(name) for name, _ in files)
+        # Paths stand alone at their lines' ends, unbroken: terminals make them clickable, people copy them.
+        parts.append(Text("\n".join(f"  {name:<{width}}  {path}" for name, path in files), overflow="fold"))
+    if summary["dropped_events"]:
+        parts.append(Text(f"  the recording lacks {summary['dropped_events']} events: it could not keep up", "yellow"))
+    return Group(*parts)
+
+
+def _theta_line(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableType:
+    from rich.text import Text
+
+    text = Text(f"θ*  {style.display_values(summary['theta'])}")
+    if summary["predicted_discrepancy"] is not None:
+        text.append(
+            f"   expected |Δ| {100 * summary['predicted_discrepancy']:.2f} ± "
+            f"{100 * (summary['predicted_deviation'] or 0.0):.2f} %",
+            style="dim",
+        )
+    return text
+
+
+def _discrepancy_table(rows: Mapping[str, Mapping[str, float | None]]) -> RenderableType:
+    from rich.table import Table
+
+    columns = {
+        "calibrated": "θ*",
+        "random_theta": "random θ (median)",
+        "mean_predictor": "mean of training pours",
+        "regression": "GP regression",
+    }
+    shown = [name for name in columns if any(row.get(name) is not None for row in rows.values())]
+    table = Table(title="mean |measured − predicted| spillage [%]", title_justify="left", title_style="", box=_box())
+    table.add_column("")
+    for name in shown:
+        table.add_column(columns[name], justify="right")
+    for split, row in rows.items():
+        cells = [row.get(name) for name in shown]
+        table.add_row(SPLITS[split], *("—" if cell is None else f"{100 * cell:.2f}" for cell in cells))
+    return table
+
+
+def _receiver_table(receivers: Mapping[str, Mapping[str, Any]], unit: LossUnit) -> RenderableType:
+    from rich.table import Table
+
+    table = Table(title=unit.label, title_justify="left", title_style="", box=_box())
+    for name, justify in (
+        ("receiver", "left"),
+        ("", "left"),
+        ("pours", "right"),
+        ("first", "right"),
+        ("best measured", "right"),
+        ("best expected", "right"),
+        ("best action", "left"),
+    ):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for scene, row in receivers.items():
+        best = "—" if row["best_loss"] is None else f"{unit.text(row['best_loss'])} (pour {row['best_pour']})"
+        expected = (
+            "—" if row["predicted_loss"] is None else unit.text(row["predicted_loss"], row["predicted_deviation"])
+        )
+        action = style.display_values(row["best_action_si"]) if row["best_action_si"] else "—"
+        table.add_row(
+            scene,
+            row["strategy"],
+            str(row["pours"]),
+            "—" if row["first_loss"] is None else unit.text(row["first_loss"]),
+            best,
+            expected,
+            action,
+        )
+    return table
+
+
+def _remarks(receivers: Mapping[str, Mapping[str, Any]]) -> list[RenderableType]:
+    from rich.text import Text
+
+    remarks: list[RenderableType] = []
+    for scene, row in receivers.items():
+        if row["untrustworthy_simulation"]:
+            text = f"  {scene}: the first pours were far from what was predicted; the simulator may not fit this vessel"
+            remarks.append(Text(text, style="yellow"))
+        if row["failed_pours"]:
+            remarks.append(Text(f"  {scene}: {row['failed_pours']} pour(s) failed", style="yellow"))
+        if row["gave_up"]:
+            remarks.append(Text(f"  {scene}: {row['gave_up']}", style="yellow"))
+    return remarks
+
+
+def _box() -> Any:
+    from rich import box
+
+    return box.SIMPLE_HEAD
