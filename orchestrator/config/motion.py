@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Discriminator, Field, Tag, create_model, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag, create_model, model_validator
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from orchestrator.config.quantities import Quantity, format_quantity
 from orchestrator.config.sections import Section
@@ -84,6 +84,11 @@ class RangeSection(Section):
         if self.range is not None and self.scale == "log" and self.range[0] <= 0.0:
             raise PydanticCustomError("range", "a log scale needs a lowest value above 0")
         return self
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        long_form = handler.resolve_ref_schema(handler(schema))
+        return {"anyOf": [long_form["properties"]["range"], dict(long_form)]}
 
     def axis(self, name: str, *, integer: bool = False) -> Axis:
         """The axis of a space."""

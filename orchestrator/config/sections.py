@@ -66,11 +66,15 @@ class SchemaGenerator(GenerateJsonSchema):
         return self.generate_inner(schema["schema"])
 
     def default_schema(self, schema: Any) -> JsonSchemaValue:
-        """The schema without 'default: null'."""
+        """The schema with defaults that are plain values; those of whole sections say nothing."""
         form = super().default_schema(schema)
-        if "default" in form and form["default"] is None:
-            form.pop("default")
+        if isinstance(form.get("default"), (dict, list, type(None))):
+            form.pop("default", None)
         return form
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        """No titles: they only repeat the keys."""
+        return False
 
     def model_schema(self, schema: Any) -> JsonSchemaValue:
         """The schema with the keys that the section requires."""

@@ -1,0 +1,151 @@
+"""What a campaign file can't show by itself: whether its vessels exist as solids, hold the liquid, and stay clear."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from orchestrator.plan import CampaignPlan
+from sim_engine.action import Action
+from sim_engine.contact import describe_contact, first_contact
+from sim_engine.motion import plan_motion
+from sim_engine.space import Space
+from sim_engine.task import Scene
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.errors import VesselError
+from sim_engine.vessel.spec import MeshShape, VesselSpec
+from sim_engine.vessel.vessel import Vessel, check_holds
+
+POSE_SPACING = 3e-3
+"""Largest way of any point of the pourer between two checked poses [m]: less than most walls."""
+
+RANDOM_ACTIONS = 16
+"""Tried beside the middle and the corners of an action space before saying that all of it touches."""
+
+
+@dataclass
+class _Checker:
+    problems: list[str] = field(default_factory=list)
+    vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
+
+    def vessel(self, spec: VesselSpec) -> Vessel | None:
+        if spec not in self.vessels:
+            try:
+                self.vessels[spec] = build_vessel(spec)
+            except (VesselError, OSError) as error:
+                where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
+                self.problems.append(f"vessel '{spec.name}'{where}: {error}")
+                self.vessels[spec] = None
+        return self.vessels[spec]
+
+    def scene(self, scene: Scene, role: str) -> tuple[Vessel, Vessel] | None:
+        """The scene's vessels, if both exist and hold the liquid."""
+        pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
+        if pourer is None or receiver is None:
+            return None
+        ok = True
+        for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
+            try:
+                check_holds(vessel, scene.liquid.volume)
+            except VesselError as error:
+                ok = False
+                self.problems.append(
+                    f"{role}: {name} can't hold the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g): {error}"
+                )
+        return (pourer, receiver) if ok else None
+
+    def reachable(self, scene: Scene, actions: Space, role: str) -> None:
+        """Some action of the space must not touch."""
+        vessels = self.scene(scene, role)
+        if vessels is None:
+            return
+        first: str | None = None
+        for chosen in _trials(actions):
+            try:
+                contact = touch(scene, scene.action(chosen), *vessels)
+            except ValueError as error:  # an action out of bounds, or a motion that can't be made
+                contact = str(error)
+            if contact is None:
+                return
+            first = first or contact
+        self.problems.append(
+            f"{role}: the vessels touch at every action that was tried; for example {first}. "
+            f"A larger x_offset or height would clear them"
+        )
+
+    def recorded(self, scene: Scene, recorded: list[Action], role: str) -> None:
+        """Weighed pours have been poured: if their vessels touch, the scene is described wrongly."""
+        vessels = self.scene(scene, role)
+        if vessels is None:
+            return
+        # The slowest to vary is the place: pours of one place and one largest tilt go through the same poses.
+        seen = set()
+        for action in recorded:
+            place = (action.x_offset, action.y_offset, action.height)
+            tilts = [a.max_angle for a in recorded if (a.x_offset, a.y_offset, a.height) == place]
+            if place in seen or action.max_angle < max(tilts):
+                continue
+            seen.add(place)
+            contact = touch(scene, action, *vessels)
+            if contact is not None:
+                shown = action.display("x_offset", "height", "max_angle")
+                self.problems.append(
+                    f"{role}: a recorded pour ({shown}) could not have been made: {contact}. Is the scene right?"
+                )
+                return
+
+
+def check_campaign(plan: CampaignPlan) -> list[str]:
+    """Build the vessels of a campaign and try its actions.
+
+    Checked for every scene: both vessels can be built and hold the liquid; some action of the space lets them stay
+    clear of each other (middle, corners and a few drawn at random are tried); recorded pours do.
+
+    Returns:
+        What is wrong, one text each; empty when the campaign can start.
+    """
+    checker = _Checker()
+    if plan.calibration is not None:
+        calibration = plan.calibration
+        if calibration.records is None:
+            checker.reachable(calibration.scene, calibration.actions, "calibration")
+        else:
+            checker.recorded(calibration.scene, [p.action for p in calibration.records.pours], "calibration.pours")
+        if calibration.transfer is not None:
+            transfer = calibration.transfer
+            checker.recorded(transfer.scene, [p.action for p in transfer.pours], "calibration.pours.transfer")
+    if plan.deployment is not None:
+        for scene in plan.deployment.scenes:
+            checker.reachable(scene, plan.deployment.actions, f"deployment into '{scene.receiver.name}'")
+    return list(dict.fromkeys(checker.problems))
+
+
+def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:
+    """Where the vessels touch during an action, in words; None when they stay clear.
+
+    Raises:
+        ValueError: the motion can't be made.
+    """
+    motion = plan_motion(scene, action, pourer, receiver)
+    reach = 2.0 * pourer.bounding_sphere[1]
+    count = max(2, int(np.ceil(action.max_angle * reach / POSE_SPACING)) + 1)
+    # Poses depend on the tilt alone: evenly spaced tilts on the way there are all that there is to see.
+    tilting = motion.phases[0].end
+    fine = np.linspace(0.0, tilting, 20 * count)
+    times = np.interp(np.linspace(0.0, action.max_angle, count), motion.tilt(fine), fine)
+    contact = first_contact(pourer, receiver, motion.sample(times))
+    if contact is None:
+        return None
+    tilt = float(motion.tilt(times[contact.index : contact.index + 1])[0])
+    return describe_contact(
+        contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
+    )
+
+
+def _trials(actions: Space) -> list[dict[str, float]]:
+    middle = [0.5] * actions.dimension
+    corners = [list(c) for c in itertools.islice(itertools.product((0.0, 1.0), repeat=actions.dimension), 64)]
+    drawn = np.random.default_rng(0).random((RANDOM_ACTIONS, actions.dimension)).tolist()
+    return [actions.decode(point) for point in (middle, *corners, *drawn)]
