@@ -1,0 +1,220 @@
+"""The recording has what people want to see, and watching never holds up or breaks a run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from actors.protocols import Frames, SimulationResult
+from orchestrator.events import LogLine
+from orchestrator.monitor.monitor import RerunMonitor
+from orchestrator.monitor.simulation import simulation_rrd
+from orchestrator.monitor.worker import Worker
+from tests.orchestrator import watched
+
+
+class Contents:
+    """What is in an .rrd: rows by entity, and the timelines they are on."""
+
+    def __init__(self, path: Path) -> None:
+        from rerun.chunk import RrdReader
+
+        reader = RrdReader(str(path))
+        self.blueprints = len(reader.blueprints())
+        self.columns: dict[str, dict[str, list[object]]] = {}
+        for chunk in reader.stream():
+            table = chunk.to_record_batch()
+            entity = self.columns.setdefault(str(chunk.entity_path), {})
+            for name, column in zip(table.schema.names, table.columns, strict=True):
+                if pa.types.is_temporal(column.type):  # nanoseconds, finer than Python's times
+                    column = column.cast(pa.int64())  # noqa: PLW2901
+                entity.setdefault(name, []).extend(column.to_pylist())
+
+    def values(self, entity: str, component: str) -> list[object]:
+        """All rows of a component, in no particular order of chunks."""
+        return [v for name, rows in self.columns[entity].items() if component in name for v in rows if v is not None]
+
+    def rows(self, entity: str, timeline: str = "wall") -> int:
+        """Rows of an entity on a timeline."""
+        return len(self.columns[entity].get(timeline, ()))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Contents:
+    path = tmp_path_factory.mktemp("run") / "campaign.rrd"
+    plan = watched.campaign()
+    monitor = RerunMonitor(path, plan)
+    for event in watched.events(plan):
+        monitor(event)
+    assert monitor.close(timeout=30.0)
+    assert (monitor.failed, monitor.dropped) == (0, 0)
+    return Contents(path)
+
+
+def test_recording_shows_both_vessels_and_the_particles_of_recorded_simulations(recorded: Contents) -> None:
+    for entity in ("/scene/pourer/mesh", "/scene/receiver/mesh"):
+        assert recorded.values(entity, "Mesh3D:vertex_positions")
+    # two simulations of 3 s at 10 Hz
+    assert recorded.rows("/scene/liquid", "sim_time") == 2 * 31
+    assert all(len(row) == watched.PARTICLES for row in recorded.values("/scene/liquid", "Points3D:positions"))  # type: ignore[arg-type]
+    states = {state for row in recorded.values("/scene/liquid", "Points3D:class_ids") for state in row}  # type: ignore[attr-defined]
+    assert states == {0, 2, 3}
+
+
+def test_pourer_moves_in_the_recording_as_it_moved_in_the_simulation(recorded: Contents) -> None:
+    quaternions = recorded.values("/scene/pourer", "Transform3D:quaternion")
+    x, y, z, w = np.array([q[0] for q in quaternions], dtype=float).T  # type: ignore[index]
+    tilts = np.degrees(2 * np.arctan2(y, w))
+    assert np.allclose((x, z), 0.0)
+    assert tilts.min() == pytest.approx(0.0, abs=1e-3)
+    assert tilts.max() == pytest.approx(90.0, abs=1e-3)
+
+
+def test_recorded_simulations_follow_each_other_on_the_timeline_of_simulated_time(recorded: Contents) -> None:
+    times = 1e-9 * np.array(recorded.columns["/scene/liquid"]["sim_time"], dtype=np.int64)
+    assert len(np.unique(times)) == len(times), "two simulations share moments and would be shown through each other"
+    assert times.max() == pytest.approx(3.0 + 0.5 + 3.0, abs=0.01)
+
+
+def test_every_pour_has_its_measured_and_predicted_loss_and_the_best_so_far(recorded: Contents) -> None:
+    def numbers(what: str) -> list[float]:
+        return sorted(float(v[0]) for v in recorded.values(f"/pours/narrow_cup/{what}", "Scalars:scalars"))  # type: ignore[index]
+
+    # (spilled + retained) / loaded of 30, 15, 10 g beside and 2 g left, of 200 g
+    assert numbers("measured") == pytest.approx([6.0, 8.5, 16.0])
+    assert numbers("best") == pytest.approx([6.0, 8.5, 16.0])
+    assert numbers("predicted") == pytest.approx([20 / 3, 10.0, 20.0])
+    assert numbers("predicted_high") == pytest.approx([20 / 3 + 4, 14.0, 24.0])
+    assert recorded.columns["/pours/narrow_cup/measured"]["pour"][-1] == 3
+
+
+def test_surrogate_maps_of_calibration_and_receiver_are_in_the_recording_with_their_observations(
+    recorded: Contents,
+) -> None:
+    for place, count in (("/maps/calibration", 1), ("/maps/narrow_cup", 3)):
+        for which in ("mean", "deviation"):
+            assert recorded.rows(f"{place}/{which}/picture") == count
+            assert recorded.rows(f"{place}/{which}/observed") == count
+    # The point (0.2, 0.3) of the unit square on a map of 9 × 9 cells of 16 pixels, the second axis upwards.
+    first = recorded.values("/maps/calibration/mean/observed", "Points2D:positions")[0][0]  # type: ignore[index]
+    assert first == pytest.approx([16 * (0.5 + 0.2 * 8), 16 * 9 - 16 * (0.5 + 0.3 * 8)], abs=1e-3)
+
+
+def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> None:
+    lines = [
+        str(v[0])  # type: ignore[index]
+        for entity in recorded.columns
+        if entity.startswith("/events/")
+        for v in recorded.values(entity, "TextLog:text")
+    ]
+    assert "pour 2: least lower bound" in lines
+    assert "the balance drifts" in lines
+    assert any(line.startswith("pour 3 of narrow cup: 6.00 %") for line in lines)
+
+
+def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_path: Path) -> None:
+    plan = watched.campaign(pours=1)
+    monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
+    for event in watched.events(plan):
+        monitor(event)
+    assert monitor.close(timeout=30.0)
+    assert Contents(monitor.path).blueprints == 1
+    checked = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(monitor.path)], capture_output=True, text=True, timeout=60
+    )
+    assert checked.returncode == 0, checked.stderr
+
+
+def test_resumed_run_keeps_the_recording_made_before_the_interruption(tmp_path: Path) -> None:
+    plan = watched.campaign()
+    first = RerunMonitor(tmp_path / "campaign.rrd", plan)
+    assert first.close()
+    before = first.path.read_bytes()
+    second = RerunMonitor(tmp_path / "campaign.rrd", plan)
+    assert second.close()
+    assert second.path.name == "campaign-2.rrd"
+    assert first.path.read_bytes() == before
+
+
+def test_recording_that_cannot_be_written_is_reported_before_the_run(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file where a folder is needed")
+    with pytest.raises(OSError, match="taken"):
+        RerunMonitor(tmp_path / "taken" / "campaign.rrd", watched.campaign())
+
+
+def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None:
+    plan = watched.campaign()
+    monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
+    told = list(watched.events(plan))
+    broken = Frames(np.array([0.0]), [np.zeros((3, 3))], [np.zeros(3, np.uint8)], np.zeros((1, 3)))
+    for event in told:
+        if getattr(event, "frames", None) is not None:
+            object.__setattr__(event, "frames", broken)
+            break
+    for event in told:
+        monitor(event)
+    assert monitor.close(timeout=30.0)
+    assert monitor.failed == 1
+    assert Contents(monitor.path).rows("/pours/narrow_cup/measured") == 3
+
+
+def test_slow_disk_drops_and_counts_events_and_never_holds_up_the_campaign() -> None:
+    release = threading.Event()
+    seen: list[int] = []
+
+    def slow(item: int) -> None:
+        release.wait(10.0)
+        seen.append(item)
+
+    worker: Worker[int] = Worker(slow, lambda: None, capacity=5, name="slow disk")
+    begin = time.monotonic()
+    taken = [worker.put(i) for i in range(1000)]
+    assert time.monotonic() - begin < 1.0
+    release.set()
+    assert worker.close(10.0)
+    assert 5 <= sum(taken) <= 6  # what waits, and what is being written
+    assert worker.dropped == 1000 - sum(taken)
+    assert len(seen) == sum(taken)
+
+
+def test_hanging_disk_does_not_keep_the_run_from_ending() -> None:
+    release = threading.Event()
+    worker: Worker[int] = Worker(lambda _: release.wait(30.0) and None, lambda: None, capacity=5, name="hanging disk")
+    worker.put(1)
+    begin = time.monotonic()
+    assert not worker.close(0.2)
+    assert time.monotonic() - begin < 2.0
+    release.set()
+
+
+def test_dropped_events_are_said_in_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = watched.campaign()
+    monitor = RerunMonitor(tmp_path / "campaign.rrd", plan, capacity=1)
+    for number in range(3000):
+        monitor(LogLine(level="info", text=f"line {number}"))
+    assert monitor.dropped > 0
+    dropped = monitor.dropped
+    assert monitor.close(timeout=30.0)
+    said = Contents(monitor.path).values("/events/recording", "TextLog:text")
+    assert said == [[f"{dropped} events are missing: the recording could not keep up"]]
+
+
+def test_simulation_recording_thins_particles_to_ten_frames_a_second(tmp_path: Path) -> None:
+    task, result = watched.simulation()
+    dense = SimulationResult(result.outcome, watched.frames(rate=50.0))
+    contents = Contents(simulation_rrd(tmp_path / "pour.rrd", task, dense))
+    assert contents.rows("/scene/liquid", "sim_time") == 31
+    assert contents.blueprints == 1
+
+
+def test_simulation_without_frames_is_refused_with_advice(tmp_path: Path) -> None:
+    task, result = watched.simulation()
+    with pytest.raises(ValueError, match="record rate above 0"):
+        simulation_rrd(tmp_path / "pour.rrd", task, SimulationResult(result.outcome))

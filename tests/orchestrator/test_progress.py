@@ -1,0 +1,151 @@
+"""What a person at the terminal, or a reader of a CI log, gets to see of a run."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from orchestrator.events import (
+    CampaignClosed,
+    CampaignOpened,
+    LogLine,
+    PourProgressed,
+    RequestFinished,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.progress import ProgressDisplay
+from orchestrator.requests import Failed, Pour, Simulate
+from orchestrator.tally import StageTally, Tally
+from tests.orchestrator import watched
+
+
+def console(*, terminal: bool) -> Console:
+    return Console(file=io.StringIO(), force_terminal=terminal, width=150, highlight=False)
+
+
+def written(display_console: Console) -> str:
+    return display_console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+def test_log_without_terminal_names_stages_pours_and_warnings_in_plain_lines() -> None:
+    plan, plain = watched.campaign(), console(terminal=False)
+    with ProgressDisplay(plan, console=plain) as display:
+        for event in watched.events(plan):
+            display(event)
+    text = written(plain)
+    assert "\x1b" not in text
+    lines = text.splitlines()
+    assert "narrow-cup begins: calibration, narrow cup; mode virtual; runs/narrow-cup-1" in lines
+    assert "calibration: stage 1 of 2" in lines
+    assert (
+        "pour 3/3 into narrow cup  angular velocity 40 deg/s, x offset 90 mm  predicted 6.67 ± 2.00 %  measured 6.00 %"
+        in lines
+    )
+    assert "the balance drifts" in lines
+    assert lines[-1].startswith("campaign finished; pool 0/2 busy · 2 simulations, 2.0 s each")
+    assert lines[-1].endswith("best so far 6.00 % (pour 3)")
+
+
+def test_log_without_terminal_has_at_most_one_progress_line_in_two_seconds() -> None:
+    now = 0.0
+    plan, plain = watched.campaign(), console(terminal=False)
+    display = ProgressDisplay(plan, console=plain, clock=lambda: now)
+    display(StageOpened(stage="calibration", index=1, count=1))
+    for step in range(100):
+        now = 0.1 * step
+        display(StrategyProgressed(stage="calibration", done=step, total=100, result={}))
+    assert len([line for line in written(plain).splitlines() if "/100" in line]) == 5  # at 0, 2, 4, 6 and 8 s
+
+
+def test_terminal_shows_bars_the_running_pours_checkpoint_and_the_pool() -> None:
+    plan, terminal = watched.campaign(), console(terminal=True)
+    display = ProgressDisplay(plan, console=terminal)
+    told = list(watched.events(plan))
+    running = next(i for i, event in enumerate(told) if isinstance(event, PourProgressed))
+    for event in told[: running + 1]:
+        display(event)
+    screen = console(terminal=False)
+    screen.print(display._render())
+    text = written(screen)
+    assert "━" in text
+    assert "pour 1/3 into narrow cup  angular velocity 40 deg/s, x offset 90 mm  predicted 20.00 ± 2.00 %" in text
+    assert "tilting" in text
+    assert "40 %" in text
+    assert "tilt 30 deg" in text
+    assert "balance 0.3 g" in text
+    assert "pool 0/2 busy · 2 simulations, 2.0 s each" in text
+
+
+def test_display_writes_nothing_to_stdout(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = watched.campaign()
+    with ProgressDisplay(plan) as display:
+        for event in watched.events(plan):
+            display(event)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "campaign finished" in captured.err
+
+
+def test_text_that_looks_like_markup_is_shown_as_it_is() -> None:
+    plain = console(terminal=False)
+    ProgressDisplay(watched.campaign(), console=plain)(LogLine(level="error", text="balance [/dev/ttyUSB0] is silent"))
+    assert written(plain).strip() == "balance [/dev/ttyUSB0] is silent"
+
+
+def test_time_left_is_estimated_from_this_runs_pace_not_from_replayed_steps() -> None:
+    tally = Tally(watched.campaign())
+    tally(StageOpened(time=0.0, stage="calibration", index=1, count=1))
+    tally(StrategyProgressed(time=5.0, stage="calibration", done=80, total=100, result={}, replayed=True))
+    tally(StrategyProgressed(time=10.0, stage="calibration", done=85, total=100, result={}))
+    stage = tally.stages["calibration"]
+    assert stage.remaining(10.0) == pytest.approx(15 * 10.0 / 5)
+
+
+def test_no_time_left_is_promised_before_anything_is_done() -> None:
+    assert StageTally("calibration", 0, 100, opened_at=0.0).remaining(50.0) is None
+
+
+def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> None:
+    plan = watched.campaign()
+    tally = Tally(plan)
+    told = list(watched.events(plan))
+    for event in told:
+        tally(event)
+    calibration_pour = next(
+        e for e in told if isinstance(e, RequestFinished) and isinstance(e.request, Pour) and e.request.number == 3
+    )
+    assert isinstance(calibration_pour.request, Pour)
+    tally(replace(calibration_pour, request=replace(calibration_pour.request, scene="tumbler", number=9)))
+    assert {scene: best.pour for scene, best in tally.best.items()} == {"narrow cup": 3}
+
+
+def test_failed_pours_and_simulations_are_shown_as_such() -> None:
+    plan = watched.campaign()
+    tally = Tally(plan)
+    tally(CampaignOpened(name="x", run_directory=watched.Path("x"), stages=("s",), mode="virtual", simulators=2))
+    simulation: Any = next(
+        e for e in watched.events(plan) if isinstance(e, RequestFinished) and isinstance(e.request, Simulate)
+    )
+    tally(replace(simulation, outcome=Failed("simulation", "diverged"), frames=None))
+    assert "1 failed" in tally.pool_line()
+    for event in watched.events(plan):
+        if isinstance(event, RequestFinished) and isinstance(event.request, Pour):
+            tally(replace(event, outcome=Failed("pour_failed", "the gripper slipped")))
+            break
+        tally(event)
+    assert "failed: the gripper slipped" in (tally.pour_line() or "")
+
+
+def test_display_can_be_left_after_a_failure_and_says_how_the_run_ended() -> None:
+    plan, terminal = watched.campaign(), console(terminal=True)
+    display = ProgressDisplay(plan, console=terminal)
+    display.__enter__()
+    display(CampaignClosed(state="failed", results={}))
+    display.__exit__(RuntimeError, RuntimeError("power cut"), None)
+    assert "campaign failed" in written(terminal)
+    assert written(terminal).rstrip().endswith("\x1b[?25h")  # the cursor is back
