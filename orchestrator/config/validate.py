@@ -46,7 +46,11 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
             locs = [_loc_in(data, detail["loc"]) for detail in details]
             cut = False
             for detail, loc in zip(details, locs, strict=True):
-                report.add(place.at(*loc), _message(model, detail, loc), key=detail["type"] == "extra_forbidden")
+                unknown = detail["type"] == "extra_forbidden"
+                report.add(place.at(*loc), _message(model, detail, loc), key=unknown)
+                if unknown and (meant := _meant(model, loc)) is not None:
+                    # Nobody needs to hear that the key is also missing.
+                    report.broken.add((place.document.path, place.at(*loc[:-1], meant).loc))
                 cut = _cut(data, loc) or cut
             if not cut:
                 return None
@@ -149,15 +153,22 @@ def _message(model: type[Section], detail: ErrorDetails, loc: Loc) -> str:
 
 def _unknown_key(model: type[Section], loc: Loc) -> str:
     key = str(loc[-1])
-    known = {name for section in _sections_at(model, loc[:-1]) for name in section.written_keys()}
-    guess = did_you_mean(key, known)
+    guess = _meant(model, loc)
     if guess is not None:
         return f"unknown key; did you mean '{guess}'?"
     if key in ACTION_DIMENSIONS:
         return f"unknown key here; fix it under 'motion: {{{key}: {EXAMPLES[key]}}}' or search it under 'actions'"
     if key in EXAMPLES:
         return f"unknown key here; it belongs under 'simulator: {{parameters: {{{key}: {EXAMPLES[key]}}}}}'"
-    return f"unknown key; known here: {', '.join(sorted(known))}"
+    return f"unknown key; known here: {', '.join(sorted(_known_keys(model, loc[:-1])))}"
+
+
+def _known_keys(model: type[Section], loc: Loc) -> set[str]:
+    return {name for section in _sections_at(model, loc) for name in section.written_keys()}
+
+
+def _meant(model: type[Section], loc: Loc) -> str | None:
+    return did_you_mean(str(loc[-1]), _known_keys(model, loc[:-1]))
 
 
 def _sections_at(model: type[Section], loc: Loc) -> set[type[Section]]:
