@@ -127,7 +127,9 @@ class Laboratory(Protocol):
     """Everything a campaign needs, opened and closed as one (`async with`)."""
 
     @property
-    def simulators(self) -> SimulatorPool: ...
+    def simulators(self) -> SimulatorPool:
+        """The pool that all simulations of a campaign share."""
+        ...
 
     @property
     def bench(self) -> Bench | None:
@@ -135,7 +137,9 @@ class Laboratory(Protocol):
         ...
 
     @property
-    def optimizer(self) -> Optimizer: ...
+    def optimizer(self) -> Optimizer:
+        """Proposes points."""
+        ...
 
     async def __aenter__(self) -> Laboratory: ...
 

@@ -1,0 +1,1 @@
+"""Balances: the protocol, a virtual one, and the actor around a driver."""

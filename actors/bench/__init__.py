@@ -1,0 +1,1 @@
+"""The virtual bench: a whole laboratory's pour without hardware."""

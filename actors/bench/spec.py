@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import PoseError
@@ -22,8 +22,8 @@ class VirtualBenchSpec:
     """
 
     liquid: SimulationParameters
-    pose_error: PoseError = PoseError()
-    pose_noise: PoseError = PoseError(speed_factor=0.0)
+    pose_error: PoseError = field(default_factory=PoseError)
+    pose_noise: PoseError = field(default_factory=lambda: PoseError(speed_factor=0.0))
     time_scale: float = 30.0
     operator_time: float = 85.0
     balance_resolution: float = 1e-4

@@ -1,0 +1,1 @@
+"""The optimiser: its pure core, and the actor around it."""

@@ -1,0 +1,1 @@
+"""Simulators as a pool: in processes of their own, or in this one."""

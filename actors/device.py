@@ -1,0 +1,156 @@
+"""A plain, blocking object (an arm, a balance, an optimiser) reached from the event loop: in a thread or in a process.
+
+Calls named urgent don't queue behind the one that is running: that is how a moving arm is stopped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+from actors.protocols import LaboratoryError
+
+
+class DeviceLostError(LaboratoryError):
+    """The device's process died during a call, or doesn't answer: nobody knows how far the call came."""
+
+
+class Device(Protocol):
+    """Calls an object's methods by name, one after the other."""
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        ...
+
+    async def call(self, method: str, *args: Any, deadline: float, urgent: bool = False) -> Any:
+        """Call a method and await its answer.
+
+        Args:
+            method: name of the object's method.
+            args: its arguments, values that travel.
+            deadline: longest time to wait [s].
+            urgent: don't queue behind other calls.
+
+        Raises:
+            DeviceLostError: its process died, or the deadline passed.
+            LaboratoryError: whatever of this kind the method raises.
+        """
+        ...
+
+    async def revive(self) -> bool:
+        """Make a new object in place of a lost one. Returns whether that was needed."""
+        ...
+
+    async def close(self) -> None:
+        """End it."""
+        ...
+
+
+class LocalDevice:
+    """The object lives in this process; its calls run in threads. The twin of `RayDevice` for tests."""
+
+    def __init__(self, name: str, make: Callable[[], Any]) -> None:
+        self.name = name
+        self._object = make()
+        self._work = ThreadPoolExecutor(1, thread_name_prefix=name)
+        self._control = ThreadPoolExecutor(2, thread_name_prefix=f"{name}-control")
+
+    async def call(self, method: str, *args: Any, deadline: float, urgent: bool = False) -> Any:
+        """See `Device.call`."""
+        executor = self._control if urgent else self._work
+        future = asyncio.wrap_future(executor.submit(getattr(self._object, method), *args))
+        done, _ = await asyncio.wait({future}, timeout=deadline)
+        if not done:
+            raise DeviceLostError(f"{self.name}: no answer to '{method}' within {deadline:g} s")
+        return future.result()
+
+    async def revive(self) -> bool:
+        """Nothing can be lost without the whole process."""
+        return False
+
+    async def close(self) -> None:
+        """See `Device.close`."""
+        for executor in (self._work, self._control):
+            executor.shutdown(wait=False, cancel_futures=True)
+
+
+class RayDevice:
+    """The object lives in a Ray actor: one thread for work, two for urgent calls. It is never restarted by Ray.
+
+    Args:
+        name: what people call it.
+        cls: the object's class, importable by workers.
+        args: arguments of its constructor.
+    """
+
+    def __init__(self, name: str, cls: type[Any], *args: Any) -> None:
+        self.name = name
+        self._class, self._args = cls, args
+        self._actor: Any = None
+        self._lost = False
+        self._start()
+
+    def _start(self) -> None:
+        import ray
+
+        actor_class = ray.remote(
+            num_cpus=0, max_restarts=0, max_task_retries=0, concurrency_groups={"work": 1, "control": 2}
+        )(self._class)
+        self._actor = actor_class.remote(*self._args)
+        self._lost = False
+
+    async def call(self, method: str, *args: Any, deadline: float, urgent: bool = False) -> Any:
+        """See `Device.call`."""
+        import ray
+
+        if self._lost:
+            raise DeviceLostError(f"{self.name}: its process has died")
+        group = "control" if urgent else "work"
+        ref = getattr(self._actor, method).options(concurrency_group=group).remote(*args)
+        future = asyncio.wrap_future(ref.future())
+        done, _ = await asyncio.wait({future}, timeout=deadline)
+        if not done:
+            # It may hang for good; a new one is made before the next pour.
+            self._lost = True
+            with contextlib.suppress(Exception):
+                ray.kill(self._actor)
+            raise DeviceLostError(f"{self.name}: no answer to '{method}' within {deadline:g} s")
+        try:
+            return future.result()
+        except ray.exceptions.RayActorError as error:
+            self._lost = True
+            raise DeviceLostError(f"{self.name}: its process died during '{method}'") from error
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, LaboratoryError | ValueError):
+                raise error.cause from None
+            raise LaboratoryError(f"{self.name}: '{method}' failed: {error.cause!r}") from error
+
+    async def revive(self) -> bool:
+        """See `Device.revive`."""
+        if not self._lost:
+            return False
+        self._start()
+        return True
+
+    async def pid(self) -> int:
+        """Process id of the actor."""
+        pid: int = await asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
+        return pid
+
+    async def close(self) -> None:
+        """See `Device.close`."""
+        import ray
+
+        self._lost = True
+        with contextlib.suppress(Exception):
+            ray.kill(self._actor)
+
+
+def _pid(_: Any) -> int:
+    import os
+
+    return os.getpid()

@@ -1,0 +1,74 @@
+"""A small process that outlives its parent by a moment, to clean up behind a parent that was killed.
+
+Ray's own processes notice the death of the program that started them, but some take half a minute. The warden holds
+the reading end of a pipe whose writing end only the parent has: when the parent is gone, for whatever reason, the pipe
+ends, and the warden ends every process that carries the session's mark and removes the session's folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+
+import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
+
+MARK = "DECANT_RAY_SESSION"
+"""Environment variable that all processes of one Ray session carry; its value is the session's folder."""
+
+
+def session_processes(folder: Path) -> list[int]:
+    """Process ids of this user that belong to a session, the asking process excepted.
+
+    Most carry the mark in their environment. Ray's agents write their titles over it, but they hold log files open.
+
+    Args:
+        folder: the session's folder, as in `MARK`.
+    """
+    return [p.pid for p in psutil.process_iter() if p.pid != os.getpid() and _belongs(p, folder)]
+
+
+def _belongs(process: psutil.Process, folder: Path) -> bool:
+    with contextlib.suppress(psutil.Error, OSError):
+        if process.environ().get(MARK) == str(folder):
+            return True
+        if "ray" in " ".join(process.cmdline()):
+            return any(folder in Path(file.path).parents for file in process.open_files())
+    return False
+
+
+def end_session(folder: Path, *, patience: float = 10.0) -> None:
+    """Kill what is left of a session and remove its folder.
+
+    Args:
+        folder: the session's folder.
+        patience: how long to go on while processes still appear or linger [s].
+    """
+    end = time.monotonic() + patience
+    while time.monotonic() < end:
+        processes = session_processes(folder)
+        if not processes:
+            break
+        for pid in processes:
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.1)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def main() -> None:
+    """Wait for the parent's end of the pipe (standard input) to close, then clean up."""
+    for sig in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(sig, signal.SIG_IGN)  # only the end of the parent counts
+    with contextlib.suppress(OSError):
+        while os.read(0, 4096):
+            pass
+    end_session(Path(sys.argv[1]))
+
+
+if __name__ == "__main__":
+    main()

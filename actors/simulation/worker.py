@@ -1,0 +1,89 @@
+"""One simulator as the pools use it: a plain class that translates between the engine and the laboratory's words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from actors.protocols import Frames, InvalidActionError, SimulationError, SimulationResult
+from sim_engine.task import PourTask
+
+
+class JobCancelledError(Exception):
+    """The job was given up because nobody waits for it any more."""
+
+
+class Simulator(Protocol):
+    """What a worker needs of the engine; `sim_engine.pour.PourSimulator` is one."""
+
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> Any:
+        """Run one pour; the answer has an `outcome` and `frames` (or None)."""
+        ...
+
+    def close(self) -> None:
+        """End it; compiled kernels are kept for the next one."""
+        ...
+
+
+def pour_simulator() -> Simulator:
+    """The engine's own simulator. Importing and starting it compiles kernels: do it where it is used."""
+    from sim_engine.pour import PourSimulator
+
+    return PourSimulator()
+
+
+class SimulationWorker:
+    """Runs jobs one after the other on one simulator.
+
+    Args:
+        make: makes the simulator, with the first job: a process that is never used compiles nothing.
+    """
+
+    def __init__(self, make: Callable[[], Simulator] = pour_simulator) -> None:
+        self._make = make
+        self._simulator: Simulator | None = None
+
+    def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulationResult:
+        """Run one pour.
+
+        Args:
+            task: what to simulate.
+            cancelled: polled between time steps.
+
+        Raises:
+            InvalidActionError: the vessels touch, or the motion is impossible.
+            JobCancelledError: `cancelled` said so.
+            SimulationError: anything else that the engine raises.
+        """
+        from sim_engine.pour import InvalidSceneError, SimulationCancelled
+
+        try:
+            if self._simulator is None:
+                self._simulator = self._make()
+            run = self._simulator.simulate(task, cancelled=cancelled)
+        except InvalidSceneError as error:
+            raise InvalidActionError(str(error)) from None
+        except SimulationCancelled:
+            raise JobCancelledError from None
+        except Exception as error:
+            raise SimulationError(f"the simulator failed: {type(error).__name__}: {error}") from error
+        return SimulationResult(run.outcome, _frames(run.frames))
+
+    def close(self) -> None:
+        """End the simulator, if there is one."""
+        simulator, self._simulator = self._simulator, None
+        if simulator is not None:
+            simulator.close()
+
+
+def _frames(recorded: Any) -> Frames | None:
+    if recorded is None:
+        return None
+    return Frames(
+        times=np.asarray(recorded.times),
+        positions=[np.asarray(p, dtype=np.float32) for p in recorded.positions],
+        states=[np.asarray(s, dtype=np.uint8) for s in recorded.states],
+        pourer_poses=np.asarray(recorded.pourer_poses),
+    )

@@ -1,0 +1,204 @@
+"""The pool of simulators: deaths, cancellation, deadlines, and its twin without Ray."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from actors.protocols import InvalidActionError, SimulationError
+from actors.simulation.in_process import InProcessSimulatorPool
+from actors.simulation.pool import RaySimulatorPool
+
+
+async def until(what, timeout=20.0):
+    end = time.monotonic() + timeout
+    while not what():
+        assert time.monotonic() < end, "waited in vain"
+        await asyncio.sleep(0.02)
+
+
+def lines(log: Path) -> list[str]:
+    return log.read_text().splitlines() if log.exists() else []
+
+
+def count(log: Path, what: str) -> int:
+    return sum(line.startswith(what) for line in lines(log))
+
+
+@pytest.fixture(params=["in_process", pytest.param("ray", marks=pytest.mark.ray)])
+def make_pool(request):
+    """Both pools, so that one test speaks for both."""
+    if request.param == "ray":
+        request.getfixturevalue("ray_running")
+        return lambda make: RaySimulatorPool(1, make=make)
+    return lambda make: InProcessSimulatorPool(make=make)
+
+
+def test_vessels_that_touch_are_an_invalid_action_and_the_pool_goes_on(make_pool, fake, task):
+    async def play():
+        pool = make_pool(fake())
+        with pytest.raises(InvalidActionError, match=r"enters the receiver by 4\.1 mm"):
+            await pool.simulate(task(name="touching"))
+        result = await pool.simulate(task())
+        await pool.close()
+        return result
+
+    assert asyncio.run(play()).outcome.seed == 1
+
+
+def test_an_error_of_the_engine_names_itself_and_the_pool_goes_on(make_pool, fake, task):
+    async def play():
+        pool = make_pool(fake())
+        with pytest.raises(SimulationError, match="ZeroDivisionError: spacing"):
+            await pool.simulate(task(name="broken"))
+        assert (await pool.simulate(task())).outcome.seed == 1
+        assert pool.statistics().deaths == 0
+        await pool.close()
+
+    asyncio.run(play())
+
+
+def test_a_cancelled_simulation_really_stops_and_the_next_one_runs_at_once(make_pool, fake, task, tmp_path):
+    log = tmp_path / "log"
+
+    async def play():
+        pool = make_pool(fake(30.0, log))
+        job = asyncio.create_task(pool.simulate(task()))
+        await until(lambda: count(log, "begin") == 1)
+        job.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await job
+        started = time.monotonic()
+        await pool.simulate(task(name="quick"))
+        waited = time.monotonic() - started
+        statistics = pool.statistics()
+        await pool.close()
+        return waited, statistics
+
+    waited, statistics = asyncio.run(play())
+    assert waited < 5.0
+    assert count(log, "cancelled") == 1
+    assert count(log, "made") == 1, "the member was kept, its compiled kernels with it"
+    assert statistics.cancelled == 1
+    assert statistics.deaths == 0
+    assert count(log, "closed") == 1
+
+
+def test_a_job_cancelled_in_the_queue_never_begins(make_pool, fake, task, tmp_path):
+    log = tmp_path / "log"
+
+    async def play():
+        pool = make_pool(fake(0.5, log))
+        first = asyncio.create_task(pool.simulate(task(seed=1)))
+        await until(lambda: count(log, "begin") == 1)
+        second = asyncio.create_task(pool.simulate(task(seed=2)))
+        await asyncio.sleep(0.05)
+        second.cancel()
+        await first
+        await pool.simulate(task(seed=3))
+        await pool.close()
+
+    asyncio.run(play())
+    assert count(log, "begin") == 2
+
+
+def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
+    async def play():
+        pool = make_pool(fake(0.3))
+        await pool.simulate(task(name="quick"))
+        before = pool.statistics().busy_s
+        await asyncio.sleep(0.3)
+        await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(3)))
+        after = pool.statistics()
+        await pool.close()
+        return after.busy_s - before, after.jobs
+
+    busy, jobs = asyncio.run(play())
+    assert jobs == 4
+    assert busy == pytest.approx(0.9, abs=0.25)
+
+
+@pytest.mark.ray
+def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_running, fake, task, tmp_path):
+    log = tmp_path / "log"
+
+    async def play():
+        pool = RaySimulatorPool(2, make=fake(1.0, log))
+        jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(4)]
+        await until(lambda: count(log, "begin") == 2)
+        victim = int(next(line for line in lines(log) if line.startswith("begin")).split()[1])
+        os.kill(victim, signal.SIGKILL)
+        results = await asyncio.gather(*jobs)
+        statistics, members = pool.statistics(), await pool.pids()
+        await pool.close()
+        return results, statistics, members, victim
+
+    results, statistics, members, victim = asyncio.run(play())
+    assert [r.outcome.seed for r in results] == [0, 1, 2, 3]
+    assert statistics.deaths == 1
+    assert len(members) == 2
+    assert victim not in members
+
+
+@pytest.mark.ray
+def test_a_job_that_kills_every_simulator_is_given_up_and_the_pool_survives(ray_running, fake, task):
+    async def play():
+        pool = RaySimulatorPool(1, make=fake(), retries=1)
+        with pytest.raises(SimulationError, match="2 simulators died over this job"):
+            await pool.simulate(task(name="deadly"))
+        assert (await pool.simulate(task())).outcome.seed == 1
+        assert pool.statistics().deaths == 2
+        await pool.close()
+
+    asyncio.run(play())
+
+
+@pytest.mark.ray
+def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_running, fake, task):
+    async def play():
+        pool = RaySimulatorPool(1, make=fake(60.0), deadline=4.0)
+        with pytest.raises(SimulationError, match="no result within 4 s"):
+            await pool.simulate(task())
+        assert (await pool.simulate(task(name="quick"))).outcome.seed == 1
+        await pool.close()
+
+    asyncio.run(play())
+
+
+@pytest.mark.ray
+def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
+    tasks = [task(seed=s, record_rate=5.0) for s in range(3)]
+
+    async def play(pool):
+        results = await asyncio.gather(*(pool.simulate(t) for t in tasks))
+        await pool.close()
+        return results
+
+    async def both():
+        return await play(RaySimulatorPool(2, make=fake())), await play(InProcessSimulatorPool(make=fake()))
+
+    for ours, twins in zip(*asyncio.run(both()), strict=True):
+        assert ours.outcome == twins.outcome
+        for a, b in zip(ours.frames.positions, twins.frames.positions, strict=True):
+            assert a.dtype == b.dtype == np.float32
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.ray
+def test_a_closed_pool_lets_no_process_live_and_says_so(ray_running, fake, task):
+    async def play():
+        pool = RaySimulatorPool(2, make=fake())
+        members = await pool.pids()
+        await pool.close()
+        await until(lambda: not any(psutil.pid_exists(pid) for pid in members))
+        with pytest.raises(SimulationError, match="closed"):
+            await pool.simulate(task())
+
+    asyncio.run(play())
