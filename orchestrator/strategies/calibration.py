@@ -26,26 +26,29 @@ class ContinuousBayesianCalibration:
     """C4: minimise O2(θ) = E_{a~g} |c_r(a) − c_s(a, θ)| with one simulation per iteration.
 
     The measured spillage is first regressed by a GP, so that a discrepancy can be formed at any action. Every iteration
-    simulates one θ at one action of the prior g; the surrogate does the averaging. In place of independent draws
-    the actions are a scrambled Sobol sequence: any run of consecutive iterations covers g evenly, so that the
-    average over an early stop or over a neighbourhood of θ is nearly the integral. And because the discrepancy
-    varies far more over actions than over θ, the surrogate knows which action each observation belongs to: it is a GP
-    over (θ, a), whose mean over g is what is minimised (`averaging='action'`). With `averaging='noise'`, as in the
-    paper, the action's influence is left to the noise term.
+    simulates one θ at one action of the prior g; the surrogate does the averaging. Two things are done
+    differently from the paper, because both lower the variance at the same price:
+
+    * In place of independent draws the actions are a scrambled Sobol sequence: any run of consecutive iterations
+      covers g evenly.
+    * The discrepancy varies far more over actions than over θ, and |·| folds away its sign. So the surrogate is a GP of
+      the signed difference c_r − c_s over (θ, a), and what is minimised is the mean over g of the absolute
+      value that it predicts (`averaging='differences'`). With `averaging='noise'`, as in the paper, the surrogate
+      sees |c_r − c_s| over θ alone and takes the action's influence for noise.
 
     g is uniform over the box of actions, but limited to where c_r is defined: actions at which less than 5 % is
     expected to be poured are left out. A simulation that failed, or poured too little for c_s to be defined,
     says nothing about its neighbours and is dropped. θ* minimises the posterior mean over the whole box: the lowest
     observation would only be the luckiest.
 
-    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); averaging over (θ, a): Toscano-Palmerin & Frazier,
-    Bayesian optimization with expensive integrands, 2018.
-    Limitations: |c_r − c_s| has a kink where the two meet, which a Matérn 5/2 kernel smooths; with
-    `averaging='noise'` the noise is heteroscedastic, large where the discrepancy varies over g.
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); a surrogate over both arguments of an expected cost:
+    Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
+    Limitations: θ that make the simulated pour stop short are judged only by the actions at which they do pour. With
+    `averaging='noise'` the optimiser sees heteroscedastic noise, large where the discrepancy varies over g.
     """
 
     def __init__(
-        self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int, *, averaging: str = "action"
+        self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int, *, averaging: str = "differences"
     ) -> None:
         """Plan the campaign; only pours of the split 'train' are used.
 
@@ -61,8 +64,8 @@ class ContinuousBayesianCalibration:
             )
         if plan.simulations < 1:
             raise ValueError(f"calibration needs a budget of simulations, got {plan.simulations}")
-        if averaging not in ("action", "noise"):
-            raise ValueError(f"averaging must be 'action' or 'noise', got {averaging!r}")
+        if averaging not in ("differences", "noise"):
+            raise ValueError(f"averaging must be 'differences' or 'noise', got {averaging!r}")
         self._plan = plan
         self._averaging = averaging
         self._seeds = SeedStream(seed, "C4")
@@ -158,7 +161,7 @@ class ContinuousBayesianCalibration:
             acquisition=acquisition,  # type: ignore[arg-type]
             kappa=self._plan.kappa,
             map_resolution=resolution,
-            context=self._actions[:CONTEXT_SIZE] if self._averaging == "action" else (),
+            context=self._actions[:CONTEXT_SIZE] if self._averaging != "noise" else (),
         )
 
     # -- listening -------------------------------------------------------------------------------------------------
@@ -178,7 +181,7 @@ class ContinuousBayesianCalibration:
             theta = self.parameters_at(point)
             action = self._plan.scene.action(self._plan.actions.decode(self._actions[index]))
             request = Simulate(self._plan.scene.name, action, theta, self._seeds.next(), "calibrate")
-            context = self._actions[index] if self._averaging == "action" else ()
+            context = self._actions[index] if self._averaging != "noise" else ()
             self._expected[request] = self._measured_at[index]
             self._trials.add(Trial(point, (request,), context))
             if suggestion.means:
@@ -193,7 +196,8 @@ class ContinuousBayesianCalibration:
         if simulated is None:
             self._undefined += 1
             return None
-        return abs(self._expected[request] - simulated)
+        difference = self._expected[request] - simulated
+        return abs(difference) if self._averaging == "noise" else difference
 
     def _conclude(self, suggestion: Suggestion) -> None:
         if not suggestion.means:
@@ -242,7 +246,8 @@ class ContinuousBayesianCalibration:
                     "theta": self._values(t.point),
                     "action_si": {name: getattr(t.requests[0].action, name) for name in self._plan.actions.names},
                     "measured": self._measured_at[i],
-                    "discrepancy": t.cost,
+                    "discrepancy": None if t.cost is None else abs(t.cost),
+                    "difference": t.cost if self._averaging == "differences" else None,
                 }
                 for i, t in enumerate(self._trials.all)
                 if t.closed

@@ -56,9 +56,10 @@ class SuggestProblem:
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has two dimensions, the answer carries the surrogate on a square grid.
         predict_at: further points at which the posterior is wanted (a regression, with `count=0`).
-        context: if given, the observations depend on further coordinates that nobody chooses (in calibration: the
-            action that was simulated), and what is minimised is the mean over these places of the context's unit
-            cube. The points of `data` then have `space.dimension` coordinates followed by those of the context.
+        context: if given, the observations are signed differences that also depend on coordinates which nobody chooses
+            (in calibration: c_r − c_s, and the action that was simulated), and what is minimised is the mean of their
+            absolute values over these places of the context's unit cube. The points of `data` then have
+            `space.dimension` coordinates followed by those of the context.
     """
 
     space: Space

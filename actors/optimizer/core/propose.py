@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from actors.optimizer.core import acquisition
-from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem, SurrogateMap
+from actors.optimizer.core.problem import Point, Suggestion, SuggestProblem, SurrogateMap
 from actors.optimizer.core.surrogate import (
-    AveragedProcess,
+    AbsoluteProcess,
     GaussianProcess,
     Surrogate,
     constant_mean_process,
@@ -44,6 +45,11 @@ def propose(problem: SuggestProblem) -> Suggestion:
     Limitations: linear algebra differs between machines in the last bits, so proposals do too: journal the answer.
     """
     _check(problem)
+    with threadpool_limits(1):  # matrices this small only lose by threads, and sums in a fixed order are repeatable
+        return _answer(problem)
+
+
+def _answer(problem: SuggestProblem) -> Suggestion:
     started = time.process_time()
     rng = np.random.default_rng(problem.seed)
     known = _observed(problem)
@@ -89,7 +95,8 @@ def _fit(problem: SuggestProblem) -> _Model | None:
         return None
     process = zero_mean_process(points, costs) if problem.mean == "zero" else constant_mean_process(points, costs)
     if problem.context:
-        return _Model(AveragedProcess(process, _array(problem.context, contextual - dimension)), process)
+        context = _array(problem.context, contextual - dimension)
+        return _Model(AbsoluteProcess(process, context), process)
     return _Model(process, process)
 
 
@@ -174,8 +181,6 @@ def _check(problem: SuggestProblem) -> None:
         raise ValueError(f"context points of different lengths: {sorted(contexts)}")
     if problem.context and problem.mean != "constant":
         raise ValueError(f"a context needs mean='constant', not {problem.mean!r}")
-    if problem.mean == "simulated" and not isinstance(problem.simulated, Data):
-        raise ValueError("mean='simulated' needs `simulated` observations")
     _check_points("context", problem.context, contexts.pop() if contexts else 0)
     contextual = dimension + (len(problem.context[0]) if problem.context else 0)
     _check_points("data", problem.data.points, contextual)

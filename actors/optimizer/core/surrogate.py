@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
+from scipy.special import ndtr
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Kernel, Matern, WhiteKernel
 
@@ -166,37 +167,29 @@ class GaussianProcess:
         W = V if second is first else solve_triangular(self._L, self._kernel(second, self.points).T, lower=True)
         return np.asarray(self.scale**2 * (self._kernel(first, second) - V.T @ W))
 
-    def averaged(self, points: Array, context: Array) -> tuple[Array, Array]:
-        """Posterior of the mean over a set of contexts.
-
-        Args:
-            points: (m, dimension − c).
-            context: (J, c), places of the last c coordinates.
-
-        Returns:
-            Means (m,) and deviations (m,) of 1/J Σ_j f(x, z_j). Needs a prior mean that is constant.
-
-        Source: the integral of a GP is Gaussian (O'Hagan, Bayes-Hermite quadrature, 1991); here a sum.
-        """
-        m, J = len(points), len(context)
-        joint = np.concatenate([np.repeat(points, J, axis=0), np.tile(context, (m, 1))], axis=1)
-        K = self._kernel(joint, self.points).reshape(m, J, -1).mean(axis=1)
-        V = solve_triangular(self._L, K.T, lower=True, check_finite=False)
-        # the kernel is stationary: the prior variance of the average is the same at every x
-        variance = float(self._kernel(joint[:J]).mean()) - np.einsum("ij,ij->j", V, V)
-        return self.mean(points) + self.scale * (K @ self._alpha), self.scale * np.sqrt(np.maximum(variance, 1e-12))
-
 
 @dataclass(frozen=True)
-class AveragedProcess:
-    """A surrogate of the mean over a context; see `GaussianProcess.averaged`."""
+class AbsoluteProcess:
+    """A surrogate of the mean absolute value over a context, of a signed quantity: 1/J Σ_j |f(x, z_j)|.
+
+    |f| of a normal f is folded normal. The deviation is the mean of the contexts' deviations of |f|, as if their errors
+    were fully correlated: an upper bound.
+
+    Source: moments of the folded normal distribution (Leone, Nelson & Nottingham, 1961).
+    """
 
     process: GaussianProcess
     context: Array
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """See `Surrogate.predict`."""
-        return self.process.averaged(points, self.context)
+        m, J = len(points), len(self.context)
+        joint = np.concatenate([np.repeat(points, J, axis=0), np.tile(self.context, (m, 1))], axis=1)
+        mean, deviation = (values.reshape(m, J) for values in self.process.predict(joint))
+        ratio = mean / deviation
+        folded = deviation * math.sqrt(2 / math.pi) * np.exp(-0.5 * ratio**2) + mean * (2 * ndtr(ratio) - 1)
+        spread = np.sqrt(np.maximum(mean**2 + deviation**2 - folded**2, 0.0))
+        return folded.mean(axis=1), np.maximum(spread.mean(axis=1), 1e-9 * self.process.scale)
 
 
 def constant_mean_process(points: Array, costs: Array) -> GaussianProcess:
