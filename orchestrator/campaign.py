@@ -25,7 +25,7 @@ from orchestrator.fingerprint import fingerprint
 from orchestrator.journal import JOURNAL_NAME, Header, Journal, JournalReader, Kind
 from orchestrator.lanes import Deadlines, LaneError, Lanes
 from orchestrator.plan import CampaignPlan
-from orchestrator.replay import StageHistory, read_history
+from orchestrator.replay import StageHistory, read_history, replayed_events
 from orchestrator.runs import write_provenance
 from orchestrator.scheduler import StageScheduler
 from orchestrator.stages import StageDefinition, scenes_of, stage_seed, stages_of
@@ -195,6 +195,8 @@ class _Run:
         )
         self._watchers.emit(opened)
         if history.result is not None:
+            for event in replayed_events(history, stage.name):
+                self._watchers.emit(event)
             self._watchers.emit(StageClosed(stage=stage.name, replayed=True, result=history.result))
             return history.result
         seed = stage_seed(self._plan.seed, stage.name)

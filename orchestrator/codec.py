@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
+from orchestrator.errors import RunError
 from orchestrator.requests import Outcome, Request
 
 T = TypeVar("T")
@@ -26,7 +27,7 @@ _FLOAT = "$float"
 _TYPE = "type"
 
 
-class CodecError(ValueError):
+class CodecError(RunError, ValueError):
     """A value that can't be written, or a text that can't be read back."""
 
 

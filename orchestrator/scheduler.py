@@ -32,7 +32,7 @@ from orchestrator.events import (
 from orchestrator.flights import Flight, Order, free_slots, is_recorded, next_to_tell
 from orchestrator.journal import Draft, Journal, Kind
 from orchestrator.lanes import Lanes
-from orchestrator.replay import StageHistory, ToldStep, replay
+from orchestrator.replay import StageHistory, replay, replayed_events
 from orchestrator.requests import Decision, Outcome, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.strategies.protocol import Strategy
 
@@ -114,17 +114,8 @@ class StageScheduler:
             )
         self._decisions = history.decisions
         self._ask_is_due = history.ask_is_due
-        for step in history.steps:
-            if isinstance(step, ToldStep):
-                event = RequestFinished(
-                    time=step.t,
-                    stage=self._stage,
-                    replayed=True,
-                    id=step.id,
-                    request=history.request(step.id),
-                    outcome=history.outcomes[step.id],
-                )
-                self._watchers.emit(event)
+        for event in replayed_events(history, self._stage):
+            self._watchers.emit(event)
         if history.steps:
             self._report_progress()
 

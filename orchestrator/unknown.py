@@ -118,9 +118,9 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
 async def _ask(
     ask: AskOperator | None, question: str, options: Sequence[str], loaded: float, on_waiting: Callable[[str], None]
 ) -> tuple[str, Outcome | None]:
-    how = f"answers: {'; '.join(options)} (masses in grams)"
+    how = f"Resume with one of these answers: {'; '.join(options)} (masses in grams)"
     if ask is None:
-        raise OperatorNeededError(f"{question} Nobody is here to be asked. Resume with an answer: {how}")
+        raise OperatorNeededError(f"{question} Nobody is here to be asked. {how}")
     on_waiting(question)
     text = question
     for _ in range(_TRIES):
@@ -130,7 +130,7 @@ async def _ask(
             return answer, parse_answer(answer, options, loaded)
         except ValueError as error:
             text = f"{question}\n{error}"
-    raise OperatorNeededError(f"{text}. Resume with an answer: {how}")
+    raise OperatorNeededError(f"{text}. {how}")
 
 
 def _searched(scene: Scene, pour: Pour) -> tuple[str, ...]:

@@ -1,0 +1,180 @@
+"""Requests and outcomes survive the journal bit for bit: a replay must tell what the live run told."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem, SurrogateMap
+from orchestrator.codec import (
+    CodecError,
+    canonical,
+    decode_outcome,
+    decode_request,
+    encode_outcome,
+    encode_request,
+    first_difference,
+    from_json,
+    to_json,
+)
+from orchestrator.plan import CampaignPlan
+from orchestrator.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
+from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.liquid import SimulationParameters
+from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.space import Axis, Space
+from tests.orchestrator.toy import toy_plan
+
+number = st.floats(allow_nan=False, allow_infinity=False)
+fraction = st.floats(0, 1)
+seed = st.integers(0, 2**63)
+point = st.tuples(fraction, fraction)
+
+
+def dimension(name: str) -> st.SearchStrategy[float | None]:
+    d = ACTION_DIMENSIONS[name]
+    values = st.floats(d.lower, d.upper)
+    return st.none() | values if d.optional else values
+
+
+actions = st.builds(Action, **{name: dimension(name) for name in ACTION_DIMENSIONS})
+parameters = st.builds(
+    SimulationParameters,
+    particles=st.integers(200, 50_000),
+    cohesion=st.floats(0, 0.2),
+    viscosity=st.floats(0, 60),
+    friction=st.floats(0, 1),
+)
+
+
+@st.composite
+def data(draw: st.DrawFn) -> Data:
+    points = draw(st.lists(point, max_size=4))
+    return Data(tuple(points), tuple(draw(number) for _ in points))
+
+
+space = Space((Axis("particles", 500, 4000, "log", integer=True), Axis("cohesion", 0.0, 0.1)))
+problems = st.builds(
+    SuggestProblem,
+    space=st.just(space),
+    data=data(),
+    pending=st.lists(point, max_size=3).map(tuple),
+    count=st.integers(1, 9),
+    seed=seed,
+    mean=st.sampled_from(["constant", "zero", "simulated"]),
+    simulated=data(),
+    kappa=number,
+)
+rows = st.lists(st.lists(number, max_size=3).map(tuple), max_size=3).map(tuple)
+suggestions = st.builds(
+    Suggestion,
+    points=st.lists(point, max_size=3).map(tuple),
+    means=st.lists(number, max_size=3).map(tuple),
+    best_point=st.none() | point,
+    best_mean=st.none() | number,
+    hyperparameters=st.none() | st.dictionaries(st.text(), number, max_size=3),
+    surrogate=st.none() | st.builds(SurrogateMap, rows, rows),
+)
+outcomes = st.builds(
+    PourOutcome,
+    **dict.fromkeys(
+        ("received", "spilled", "retained", "in_flight", "escaped", "spacing", "density_error", "simulated_time"),
+        number,
+    ),
+    cpu_s=number,
+    particles=st.integers(0, 10**6),
+    steps=st.integers(0, 10**6),
+    seed=seed,
+    curve_times=st.lists(number, max_size=4).map(tuple),
+    invalid=st.none() | st.text(),
+)
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | number | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+measurements = st.builds(PourMeasurement, number, number, number, st.dictionaries(st.text(), json_values, max_size=3))
+
+
+def through_json(written: Any) -> Any:
+    return json.loads(canonical(written))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(
+        st.builds(Simulate, st.text(), actions, parameters, seed, st.text()),
+        st.builds(
+            Pour,
+            st.text(),
+            actions,
+            st.integers(1, 99),
+            seed,
+            st.none() | st.builds(Prediction, number, number),
+            st.text(),
+        ),
+        st.builds(Suggest, problems),
+    )
+)
+def test_requests_survive_bit_for_bit(request: Simulate | Pour | Suggest) -> None:
+    written = encode_request(request)
+    read = decode_request(through_json(written))
+    assert read == request
+    assert hash(read) == hash(request)  # strategies keep requests in dictionaries
+    assert canonical(encode_request(read)) == canonical(written)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(
+        st.builds(Simulated, outcomes),
+        st.builds(Poured, measurements),
+        st.builds(Suggested, suggestions),
+        st.builds(Failed, st.text(), st.text()),
+    )
+)
+def test_outcomes_survive_bit_for_bit(outcome: Simulated | Poured | Suggested | Failed) -> None:
+    written = encode_outcome(outcome)
+    assert decode_outcome(through_json(written)) == outcome
+
+
+def test_a_whole_plan_survives(tmp_path: Any) -> None:
+    plan = toy_plan(tmp_path)
+    assert from_json(through_json(to_json(plan, CampaignPlan)), CampaignPlan) == plan
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_json_can_not_say_is_said_otherwise(value: float) -> None:
+    written = encode_outcome(Poured(PourMeasurement(value, 0.0, 0.0, {"reading": value})))
+    read = decode_outcome(through_json(written))
+    assert isinstance(read, Poured)
+    assert str(read.measurement.loaded) == str(read.measurement.notes["reading"]) == str(value)
+
+
+def test_whole_numbers_given_for_floats_are_the_same_request() -> None:
+    assert canonical(encode_request(Suggest(SuggestProblem(space, Data(), kappa=2)))) == canonical(
+        encode_request(Suggest(SuggestProblem(space, Data(), kappa=2.0)))
+    )
+
+
+def test_entries_of_a_newer_version_are_refused_by_name() -> None:
+    written = encode_outcome(Failed("simulation", "diverged"))
+    with pytest.raises(CodecError, match="Failed has no field severity"):
+        decode_outcome({**written, "severity": 3})
+    with pytest.raises(CodecError, match="'Exploded'"):
+        decode_outcome({**written, "type": "Exploded"})
+    with pytest.raises(CodecError, match=r"Failed\.kind: expected str, got 3"):
+        decode_outcome({**written, "kind": 3})
+
+
+def test_the_first_difference_is_named() -> None:
+    old = {"action": {"x_offset": 0.1}, "seed": 4, "points": [1.0, 2.0]}
+    assert first_difference(old, old) is None
+    assert first_difference(old, {**old, "points": [1.0, 2.5]}) == "points[1]: 2.0 became 2.5"
+    assert first_difference(old, {**old, "action": {"x_offset": 0.2}}) == "action.x_offset: 0.1 became 0.2"
+    assert first_difference(old, {**old, "new": 1}) == "new: nothing became 1"

@@ -1,0 +1,189 @@
+"""The stages that a plan asks for, with the real strategies and the real optimiser on a toy laboratory."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from actors.optimizer.core.propose import propose
+from orchestrator.codec import canonical
+from orchestrator.errors import RunError
+from orchestrator.events import Event, RequestFinished
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordedPour, RecordSet
+from orchestrator.requests import Pour, Simulate
+from orchestrator.stages import scenes_of, stages_of
+from sim_engine.losses import Loss
+from sim_engine.space import Axis, Space
+from sim_engine.vessel.spec import cylinder
+from tests.orchestrator.toy import SCENE, SPACE, ToyLaboratory, logical_record, run_toy, toy_plan
+
+NARROW = replace(SCENE, name="narrow", receiver=cylinder("narrow", inner_radius=0.02, inner_height=0.1))
+PARAMETERS = Space((Axis("cohesion", 0.0, 0.1), Axis("friction", 0.0, 0.5)))
+
+
+class Optimizer:
+    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+        return propose(problem)
+
+
+def laboratory() -> ToyLaboratory:
+    return ToyLaboratory(optimizer=Optimizer())  # type: ignore[arg-type]
+
+
+def calibration(**changes: Any) -> CalibrationPlan:
+    plan = CalibrationPlan(
+        strategy="C4",
+        scene=SCENE,
+        actions=SPACE,
+        parameters=PARAMETERS,
+        fixed_parameters={"particles": 700, "viscosity": 4.0},
+        pour_count=5,
+        holdout=1,
+        records=None,
+        transfer=None,
+        simulations=5,
+        random_baseline=3,
+        initial=4,
+    )
+    return replace(plan, **changes)
+
+
+def campaign(directory: Path, **changes: Any) -> CampaignPlan:
+    deployment = DeploymentPlan(
+        "D3", (SCENE, NARROW), SPACE, Loss(), pours=2, prior_simulations=4, per_pour=2, initial=3
+    )
+    values = {"calibration": calibration(), "deployment": deployment, "on_unknown": "repeat"}
+    return toy_plan(directory, **(values | changes))
+
+
+def records(split: str, scene: Any, count: int) -> RecordSet:
+    pours = [
+        RecordedPour(scene.action(SPACE.decode([(i + 0.5) / count, 0.5])), 0.19, 0.01 * (i + 1), 0.01, split)
+        for i in range(count)
+    ]
+    return RecordSet(scene, tuple(pours), Path("pours.csv"))
+
+
+def run(directory: Path, plan: CampaignPlan, **arguments: Any) -> Any:
+    return asyncio.run(run_toy(directory, laboratory(), plan=plan, stages=None, **arguments))
+
+
+def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path: Path) -> None:
+    events: list[Event] = []
+    result = run(tmp_path / "run", campaign(tmp_path), watchers=[events.append])
+    assert list(result.results) == ["pours", "calibration", "evaluation", "deployment:cup", "deployment:narrow"]
+    theta = result.results["calibration"]["theta"]
+    assert (theta["particles"], theta["viscosity"]) == (700, 4.0)
+    done = [e for e in events if isinstance(e, RequestFinished)]
+    deployed = [e.request for e in done if e.stage.startswith("deployment") and isinstance(e.request, Simulate)]
+    assert deployed
+    assert {canonical(request.parameters.model_dump()) for request in deployed} == {canonical(theta)}
+    assert {r.request.scene for r in done if r.stage == "deployment:narrow" and isinstance(r.request, Pour)} == {
+        "narrow"
+    }
+    evaluation = result.results["evaluation"]
+    assert set(evaluation["discrepancy"]) == {"theta", "random 1", "random 2", "random 3"}
+    assert evaluation["discrepancy"]["theta"].keys() == {"test", "train"}
+    assert evaluation["random_median"].keys() == {"test"}  # random θ are not simulated on training pours
+    assert evaluation["mean_predictor"]["test"] is not None
+    assert evaluation["regression"]["test"] is not None
+
+
+def test_the_real_strategies_resume_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    run(tmp_path / "undisturbed", campaign(tmp_path))
+    expected = logical_record(tmp_path / "undisturbed")
+    told = [i for i, entry in enumerate(expected) if entry[1] == "told"]
+    directory, resume = tmp_path / "run", False
+    for fraction in (0.15, 0.4, 0.6, 0.75, 0.9):
+        with pytest.raises(asyncio.CancelledError):
+            run(directory, campaign(tmp_path), resume=resume, watchers=[Stopper(int(fraction * len(told)))])
+        resume = True
+        assert logical_record(directory) == expected[: len(logical_record(directory))]
+    run(directory, campaign(tmp_path), resume=True)
+    assert logical_record(directory) == expected
+
+
+class Stopper:
+    """Pauses the run that it watches after so many outcomes."""
+
+    def __init__(self, outcomes: int) -> None:
+        self._left = outcomes
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, RequestFinished):
+            self._left -= 1
+            if self._left == 0:
+                main = next(t for t in asyncio.all_tasks() if t.get_coro().__name__ == "run_toy")  # type: ignore[union-attr]
+                main.cancel()
+
+
+def test_records_take_the_place_of_pours(tmp_path: Path) -> None:
+    plan = calibration(
+        pour_count=0,
+        records=records("train", SCENE, 4),
+        transfer=records("transfer", NARROW, 2),
+        random_baseline=2,
+    )
+    result = run(tmp_path / "run", campaign(tmp_path, calibration=plan, deployment=None))
+    assert list(result.results) == ["calibration", "evaluation"]
+    assert result.pours == 0
+    evaluation = result.results["evaluation"]
+    assert set(evaluation["discrepancy"]["theta"]) == {"train", "transfer"}
+    assert set(evaluation["random_median"]) == {"transfer"}
+    assert evaluation["regression"] == {}  # no answer for another vessel
+    assert {pair["scene"] for pair in evaluation["pairs"] if pair["split"] == "transfer"} == {"narrow"}
+
+
+def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> None:
+    events: list[Event] = []
+    plan = calibration(pour_count=0, records=records("train", SCENE, 4), transfer=records("transfer", NARROW, 3))
+    run(tmp_path / "run", campaign(tmp_path, calibration=plan, deployment=None), watchers=[events.append])
+    seeds: dict[str, set[tuple[Any, int]]] = {}
+    for event in events:
+        if isinstance(event, RequestFinished) and event.stage == "evaluation" and isinstance(event.request, Simulate):
+            request = event.request
+            if request.scene == "narrow":
+                theta = canonical(request.parameters.model_dump())
+                seeds.setdefault(theta, set()).add((request.action, request.seed))
+    assert len(seeds) == 4
+    assert len({frozenset(of_theta) for of_theta in seeds.values()}) == 1
+
+
+@pytest.mark.parametrize(
+    ("strategy", "per_pour", "order"),
+    [("D3", 2, "logical"), ("D3", 0, "logical"), ("D3", None, "completion"), ("D2", None, "logical")],
+)
+def test_only_free_simulation_beside_pours_lets_the_clock_decide(
+    tmp_path: Path, strategy: Any, per_pour: int | None, order: str
+) -> None:
+    plan = campaign(tmp_path)
+    assert plan.deployment is not None
+    plan = replace(plan, deployment=replace(plan.deployment, strategy=strategy, per_pour=per_pour))
+    assert {stage.order for stage in stages_of(plan) if stage.name.startswith("deployment")} == {order}
+    assert all(stage.order == "logical" for stage in stages_of(plan) if not stage.name.startswith("deployment"))
+
+
+def test_free_simulations_fill_the_time_of_a_pour(tmp_path: Path) -> None:
+    plan = campaign(tmp_path, calibration=None)
+    assert plan.deployment is not None
+    plan = replace(plan, deployment=replace(plan.deployment, per_pour=None, scenes=(SCENE,), prior_simulations=3))
+    room = laboratory()
+    assert room.bench is not None
+    room.bench.pauses = lambda: 0.3
+    events: list[Event] = []
+    asyncio.run(run_toy(tmp_path / "run", room, plan=plan, stages=None, watchers=[events.append]))
+    finished = [e.request for e in events if isinstance(e, RequestFinished)]
+    first = next(i for i, request in enumerate(finished) if isinstance(request, Pour))
+    assert sum(isinstance(request, Simulate) for request in finished[:first]) > 3
+
+
+def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
+    assert set(scenes_of(campaign(tmp_path))) == {"cup", "narrow"}
+    plan = campaign(tmp_path, calibration=calibration(scene=replace(NARROW, name="cup")))
+    with pytest.raises(RunError, match="two different scenes are both named 'cup'"):
+        scenes_of(plan)
