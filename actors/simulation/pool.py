@@ -20,7 +20,10 @@ RETRIES = 2
 """How often a job is given to another member after one died over it."""
 
 DEADLINE = 1800.0
-"""Longest time for one job on one member [s], its start included: half an hour means dead, not slow."""
+"""Longest time for one job on one member [s]: half an hour means dead, not slow."""
+
+START_DEADLINE = 120.0
+"""Longest time for a member's process to start [s]."""
 
 DRAIN_DEADLINE = 10.0
 """Time a cancelled job has to stop [s]; then its member is replaced."""
@@ -35,13 +38,14 @@ class _Member:
 
     number: int
     actor: Any
+    up: asyncio.Future[Any]
 
 
 class RaySimulatorPool:
     """`SimulatorPool` over Ray actors. Jobs wait for the next idle member in the order in which they came.
 
     Simulations are idempotent, so a job whose member died is done again by another one. Needs a running Ray
-    (`actors.ray_runtime`).
+    (`actors.ray_runtime`), and is made inside an event loop.
 
     Args:
         size: number of members.
@@ -106,7 +110,9 @@ class RaySimulatorPool:
         ref = member.actor.simulate.remote(task)
         answer = asyncio.wrap_future(ref.future())
         try:
-            done, _ = await asyncio.wait({answer}, timeout=self._deadline)
+            waiting = {answer, member.up}
+            await asyncio.wait(waiting, timeout=START_DEADLINE, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait({answer}, timeout=self._deadline if member.up.done() else 0.0)
         except asyncio.CancelledError:
             # The member is idle again when it has noticed, not before: the next job must not wait behind a dead one.
             self._account.cancelled += 1
@@ -116,14 +122,15 @@ class RaySimulatorPool:
         if not done:
             self._replace(member)
             answer.add_done_callback(_look_away)
+            if not member.up.done():
+                raise SimulationError(f"a simulator's process did not start within {START_DEADLINE:g} s")
             raise SimulationError(f"no result within {self._deadline:g} s; its simulator was replaced")
         try:
             result: SimulationResult = answer.result()
         except ray.exceptions.RayActorError as error:
-            if "__init__" in str(error) and "died because of an error raised in its creation" in str(error):
-                self._replace(member)
-                raise SimulationError(f"a simulator does not start: {_last_line(error)}") from error
             self._replace(member)
+            if "error raised in its creation task" in str(error):
+                raise SimulationError(f"a simulator's process does not start: {_last_line(error)}") from error
             return None
         except ray.exceptions.RayTaskError as error:
             self._release(member)
@@ -138,7 +145,10 @@ class RaySimulatorPool:
 
     def _add(self) -> None:
         self._numbers += 1
-        member = _Member(self._numbers, simulator_actor(self._make, cpus=self._cpus))
+        actor = simulator_actor(self._make, cpus=self._cpus)
+        up = asyncio.wrap_future(actor.pid.remote().future())
+        up.add_done_callback(_look_away)
+        member = _Member(self._numbers, actor, up)
         self._members[member.number] = member
         self._idle.put_nowait(member)
 

@@ -1,0 +1,114 @@
+"""The virtual arm: scaled time, what it reads back, and a stop that does not queue behind the motion."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import numpy as np
+import pytest
+
+from actors.arm.actor import DeviceArm
+from actors.arm.virtual_arm import POSITION_NOISE, Grip, VirtualArm
+from actors.bench.planning import plan_pour
+from actors.device import LocalDevice, RayDevice
+from actors.protocols import LaboratoryError
+
+
+@pytest.fixture
+def motion(scene, action):
+    return plan_pour(scene, action)
+
+
+def test_arm_reads_back_the_motion_it_was_given_up_to_its_repeatability(motion):
+    executed = VirtualArm(0.0).execute(motion)
+    assert executed.completed
+    assert executed.times[-1] == pytest.approx(motion.duration)
+    difference = executed.poses - motion.sample(executed.times)
+    assert np.abs(difference[:, :3]).max() < 6 * POSITION_NOISE
+    assert np.abs(difference[:, :3]).max() > 0.0
+    assert np.abs(difference[:, 3:]).max() < 1e-12
+
+
+def test_a_slow_arm_takes_longer_over_the_tilt_and_reaches_the_same_angle(motion):
+    arm = VirtualArm(0.0)
+    arm.grip(Grip(speed_factor=0.8))
+    executed = arm.execute(motion)
+    tilted = motion.phases[0].end
+    assert executed.times[-1] == pytest.approx(motion.duration + tilted / 0.8 - tilted)
+    tilts = executed.motion.tilt(executed.times)
+    assert tilts.max() == pytest.approx(np.deg2rad(100.0), abs=1e-6)
+    assert np.interp(tilted, executed.times, tilts) < np.deg2rad(90.0)
+
+
+def test_same_grip_reads_back_the_same_bits_at_any_pace_and_after_other_pours(motion):
+    fresh, used = VirtualArm(0.0), VirtualArm(40.0)
+    used.execute(motion)
+    for arm in (fresh, used):
+        arm.grip(Grip(1.03, (5, 3)))
+    a, b = fresh.execute(motion), used.execute(motion)
+    np.testing.assert_array_equal(a.poses, b.poses)
+    np.testing.assert_array_equal(a.times, b.times)
+
+
+@pytest.mark.parametrize("scale", [10.0, 40.0])
+def test_motion_takes_its_duration_over_the_time_scale(motion, scale):
+    arm = VirtualArm(scale)
+    started = time.monotonic()
+    arm.execute(motion)
+    assert motion.duration / scale <= time.monotonic() - started + 1e-3 < motion.duration / scale + 0.3
+
+
+@pytest.fixture(params=["thread", pytest.param("process", marks=pytest.mark.ray)])
+def make_arm(request):
+    if request.param == "process":
+        request.getfixturevalue("ray_running")
+        return lambda scale: DeviceArm(RayDevice("arm", VirtualArm, scale), scale)
+    return lambda scale: DeviceArm(LocalDevice("arm", lambda: VirtualArm(scale)), scale)
+
+
+def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, motion):
+    async def play():
+        arm = make_arm(0.2)
+        pouring = asyncio.create_task(arm.execute(motion))
+        while not (await arm.state()).moving or (await arm.state()).time < 0.1:
+            await asyncio.sleep(0.02)
+        started = time.monotonic()
+        await arm.stop()
+        executed = await pouring
+        took = time.monotonic() - started
+        with pytest.raises(LaboratoryError, match="release"):
+            await arm.execute(motion)
+        await arm.release()
+        going = asyncio.create_task(arm.move_to_start(motion))
+        await asyncio.sleep(0.1)
+        moving = await arm.state()
+        await arm.stop()
+        with pytest.raises(LaboratoryError, match="nothing was poured"):
+            await going
+        await arm.device.close()
+        return executed, took, moving
+
+    executed, took, moving = asyncio.run(play())
+    assert took < 1.0
+    assert not executed.completed
+    assert 0.05 < executed.times[-1] < 1.5 < motion.duration
+    assert moving.moving
+    assert moving.phase == "approach"
+
+
+def test_progress_follows_the_tilt_through_the_phases(make_arm, motion):
+    seen = []
+
+    async def play():
+        arm = make_arm(2.0)
+        await arm.execute(motion, seen.append)
+        await arm.device.close()
+
+    asyncio.run(play())
+    moving = [state for state in seen if state.moving]
+    assert len(moving) >= 5
+    assert [s.fraction for s in moving] == sorted(s.fraction for s in moving)
+    assert list(dict.fromkeys(s.phase for s in moving)) == ["tilt", "hold", "return"]
+    for state in moving:
+        assert state.tilt == pytest.approx(float(motion.tilt(np.array([state.time]))[0]), abs=1e-6)

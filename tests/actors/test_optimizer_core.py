@@ -1,0 +1,190 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actors.optimizer.core.problem import Data, SuggestProblem
+from actors.optimizer.core.propose import propose
+from sim_engine.space import Axis, Space
+
+PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
+
+
+def data_of(points, costs) -> Data:
+    return Data(tuple(tuple(map(float, p)) for p in points), tuple(map(float, costs)))
+
+
+def bowl(points, centre=(0.3, 0.6)):
+    return 2.0 * ((np.asarray(points) - centre) ** 2).sum(axis=1)
+
+
+def cover(n, seed=0, dimension=2):
+    return np.random.default_rng(seed).random((n, dimension))
+
+
+coordinate = st.sampled_from([0.0, 0.25, 0.5, 0.5000001, 1.0]) | st.floats(0.0, 1.0)
+cost = st.sampled_from([0.0, 1.0, 1.0]) | st.floats(-1e6, 1e6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    observed=st.lists(st.tuples(coordinate, coordinate, cost), max_size=12),
+    simulated=st.lists(st.tuples(coordinate, coordinate, cost), max_size=8),
+    pending=st.lists(st.tuples(coordinate, coordinate), max_size=3),
+    mean=st.sampled_from(["constant", "zero", "simulated"]),
+    acquisition=st.sampled_from(["lcb", "posterior_minimum", "random", "sobol"]),
+    count=st.integers(0, 3),
+    seed=st.integers(0, 2**31),
+)
+def test_any_finite_data_gives_finite_proposals_inside_the_cube(
+    observed, simulated, pending, mean, acquisition, count, seed
+):
+    problem = SuggestProblem(
+        PLANE,
+        data_of([p[:2] for p in observed], [p[2] for p in observed]),
+        pending=tuple(pending),
+        count=count,
+        seed=seed,
+        mean=mean,
+        simulated=data_of([p[:2] for p in simulated], [p[2] for p in simulated]),
+        acquisition=acquisition,
+    )
+    answer = propose(problem)
+    assert len(answer.points) == count
+    assert all(len(p) == 2 and all(0.0 <= u <= 1.0 for u in p) for p in answer.points)
+    assert all(map(math.isfinite, (*answer.means, *answer.deviations)))
+    assert all(s > 0.0 for s in answer.deviations)
+    assert answer.best_mean is None or math.isfinite(answer.best_mean)
+
+
+def test_the_same_question_gets_the_same_answer_and_another_seed_another():
+    points = cover(12)
+    problem = SuggestProblem(PLANE, data_of(points, bowl(points)), count=2, seed=3, acquisition="lcb")
+    first, again = propose(problem), propose(problem)
+    assert (first.points, first.means, first.hyperparameters) == (again.points, again.means, again.hyperparameters)
+    drawn = [propose(SuggestProblem(PLANE, Data(), seed=s, acquisition="random")).points for s in (1, 2)]
+    assert drawn[0] != drawn[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"data": Data(((0.1, 0.2), (0.3, 0.4)), (0.5, float("nan")))}, "cost 1 is nan"),
+        ({"data": Data(((0.1, float("inf")),), (0.5,))}, "point 0"),
+        ({"data": Data(((0.1,),), (0.5,))}, "has 1 coordinates, expected 2"),
+        ({"kappa": float("nan")}, "kappa"),
+        ({"count": -1}, "count"),
+        ({"map_resolution": 10_000}, "map_resolution"),
+        ({"context": ((0.5,),), "mean": "zero"}, "context needs mean='constant'"),
+    ],
+)
+def test_a_question_that_cannot_be_answered_is_refused_with_its_number(change, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        propose(SuggestProblem(**{"space": PLANE, "data": Data(), **change}))
+
+
+def test_the_minimum_of_a_smooth_cost_is_found_in_a_few_steps():
+    data = Data()
+    for step in range(15):
+        point = propose(SuggestProblem(PLANE, data, seed=step)).points[0]
+        data = data.added(point, float(bowl([point])[0]))
+    best = propose(SuggestProblem(PLANE, data, acquisition="posterior_minimum")).points[0]
+    assert np.linalg.norm(np.array(best) - (0.3, 0.6)) < 0.05
+
+
+def test_on_a_plateau_it_keeps_looking_where_nothing_is_known():
+    corner = 0.3 * cover(6)  # everything spilled in one corner
+    answer = propose(SuggestProblem(PLANE, data_of(corner, np.ones(6))))
+    assert min(np.linalg.norm(np.array(answer.points[0]) - p) for p in corner) > 0.3
+    assert answer.deviations[0] > 0.01
+
+
+def test_duplicates_that_disagree_are_taken_for_noise():
+    points = np.array([[0.5, 0.5]] * 6 + [[0.1, 0.1]] * 6)
+    costs = np.array([0.4, 0.6] * 3 + [0.85, 0.95] * 3)
+    answer = propose(SuggestProblem(PLANE, data_of(points, costs), count=0, predict_at=((0.5, 0.5), (0.1, 0.1))))
+    assert answer.predictions == pytest.approx((0.5, 0.9), abs=0.06)
+    assert 0.03 < answer.hyperparameters["noise"] < 0.3
+
+
+def test_the_best_point_is_not_the_luckiest():
+    good, tempting, bad = (0.2, 0.5), (0.6, 0.5), (0.9, 0.9)
+    costs = [0.18, 0.22, 0.25, 0.15, 0.2, 0.05, 0.6, 0.55, 0.5, 0.62, 0.9, 0.92]  # 0.05: one lucky pour
+    data = data_of([good] * 5 + [tempting] * 5 + [bad] * 2, costs)
+    answer = propose(SuggestProblem(PLANE, data, count=0))
+    assert answer.best_point == good
+    assert answer.best_mean == pytest.approx(0.2, abs=0.1)
+
+
+def test_points_that_are_still_out_are_not_asked_for_again():
+    points = cover(12, 1)
+    data = data_of(points, bowl(points))
+    alone = propose(SuggestProblem(PLANE, data)).points[0]
+    beside = propose(SuggestProblem(PLANE, data, pending=(alone,))).points[0]
+    assert math.dist(alone, beside) > 0.05
+    several = propose(SuggestProblem(PLANE, data, count=4)).points
+    assert min(math.dist(p, q) for i, p in enumerate(several) for q in several[:i]) > 0.05
+
+
+def test_without_data_points_are_spread_over_the_cube():
+    points = np.array(propose(SuggestProblem(PLANE, Data(), count=8, seed=5)).points)
+    quarters = {(int(2 * x), int(2 * y)) for x, y in points}
+    assert len(quarters) == 4
+    one = Data(((0.1, 0.1),), (0.5,))
+    assert math.dist(propose(SuggestProblem(PLANE, one)).points[0], (0.1, 0.1)) > 0.5
+
+
+def test_simulations_are_the_prior_mean_and_pours_correct_it():
+    simulated = cover(30, 2)
+    sims = data_of(simulated, bowl(simulated))
+    shifted = cover(6, 3)
+    places = ((0.2, 0.2), (0.3, 0.6), tuple(map(float, shifted[0])))
+    prior = propose(SuggestProblem(PLANE, Data(), mean="simulated", simulated=sims, count=0, predict_at=places))
+    assert prior.predictions == pytest.approx(bowl(places), abs=0.05)
+    real = data_of(shifted, bowl(shifted) + 0.4)  # reality spills 0.4 more everywhere
+    corrected = propose(SuggestProblem(PLANE, real, mean="simulated", simulated=sims, count=0, predict_at=places))
+    assert corrected.predictions[2] == pytest.approx(bowl(places)[2] + 0.4, abs=0.1)
+    assert corrected.predictions[1] > prior.predictions[1] + 0.15
+
+
+def test_first_pour_goes_to_the_minimum_of_the_simulated_surrogate():
+    simulated = cover(30, 2)
+    sims = data_of(simulated, bowl(simulated))
+    first = propose(
+        SuggestProblem(PLANE, Data(), mean="simulated", simulated=sims, acquisition="posterior_minimum", count=3)
+    )
+    assert math.dist(first.points[0], (0.3, 0.6)) < 0.08
+    assert min(math.dist(first.points[0], p) for p in first.points[1:]) > 0.03
+
+
+def test_a_mean_absolute_difference_is_minimised_over_its_context():
+    # d(x, z) = x − z: the mean of |x − z| over z is least at the median of z, here 0.2, while the mean of z is 0.38
+    line = Space((Axis("x", 0.0, 1.0),))
+    joint = cover(40, 6)
+    problem = SuggestProblem(
+        line,
+        data_of(joint, joint[:, 0] - joint[:, 1]),
+        acquisition="posterior_minimum",
+        context=((0.1,), (0.15,), (0.2,), (0.55,), (0.9,)),
+    )
+    answer = propose(problem)
+    assert answer.points[0][0] == pytest.approx(0.2, abs=0.04)
+    assert answer.means[0] == pytest.approx(np.mean(np.abs(0.2 - np.array([0.1, 0.15, 0.2, 0.55, 0.9]))), abs=0.03)
+
+
+def test_the_map_has_the_second_axis_in_its_rows():
+    points = cover(30, 7)
+    answer = propose(SuggestProblem(PLANE, data_of(points, points[:, 1]), count=0, map_resolution=5))
+    mean = np.array(answer.surrogate.mean)
+    assert mean.shape == (5, 5)
+    assert mean[:, 2] == pytest.approx(np.linspace(0, 1, 5), abs=0.1)
+    assert mean[2, :] == pytest.approx(np.full(5, 0.5), abs=0.1)
+
+
+def test_a_suggestion_at_a_hundred_points_takes_far_less_than_a_simulation():
+    points = cover(100, 8)
+    costs = bowl(points) + 0.1 * np.random.default_rng(8).standard_normal(100)
+    problem = SuggestProblem(PLANE, data_of(points, costs))
+    assert min(propose(problem).seconds for _ in range(3)) < 0.25  # 0.03 s where nothing else runs
