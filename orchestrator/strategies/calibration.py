@@ -115,9 +115,11 @@ class ContinuousBayesianCalibration:
         problem = SuggestProblem(self._plan.actions, spillage, count=0, predict_at=sequence)
 
         def with_poured(regression: Suggestion, likely: Suggestion | None) -> None:
-            keep = [i for i in range(len(sequence)) if likely is None or likely.predictions[i] >= MINIMUM_POURED][
-                : self._plan.simulations
-            ]
+            keep = [
+                i
+                for i in range(len(sequence))
+                if likely is None or likely.predictions[i] - likely.prediction_deviations[i] >= MINIMUM_POURED
+            ][: self._plan.simulations]
             if not keep:
                 raise RuntimeError("at no action of the calibration's space would 5 % of the liquid be poured")
             # few places may be left where c_r is defined: they are used again

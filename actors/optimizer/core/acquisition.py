@@ -53,12 +53,15 @@ def penalised(score: Score, surrogate: Surrogate, busy: Array, candidates: Array
     all_means = surrogate.predict(candidates)[0]
     lowest = min(float(all_means.min()), float(mean.min()))
     slope = _steepest_slope(surrogate, candidates[:: max(1, len(candidates) // 64)])
-    slope = max(slope, (float(all_means.max()) - lowest) / np.sqrt(candidates.shape[1]), 1e-9)
+    relief = float(all_means.max()) - lowest
+    slope = max(slope, relief / np.sqrt(candidates.shape[1]), 1e-9)
+    # where the surrogate is sure of itself the ball would vanish, and two identical trials be asked for
+    deviation = np.maximum(deviation, max(0.05 * relief, 1e-9))
 
     def divided(points: Array) -> Array:
         reward = np.logaddexp(0.0, -(score(points) - centre) / spread)  # softplus: positive, as a product needs
         distance = np.linalg.norm(points[:, None, :] - busy[None, :, :], axis=2)
-        outside = log_ndtr((slope * distance - (mean - lowest)[None, :]) / np.maximum(deviation, 1e-9)[None, :])
+        outside = log_ndtr((slope * distance - (mean - lowest)[None, :]) / deviation[None, :])
         return np.asarray(-np.log(np.maximum(reward, 1e-300)) - outside.sum(axis=1))
 
     return divided

@@ -7,6 +7,7 @@ noise-free predictions are ours.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.special import ndtr
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Kernel, Matern, WhiteKernel
 
@@ -141,7 +143,9 @@ class GaussianProcess:
             optimizer=_maximum_a_posteriori(prior, dimension),
             copy_X_train=False,
         )
-        regressor.fit(points, (costs - mean(points)) / scale)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # an optimum at a bound is what the bounds are for
+            regressor.fit(points, (costs - mean(points)) / scale)
         summed = regressor.kernel_
         self._kernel = summed.k1
         matern = self._kernel if covariance is None else self._kernel.k2
