@@ -1,0 +1,1 @@
+"""The position-based solver. Taichi lives here and nowhere else."""

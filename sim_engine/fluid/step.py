@@ -1,0 +1,291 @@
+"""One time step, and the loop over steps. Serial within a scene; scenes run side by side.
+
+Step: move the pourer, predict, sweep against the walls, refresh neighbour lists if needed, look up wall distances, warm start,
+iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion, classify.
+
+Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
+"""
+
+import taichi as ti
+
+from sim_engine.fluid.density import displace, measure
+from sim_engine.fluid.forces import velocity_change
+from sim_engine.fluid.neighbours import rebuild
+from sim_engine.fluid.state import VESSELS, FluidState, ParticleState
+from sim_engine.fluid.walls import FAR, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
+
+GRAVITY = 9.81
+CFL = 0.8
+"""Largest displacement per step, in spacings."""
+LONGEST_STEP = 3e-3
+SHORTEST_STEP = 1e-4
+ITERATIONS = 3
+SKIN = 0.25
+"""Neighbour lists reach that many spacings beyond the support."""
+CONTACT = 0.2
+"""Particles' centres keep that many spacings from solid; the density constraint keeps about half a spacing."""
+WARM = 0.5
+"""Share of the last step's multipliers that a step starts with."""
+
+IN_POURER, IN_FLIGHT, RECEIVED, SPILLED, ESCAPED = (int(s) for s in ParticleState)
+
+
+@ti.func
+def rotation(q):
+    """Rotation matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return ti.Matrix(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@ti.data_oriented
+class Stepper:
+    """The solver's algorithm on a `FluidState`."""
+
+    def __init__(self, state: FluidState) -> None:
+        self.state = state
+
+    @ti.func
+    def place_pourer(self, s, time, poses: ti.template()):
+        """Pose of the pourer from the table, rows of which are `table_step` apart."""
+        f = self.state
+        u = ti.cast(ti.max(time, 0.0) / f.table_step[s], ti.f32)
+        k = ti.min(ti.cast(u, ti.i32), f.table_length[s] - 2)
+        w = ti.min(u - k, 1.0)
+        row = ti.Vector([0.0] * 7)
+        for c in ti.static(range(7)):
+            row[c] = poses[s, k, c] + w * (poses[s, k + 1, c] - poses[s, k, c])
+        q = ti.Vector([row[3], row[4], row[5], row[6]]).normalized()
+        f.origin[s, 0] = ti.Vector([row[0], row[1], row[2]])
+        f.turn[s, 0] = rotation(q)
+
+    @ti.func
+    def choose_step(self, s):
+        f = self.state
+        fastest = ti.cast(0.0, ti.f32)
+        for i in range(f.moving[s]):
+            fastest = ti.max(fastest, f.v[s, i].norm_sqr())
+        fastest = ti.sqrt(fastest)
+        return ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), LONGEST_STEP)
+
+    @ti.func
+    def predict(self, s, dt, grids: ti.template()):
+        """Ballistic prediction, stopped by walls; asks for new lists if someone has moved too far."""
+        f = self.state
+        clear = CONTACT * f.spacing[s]
+        limit = 0.45 * SKIN * f.spacing[s]
+        for i in range(f.moving[s]):
+            x0 = f.x[s, i]
+            f.x0[s, i] = x0
+            v = f.v[s, i]
+            v[2] -= GRAVITY * dt
+            x = x0 + dt * v
+            reach = 2.0 * clear + dt * v.norm() + 2.0 * f.spacing[s]
+            for b in range(VESSELS):
+                # φ is a step old: everything that can have changed since is within `reach`.
+                if f.phi[s, i][b] < reach:
+                    y0 = to_vessel(f, s, b, x0, True)
+                    y1 = to_vessel(f, s, b, x, False)
+                    y = swept(f, grids, s, b, y0, y1, clear)
+                    if (y - y1).norm_sqr() > 0.0:
+                        x = to_world(f, s, b, y)
+            f.x[s, i] = x
+            f.push[s, i] = ti.Vector([0.0, 0.0])
+            if (x - f.x_listed[s, i]).norm_sqr() > limit * limit:
+                f.stale[s] = 1
+
+    @ti.func
+    def look_at_walls(self, s, grids: ti.template()):
+        f = self.state
+        for i in range(f.moving[s]):
+            x = f.x[s, i]
+            for b in range(VESSELS):
+                look = distance_and_gradient(f, grids, s, b, to_vessel(f, s, b, x, False))
+                f.phi[s, i][b] = look[3]
+                n = f.turn[s, b] @ ti.Vector([look[0], look[1], look[2]])
+                for c in ti.static(range(3)):
+                    f.normal[s, i][b, c] = n[c]
+
+    @ti.func
+    def apply(self, s):
+        """Move by the displacements found; linearised wall contact."""
+        f = self.state
+        clear = CONTACT * f.spacing[s]
+        for i in range(f.moving[s]):
+            x = f.x[s, i] + f.dx[s, i]
+            for b in ti.static(range(VESSELS)):
+                phi = f.phi[s, i][b]
+                if phi < 4.0 * f.spacing[s]:
+                    n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
+                    phi += n.dot(f.dx[s, i])
+                    if phi < clear:
+                        x += (clear - phi) * n
+                        f.push[s, i][b] += clear - phi
+                        phi = clear
+                    f.phi[s, i][b] = phi
+            f.x[s, i] = x
+
+    @ti.func
+    def solve_density(self, s, ratio):
+        """`ratio`: this step's dt² over the last one's, which scales the multipliers of the warm start."""
+        f = self.state
+        for i in range(f.moving[s]):
+            f.pressure[s, i] *= WARM * ratio
+            f.dp[s, i] = f.pressure[s, i]
+        for i in range(f.moving[s]):
+            displace(f, s, i)
+        self.apply(s)
+        for _ in range(ITERATIONS):
+            for i in range(f.moving[s]):
+                measure(f, s, i)
+            for i in range(f.moving[s]):
+                displace(f, s, i)
+            self.apply(s)
+
+    @ti.func
+    def finish(self, s, dt, grids: ti.template()):
+        """Last look at the walls, friction, velocities."""
+        f = self.state
+        d = f.spacing[s]
+        clear = CONTACT * d
+        for i in range(f.moving[s]):
+            x = f.x[s, i]
+            x0 = f.x0[s, i]
+            for b in range(VESSELS):
+                if f.phi[s, i][b] < 3.0 * d:
+                    y0 = to_vessel(f, s, b, x0, True)
+                    y1 = to_vessel(f, s, b, x, False)
+                    y = swept(f, grids, s, b, y0, y1, 0.5 * clear)
+                    look = distance_and_gradient(f, grids, s, b, y)
+                    n = ti.Vector([look[0], look[1], look[2]])
+                    push = f.push[s, i][b]
+                    if look[3] < clear and look[3] > 0.0:
+                        y += (clear - look[3]) * n
+                        push += clear - look[3]
+                    if push > 0.0 and look[3] < 1.5 * d:
+                        # Coulomb: the wall, which moves with the vessel's frame, holds back at most μ times its push.
+                        way = y - y0
+                        along = way - way.dot(n) * n
+                        length = along.norm()
+                        if length > 1e-9:
+                            y -= along * ti.min(f.friction[s] * push / length, 1.0)
+                    if (y - y1).norm_sqr() > 0.0:
+                        x = to_world(f, s, b, y)
+                    if crossed(f, grids, s, b, y0, y) == 1:
+                        f.home[s, i] = ESCAPED
+                        f.stale[s] = 1
+            f.x[s, i] = x
+            v = (x - x0) / dt
+            f.v[s, i] = v
+            if not (ti.abs(v[0]) + ti.abs(v[1]) + ti.abs(v[2]) < 1e3):
+                f.fault[s] = 2
+
+    @ti.func
+    def interact(self, s, dt):
+        f = self.state
+        for i in range(f.moving[s]):
+            f.dv[s, i] = velocity_change(f, s, i, dt)
+        for i in range(f.moving[s]):
+            f.v[s, i] += f.dv[s, i]
+
+    @ti.func
+    def classify(self, s, cavities: ti.template()):
+        """Where every moving particle is now. A cavity ends at its opening plane; half a spacing above it still counts."""
+        f = self.state
+        lift = ti.Vector([0.0, 0.0, 0.5 * f.spacing[s]])
+        compressed = ti.cast(0.0, ti.f32)
+        inside = 0
+        for i in range(f.moving[s]):
+            if f.home[s, i] != ESCAPED:
+                x = f.x[s, i]
+                home = IN_FLIGHT
+                if f.phi[s, i][0] < FAR and in_cavity(f, cavities, s, 0, to_vessel(f, s, 0, x, False)) == 1:
+                    home = IN_POURER
+                elif f.phi[s, i][1] < FAR and (
+                    in_cavity(f, cavities, s, 1, to_vessel(f, s, 1, x, False) - lift) == 1
+                    or in_cavity(f, cavities, s, 1, to_vessel(f, s, 1, x, False)) == 1
+                ):
+                    home = RECEIVED
+                elif x[2] < f.spill_level[s]:
+                    home = SPILLED
+                    f.stale[s] = 1
+                f.home[s, i] = home
+                if f.count[s, i] >= 24:
+                    inside += 1
+                    compressed += ti.max(f.density[s, i] - 1.0, 0.0)
+        if inside > 0:
+            f.compression[s] += compressed / inside
+
+    @ti.func
+    def let_fall(self, s, dt):
+        """Particles out of play fall to the table, for pictures only."""
+        f = self.state
+        for i in range(f.moving[s], f.particles[s]):
+            if f.x[s, i][2] > 0.0:
+                f.v[s, i][2] -= GRAVITY * dt
+                x = f.x[s, i] + dt * f.v[s, i]
+                x[2] = ti.max(x[2], 0.0)
+                f.x[s, i] = x
+
+    @ti.func
+    def step(self, s, grids: ti.template(), cavities: ti.template(), poses: ti.template()):
+        f = self.state
+        dt = self.choose_step(s)
+        ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)
+        f.dt[s] = dt
+        f.origin0[s, 0] = f.origin[s, 0]
+        f.turn0[s, 0] = f.turn[s, 0]
+        f.time[s] += dt
+        self.place_pourer(s, f.time[s], poses)
+        self.predict(s, dt, grids)
+        if f.stale[s] == 1:
+            rebuild(f, s, SKIN)
+        self.look_at_walls(s, grids)
+        self.solve_density(s, ratio)
+        self.finish(s, dt, grids)
+        self.interact(s, dt)
+        self.classify(s, cavities)
+        self.let_fall(s, dt)
+        f.steps[s] += 1
+
+    @ti.kernel
+    def begin(self, poses: ti.types.ndarray(dtype=ti.f32, ndim=3)):
+        """Put vessels in their first pose and ask for lists."""
+        f = self.state
+        for s in range(f.scenes):
+            self.place_pourer(s, f.time[s], poses)
+            for b in range(VESSELS):
+                f.origin0[s, b] = f.origin[s, b]
+                f.turn0[s, b] = f.turn[s, b]
+            f.stale[s] = 1
+            f.moving[s] = f.particles[s]
+            f.dt[s] = LONGEST_STEP
+
+    @ti.kernel
+    def advance(
+        self,
+        until: ti.f64,
+        grids: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        cavities: ti.types.ndarray(dtype=ti.u8, ndim=1),
+        poses: ti.types.ndarray(dtype=ti.f32, ndim=3),
+    ):
+        """Run every scene until its time reaches `until` [s] or a fault stops it."""
+        f = self.state
+        for s in range(f.scenes):
+            while f.time[s] < until and f.fault[s] == 0:
+                self.step(s, grids, cavities, poses)
+
+    @ti.kernel
+    def census(self, s: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+        """Number of particles in each state."""
+        f = self.state
+        for k in range(5):
+            counts[k] = 0
+        ti.loop_config(serialize=True)
+        for i in range(f.particles[s]):
+            counts[f.home[s, i]] += 1
