@@ -118,7 +118,7 @@ class _Direction:
     def centre_distances(self) -> Floats:
         """Least possible distance of every patch's points from the other solid, shape (T, P) [m]."""
         centres = np.einsum("pi,tij->tpj", self.samples.centres, self.turn) + self.shift[:, None]
-        away = self.other.grid.sample(centres.reshape(-1, 3)).reshape(centres.shape[:2])
+        away = self.other.grid.lower_bound(centres.reshape(-1, 3)).reshape(centres.shape[:2])
         # the interpolant may be off by a part of the spacing, so a patch is let go only with that to spare
         return away - self.samples.radii - self.other.grid.spacing
 
@@ -201,8 +201,8 @@ def clearance(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
         poses: shape (T, 7), see `first_contact`.
 
     Returns:
-        Shape (T,) [m]; negative where they overlap (then the depth as in `Contact`). Accurate to about the samples'
-        spacing squared over the distance, and to a part of the grid's spacing.
+        Shape (T,) [m]; negative where they overlap (then the depth as in `Contact`). Accurate to a part of the grids'
+        spacing up to their margin (12 mm); farther apart it is an upper estimate, but never less than the margin.
 
     Raises:
         ValueError: poses of another shape, or not finite.
@@ -224,7 +224,7 @@ def clearance(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
 
 
 def describe_contact(
-    contact: Contact, *, tilt: float | None = None, pourer: str = "the pourer", receiver: str = "the receiver"
+    contact: Contact, tilt: float | None = None, *, pourer: str = "the pourer", receiver: str = "the receiver"
 ) -> str:
     """What to tell the person whose action it was.
 

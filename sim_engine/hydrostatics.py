@@ -284,4 +284,4 @@ def predicted_end_of_flow(
     times = np.linspace(0.0, t_end, int(np.clip(math.ceil(t_end / TIME_STEP), 100, 3000)) + 1)
     _, flow = _drain(vessel, volume, times, np.asarray(tilt_of_time(times), dtype=float), DISCHARGE)
     flowing = np.flatnonzero(flow > flow_limit)
-    return float(times[flowing[-1]]) if flowing.size else 0.0
+    return float(times[flowing[-1] + 1]) if flowing.size else 0.0  # the last time has no step after it, so no flow

@@ -151,7 +151,7 @@ def _check_cavity(found: Flood, shape: MeshShape, spacing: float, vertices: Floa
             "cut the lid away"
         )
     if found.drained * cell >= least:
-        at = max(bottom + spacing * found.drain, 0.0)
+        at = max(bottom + spacing * (found.drain - 1), 0.0)  # the hole begins between two slices
         raise VesselError(
             f"{name}: holds nothing: what is poured in runs out {1e3 * at:.0f} mm above the underside; "
             f"close the hole in its floor or wall, or state which axis is up (now '{shape.up}')"

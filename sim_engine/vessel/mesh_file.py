@@ -61,21 +61,27 @@ def _check_closed(mesh: object, path: Path) -> None:
     import trimesh
 
     assert isinstance(mesh, trimesh.Trimesh)
-    if not mesh.is_watertight:
-        _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-        single, many = int(np.count_nonzero(uses == 1)), int(np.count_nonzero(uses > 2))
+    # A surface is closed when its directed edges cancel; bodies that touch along an edge use it four times.
+    _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    if np.any(uses % 2):
+        open_edges = int(np.count_nonzero(uses % 2))
         raise VesselError(
-            f"{path.name}: not watertight: {single} edge(s) with one face only and {many} with more than two; "
+            f"{path.name}: not watertight: {open_edges} edge(s) belong to an odd number of faces; "
             "close the holes (a vessel is a solid with walls, not a sheet)"
         )
-    if not mesh.is_winding_consistent:
+    if not _edges_cancel(mesh.edges):
         trimesh.repair.fix_winding(mesh)
-        if not mesh.is_winding_consistent:
+        if not _edges_cancel(mesh.edges):
             raise VesselError(f"{path.name}: its faces don't agree which side is out, and can't be made to; repair it")
     if mesh.volume < 0.0:
         mesh.invert()
     if not mesh.volume > 0.0:
         raise VesselError(f"{path.name}: encloses no volume")
+
+
+def _edges_cancel(edges: Integers) -> bool:
+    forth, back = np.lexsort((edges[:, 1], edges[:, 0])), np.lexsort((edges[:, 0], edges[:, 1]))
+    return bool(np.array_equal(edges[forth], edges[back][:, ::-1]))
 
 
 def _scale(extent: float, shape: MeshShape) -> float:

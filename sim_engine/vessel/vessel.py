@@ -23,6 +23,10 @@ QUADRATURE_POINTS = 120_000
 """Points that `Vessel.cavity_points` aims at."""
 
 
+LATTICE_TURN = 0.3820
+"""Angle between the quadrature's rows and a mesh's axes, far from every fraction of a right angle [rad]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Vessel:
     """One vessel, ready for the solver. Build it with `sim_engine.vessel.build.build_vessel`.
@@ -144,7 +148,12 @@ def lattice(
         inside = profiles.contains(polygon, np.hypot(x[:, None], y)[..., None], z)
         i, j, k = np.nonzero(inside)
         return np.column_stack([x[i], y[j], z[k]]), step * step * thickness
-    grid_points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    # turned about z, so that no row of points runs along a flat wall and falls in or out of the cavity as a whole
+    reach = np.hypot(half[0], half[1])
+    steps = (np.arange(-np.ceil(reach), np.ceil(reach)) + 0.5) * step
+    grid_points = np.stack(np.meshgrid(steps, steps, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    cos, sin = np.cos(LATTICE_TURN), np.sin(LATTICE_TURN)
+    grid_points[:, :2] = grid_points[:, :2] @ np.array([[cos, sin], [-sin, cos]])
     grid_points = grid_points[np.all((grid_points >= low) & (grid_points <= high), axis=1)]
     return grid_points[in_cavity(grid, grid_points)], step * step * thickness
 
