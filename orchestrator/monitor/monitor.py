@@ -278,9 +278,7 @@ class _Translator:
         scene = self._scene_of_stage.get(event.stage)
         place = f"/maps/{safe_name(scene)}" if acting and scene is not None else "/maps/calibration"
         unit = loss_unit(self._plan.deployment.loss) if acting and self._plan.deployment else DISCREPANCY
-        # Points may carry further coordinates behind those of the space (see SuggestProblem.context).
-        points = tuple(point[: problem.space.dimension] for point in problem.data.points)
-        said = self.streams.surrogate(place, problem.space, suggestion.surrogate, points, unit.factor)
+        said = self.streams.surrogate(place, problem.space, suggestion.surrogate, problem.data.points, unit.factor)
         self._about[f"map {place.removeprefix('/maps/')}"] = f"{unit.label}: {said}"
         self._page()
 

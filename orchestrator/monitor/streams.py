@@ -188,7 +188,7 @@ class Streams:
             entity: under which it goes.
             space: two axes; the first to the right, the second upwards.
             surrogate: (R, R) values, row i at the second axis' i-th place.
-            points: observations in the unit cube.
+            points: observations in the unit cube; further coordinates (`SuggestProblem.context`) are ignored.
             factor: shown over own unit of the cost.
 
         Returns:

@@ -137,10 +137,11 @@ def _shares(states: Any) -> Floats:
 
 
 def _moments(times: Floats, shares: Floats, count: int) -> NDArray[np.intp]:
-    """Frames worth a picture: when shares 1/8 … 7/8 of what will leave had left, and the end."""
+    """Frames worth a picture: when shares 1/8 … 7/8 of what will leave had left, and the end; if
+    nothing left, evenly spread."""
     left = 1.0 - shares[:, IN_POURER]
     if left[-1] < 0.01:
-        return np.unique(np.linspace(0, len(times) - 1, count).astype(int)).repeat(1)[:count]
+        return np.linspace(0, len(times) - 1, count).round().astype(int)
     wanted = np.linspace(0.0, 1.0, 2 * count - 1)[1::2][: count - 1] * left.max()
     picked = [int(np.argmax(left >= level)) for level in wanted]
     return np.array([*picked, len(times) - 1])

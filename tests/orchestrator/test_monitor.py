@@ -147,6 +147,10 @@ def test_recording_that_cannot_be_written_is_reported_before_the_run(tmp_path: P
     (tmp_path / "taken").write_text("a file where a folder is needed")
     with pytest.raises(OSError, match="taken"):
         RerunMonitor(tmp_path / "taken" / "campaign.rrd", watched.campaign())
+    task, result = watched.simulation()
+    (tmp_path / "pour.rrd").mkdir()
+    with pytest.raises(OSError, match=r"pour\.rrd"):
+        simulation_rrd(tmp_path / "pour.rrd", task, result)
 
 
 def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None:

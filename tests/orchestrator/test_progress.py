@@ -19,8 +19,9 @@ from orchestrator.events import (
     StrategyProgressed,
 )
 from orchestrator.progress import ProgressDisplay
-from orchestrator.requests import Failed, Pour, Simulate
+from orchestrator.requests import Failed, Pour, Poured, Simulate
 from orchestrator.tally import StageTally, Tally
+from sim_engine.outcome import PourMeasurement
 from tests.orchestrator import watched
 
 
@@ -121,6 +122,8 @@ def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> Non
     )
     assert isinstance(calibration_pour.request, Pour)
     tally(replace(calibration_pour, request=replace(calibration_pour.request, scene="tumbler", number=9)))
+    worse = PourMeasurement(loaded=0.2, spilled=0.1, retained=0.0)
+    tally(replace(calibration_pour, request=replace(calibration_pour.request, number=4), outcome=Poured(worse)))
     assert {scene: best.pour for scene, best in tally.best.items()} == {"narrow cup": 3}
 
 

@@ -18,7 +18,7 @@ from orchestrator.report.campaign import draw_figures
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
 from orchestrator.report.maps import SurrogatePicture, draw_surrogate
 from orchestrator.report.results import calibration_picture, deployment_picture, discrepancy_groups, evaluation_of
-from orchestrator.report.scene import simulation_png
+from orchestrator.report.scene import _moments, simulation_png
 from orchestrator.report.section import place, section
 from orchestrator.report.style import display_value, display_values
 from orchestrator.report.summary import summarise, summary_table, write_summary
@@ -284,6 +284,16 @@ def test_pour_that_keeps_everything_in_the_pourer_is_drawn(tmp_path: Path) -> No
     for states in frames.states:
         states[:] = 0
     assert is_picture(simulation_png(tmp_path / "nothing.png", task, result))
+
+
+def test_snapshots_show_the_flow_from_its_beginning_to_its_end() -> None:
+    times = np.linspace(0.0, 10.0, 101)
+    left = np.clip((times - 6.0) / 2.0, 0.0, 0.9)  # flows from 6 s to 7.8 s
+    shares = np.column_stack([1.0 - left, 0 * left, left, 0 * left, 0 * left])
+    assert times[_moments(times, shares, 4)] == pytest.approx([6.3, 6.9, 7.5, 10.0])
+    shares[:, 0] = 1.0  # nothing leaves: evenly spread
+    assert times[_moments(times, shares, 4)] == pytest.approx([0.0, 3.3, 6.7, 10.0])
+    assert len(_moments(times[:1], shares[:1], 4)) == 4
 
 
 def test_simulation_without_frames_is_refused_with_advice(tmp_path: Path) -> None:
