@@ -223,6 +223,7 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
             )
     style.dress(axes, title=title, y="mean |measured − predicted| spillage [%]")
     axes.set_ylim(0.0, 1.12 * top or 1.0)
+    axes.set_xlim(-0.55, len(groups) - 0.45)  # room for every predictor, those with nothing to say too
     axes.set_xticks(
         range(len(groups)), [f"{g.name}\n{g.pours} pour{'s' * (g.pours != 1)}" for g in groups], fontsize=9.5
     )
