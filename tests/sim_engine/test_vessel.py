@@ -74,6 +74,9 @@ def test_gradient_points_away_from_the_wall() -> None:
 
 def test_wall_of_a_cone_keeps_its_thickness_along_the_normal() -> None:
     cone = vessel_of((0.0, 0.0), (0.01, 0.0), (0.06, 0.05), wall=0.004)
+    assert cone.outer_radius == pytest.approx(
+        0.06 + 0.004 * math.sqrt(2), abs=1e-5
+    )  # cut flat, not thinner, at the rim
     # a point of the wall's middle surface, by its normal (1, −1)/√2, half a wall from the inner surface
     middle = np.array([[0.035 + 0.002 / math.sqrt(2), 0.0, 0.003 + 0.025 - 0.002 / math.sqrt(2)]])
     h = cone.grid.spacing
