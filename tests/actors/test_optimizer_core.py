@@ -94,9 +94,10 @@ def test_the_minimum_of_a_smooth_cost_is_found_in_a_few_steps():
     assert np.linalg.norm(np.array(best) - (0.3, 0.6)) < 0.05
 
 
-def test_on_a_plateau_it_keeps_looking_where_nothing_is_known():
-    corner = 0.3 * cover(6)  # everything spilled in one corner
-    answer = propose(SuggestProblem(PLANE, data_of(corner, np.ones(6))))
+@pytest.mark.parametrize("ripple", [0.0, 1e-4])
+def test_on_a_plateau_it_keeps_looking_where_nothing_is_known(ripple):
+    corner = 0.3 * cover(6)  # (almost) everything spilled in one corner
+    answer = propose(SuggestProblem(PLANE, data_of(corner, 1.0 - ripple * cover(6)[:, 0])))
     assert min(np.linalg.norm(np.array(answer.points[0]) - p) for p in corner) > 0.3
     assert answer.deviations[0] > 0.01
 
@@ -147,6 +148,16 @@ def test_simulations_are_the_prior_mean_and_pours_correct_it():
     corrected = propose(SuggestProblem(PLANE, real, mean="simulated", simulated=sims, count=0, predict_at=places))
     assert corrected.predictions[2] == pytest.approx(bowl(places)[2] + 0.4, abs=0.1)
     assert corrected.predictions[1] > prior.predictions[1] + 0.15
+
+
+def test_far_from_all_pours_the_simulations_are_believed():
+    sims = data_of(cover(30, 2), bowl(cover(30, 2)))
+    near = np.array([[0.1, 0.9], [0.2, 0.8]])
+    far = ((0.95, 0.1), (0.9, 0.2))
+    question = SuggestProblem(
+        PLANE, data_of(near, bowl(near)), mean="simulated", simulated=sims, count=0, predict_at=far
+    )
+    assert propose(question).predictions == pytest.approx(bowl(far), abs=0.1)
 
 
 def test_first_pour_goes_to_the_minimum_of_the_simulated_surrogate():
