@@ -11,22 +11,22 @@ from sim_engine.vessel.vessel import Vessel, in_cavity
 JITTER = 0.05
 """Largest displacement from the lattice, in spacings; it makes seeds differ and breaks the crystal."""
 
-STAND_OFF = 0.45
-"""Lattice points keep that many spacings from solid, close to where the density constraint puts them."""
-
 
 def spacing(volume: float, particles: int) -> float:
     """d = (V/N)^(1/3) [m]."""
     return float((volume / particles) ** (1.0 / 3.0))
 
 
-def fill(vessel: Vessel, volume: float, particles: int, seed: int) -> NDArray[np.float32]:
+def fill(
+    vessel: Vessel, volume: float, particles: int, seed: int, wall_distance: float = 0.5
+) -> NDArray[np.float32]:
     """Positions of exactly `particles` particles of volume V/N each.
 
     Args:
         vessel: upright.
         volume: of the liquid [m³].
         particles: N.
+        wall_distance: lattice points keep about that many spacings from solid, as the density constraint will.
         seed: shifts the lattice, jitters it, and chooses among the places of the topmost layer.
 
     Returns:
@@ -43,9 +43,9 @@ def fill(vessel: Vessel, volume: float, particles: int, seed: int) -> NDArray[np
         reach = vessel.outer_radius + step
         across = np.arange(-reach, reach, step)
         shift = rng.uniform(-0.5, 0.5, 2) * step
-        z = np.arange(vessel.inner_floor + 0.5 * d, vessel.rim_height, step)
+        z = np.arange(vessel.inner_floor + wall_distance * d, vessel.rim_height, step)
         places = np.stack(np.meshgrid(across + shift[0], across + shift[1], z, indexing="ij"), axis=-1).reshape(-1, 3)
-        places = places[vessel.grid.sample(places) >= STAND_OFF * d]
+        places = places[vessel.grid.sample(places) >= 0.9 * wall_distance * d]
         places = places[in_cavity(vessel.grid, places)]
         if len(places) >= particles:
             order = np.lexsort((rng.random(len(places)), np.round(places[:, 2] / step)))

@@ -59,6 +59,10 @@ class SimulationParameters(BaseModel):
     friction: float = Field(default=0.05, ge=0.0, le=1.0, json_schema_extra={"unit": "1"})
     """Coulomb coefficient between particles and vessel walls."""
 
+    wall_distance: float = Field(default=0.5, ge=0.3, le=1.5, json_schema_extra={"unit": "1"})
+    """Distance from a wall at which liquid comes to rest, in particle spacings (FleX: collision distance). At 0.5 a vessel
+    holds its true volume; more narrows vessels and raises lips, as walls made of particles do."""
+
     @classmethod
     def info(cls) -> dict[str, ParameterInfo]:
         """Name, unit, bounds and meaning of every parameter."""

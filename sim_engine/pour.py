@@ -166,7 +166,7 @@ class PourSimulator:
         latest = motion.duration + LONGEST_TAIL
         poses = motion.sample(np.arange(0.0, latest + 0.1, POSE_STEP))
         # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
-        local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed)
+        local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed, parameters.wall_distance)
         positions = _to_world(local, poses[0])
         fluid = engine()
         fluid.load(
@@ -175,6 +175,7 @@ class PourSimulator:
             pair_acceleration=cohesion_strength(parameters.cohesion, d, SUPPORT * d) / (scene.liquid.density * d**3),
             viscosity=parameters.viscosity,
             friction=parameters.friction,
+            wall_distance=parameters.wall_distance,
             grids=[pourer.grid, receiver.grid],
             masks=[self._masks[scene.pourer], self._masks[scene.receiver]],
             walls=[pourer.wall_thickness, receiver.wall_thickness],

@@ -32,6 +32,7 @@ EXAMPLES = {
     "cohesion": "0.02 N/m",
     "viscosity": "3 1/s",
     "friction": "0.05",
+    "wall_distance": "0.5",
 }
 
 

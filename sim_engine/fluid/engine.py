@@ -5,12 +5,15 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim_engine.cache import cache_directory
-from sim_engine.fluid.state import VESSELS, FluidState, ParticleState
+from sim_engine.fluid.state import SUPPORT, VESSELS, FluidState, ParticleState
 from sim_engine.fluid.step import Stepper
 from sim_engine.vessel.sdf import SignedDistanceGrid
 
 CAPACITY = 50_000
 """Particles of a scene; one size for all, so that kernels are compiled once. Memory that is not used is not touched."""
+
+NATURAL_WALL_DISTANCE = 0.4
+"""Spacings at which the unshifted wall integral holds liquid off a wall, measured on a cup at rest."""
 
 POSE_STEP = 1e-3
 """Rows of the pose table are so far apart [s]."""
@@ -43,6 +46,7 @@ class FluidEngine:
         pair_acceleration: float,
         viscosity: float,
         friction: float,
+        wall_distance: float,
         grids: list[SignedDistanceGrid],
         masks: list[NDArray[np.uint8]],
         walls: list[float],
@@ -59,6 +63,7 @@ class FluidEngine:
             pair_acceleration: peak cohesive acceleration of one pair [m/s²].
             viscosity: XSPH rate [1/s].
             friction: Coulomb coefficient.
+            wall_distance: where liquid comes to rest before a wall, in spacings.
             grids, masks, walls: of pourer and receiver; a mask is 1 where a particle counts as inside.
             receiver_at: (3,) [m].
             spill_level: below it and in no vessel a particle is spilled [m].
@@ -71,6 +76,7 @@ class FluidEngine:
             raise ValueError(f"{count} particles; at most {f.capacity}")
         f.particles[0], f.spacing[0] = count, spacing
         f.attraction[0], f.viscosity[0], f.friction[0] = pair_acceleration, viscosity, friction
+        f.wall_shift[0] = (wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
         offset = 0
         for b in range(VESSELS):
             f.grid_offset[0, b], f.grid_size[0, b] = offset, list(grids[b].values.shape)

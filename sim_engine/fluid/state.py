@@ -63,6 +63,7 @@ class FluidState:
         self.attraction = ti.field(ti.f32, shape=scenes)  # peak cohesive acceleration of one pair [m/s²]
         self.viscosity = ti.field(ti.f32, shape=scenes)
         self.friction = ti.field(ti.f32, shape=scenes)
+        self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if that much nearer, in supports h
         self.table_step = ti.field(ti.f32, shape=scenes)  # of the pose table [s]
         self.table_length = ti.field(ti.i32, shape=scenes)
         # Poses of the vessels at the end and at the beginning of the step: vessel frame → world.
