@@ -80,6 +80,7 @@ def start_ray(spec: LaboratorySpec) -> None:
         if _session is not None:
             _session.uses += 1
             return
+        _refuse_foreign_ray()
         session = _open_session()
         try:
             _start_keeper(session, spec)
@@ -182,6 +183,12 @@ def prune_sessions(root: Path | None = None) -> list[Path]:
     return removed
 
 
+def _refuse_foreign_ray() -> None:
+    ray = sys.modules.get("ray")
+    if ray is not None and ray.is_initialized():
+        raise LaboratoryError("this process has already started a Ray of its own; end it before opening a laboratory")
+
+
 def _open_session() -> _Session:
     root = _root()
     with _only_one(root):
@@ -257,8 +264,6 @@ def _init(session: _Session, spec: LaboratorySpec) -> None:
     )
     import ray
 
-    if ray.is_initialized():
-        raise LaboratoryError("this process has already started a Ray of its own; end it before opening a laboratory")
     os.environ[MARK] = str(session.folder)
     try:
         for attempt in range(3):

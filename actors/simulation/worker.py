@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from actors.protocols import Frames, InvalidActionError, SimulationError, SimulationResult
+from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.task import PourTask
 
 
@@ -57,8 +58,6 @@ class SimulationWorker:
             JobCancelledError: `cancelled` said so.
             SimulationError: anything else that the engine raises.
         """
-        from sim_engine.pour import InvalidSceneError, SimulationCancelled
-
         try:
             if self._simulator is None:
                 self._simulator = self._make()

@@ -16,6 +16,7 @@ import pytest
 from actors.bench.spec import VirtualBenchSpec
 from actors.spec import LaboratorySpec
 from sim_engine.action import DEG, Action
+from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.outcome import PourOutcome
 from sim_engine.task import PoseError, PourTask, Scene
@@ -38,8 +39,6 @@ class FakeSimulator:
                 file.write(f"{what} {os.getpid()}\n")
 
     def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimpleNamespace:
-        from sim_engine.pour import InvalidSceneError, SimulationCancelled
-
         if task.scene.name == "touching":
             raise InvalidSceneError("cups touch: at tilt 37° the pourer enters the receiver by 4.1 mm")
         if task.scene.name == "broken":

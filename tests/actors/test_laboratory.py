@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from actors.laboratory import open_laboratory
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.protocols import LaboratoryError
 from actors.spec import LaboratorySpec
+from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
+from sim_engine.task import PourTask
 
 PROBLEM = SuggestProblem(
     space=Space((Axis("x_offset", 0.08, 0.15), Axis("angular_velocity", 0.3, 2.0))),
@@ -76,3 +80,24 @@ def test_optimiser_and_its_twin_propose_the_same_and_a_death_is_asked_again(ray_
     assert len(answer.points) == 2
     for ours, theirs in zip(answer.points, twin.points, strict=True):
         assert ours == pytest.approx(theirs, abs=1e-6)
+
+
+@pytest.mark.ray
+def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_liquid(
+    ray_running, bench_spec, scene, action
+):
+    bench = replace(bench_spec, liquid=SimulationParameters(particles=400))
+    coarse = SimulationParameters(particles=300)
+
+    async def play(in_process):
+        spec = LaboratorySpec("desk", simulators=1, bench=bench, in_process=in_process)
+        async with open_laboratory(spec, need_bench=True) as opened:
+            job = opened.simulators.simulate(PourTask(scene, action, coarse, 3, record_rate=4.0))
+            return await asyncio.gather(job, opened.bench.pour(scene, action, seed=5))
+
+    (ours, measured), (twins, measured_twin) = asyncio.run(play(False)), asyncio.run(play(True))
+    assert replace(ours.outcome, cpu_s=0.0) == replace(twins.outcome, cpu_s=0.0)
+    assert ours.outcome.invalid is None
+    np.testing.assert_array_equal(np.array(ours.frames.positions), np.array(twins.frames.positions))
+    assert measured == measured_twin
+    assert measured.loaded == pytest.approx(0.2, abs=1e-3)

@@ -178,7 +178,7 @@ def test_a_stop_during_the_pour_leaves_it_unknown_and_the_bench_usable(request, 
             pour = asyncio.create_task(laboratory.bench.pour(scene, slow, seed=5, progress=seen.append))
             await reach(seen, "tilt")
             await laboratory.bench.arm.stop()
-            with pytest.raises(LaboratoryError, match="the arm was stopped .* what was poured is unknown"):
+            with pytest.raises(LaboratoryError, match=r"the arm was stopped .* what was poured is unknown"):
                 await pour
             return await laboratory.bench.pour(scene, action, seed=5)
 

@@ -1,0 +1,163 @@
+"""However a program that uses Ray ends: no process, no folder, nothing in the home folder, nothing on the network."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from actors import ray_runtime
+from actors.protocols import LaboratoryError
+from actors.spec import LaboratorySpec
+
+pytestmark = pytest.mark.ray
+
+PROGRAM = """
+import asyncio, json, os, signal, sys, time
+import psutil
+from actors.ray_runtime import keep_signals, ray_folder, start_ray, stop_ray
+from actors.spec import LaboratorySpec
+
+class Spinner:
+    def pid(self): return os.getpid()
+    def spin(self):
+        while True: pass
+
+def open_ports():
+    me = psutil.Process()
+    processes = [me, *me.children(recursive=True)]
+    return sorted({c.laddr.ip for p in processes for c in p.net_connections() if c.status == "LISTEN"})
+
+async def main(how):
+    caught = asyncio.Event()
+    if how == "own handler":
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, caught.set)
+    await asyncio.to_thread(start_ray, LaboratorySpec("test", simulators=1))
+    keep_signals()
+    import ray
+    actor = ray.remote(Spinner).remote()
+    ray.get(actor.pid.remote())
+    actor.spin.remote()
+    pids = [p.pid for p in psutil.Process().children(recursive=True)]
+    print(json.dumps({"pids": pids, "folder": str(ray_folder()), "listens": open_ports()}), flush=True)
+    await asyncio.wait_for(caught.wait(), 60)
+    print(json.dumps("caught"), flush=True)
+
+asyncio.run(main(sys.argv[1]))
+"""
+
+
+def start(how: str, home: Path) -> tuple[subprocess.Popen[str], dict[str, list[int] | str]]:
+    environment = {**os.environ, "HOME": str(home)}
+    environment.pop("TMPDIR", None)
+    program = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, how],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+    line = program.stdout.readline()
+    assert line, program.communicate(timeout=30)[1]
+    return program, json.loads(line)
+
+
+def left(facts) -> list[str]:
+    """Processes of the program that still run, by title."""
+    names = []
+    for pid in facts["pids"]:
+        with contextlib.suppress(psutil.Error):
+            process = psutil.Process(pid)
+            if process.status() != psutil.STATUS_ZOMBIE:
+                names.append(process.name())
+    return names
+
+
+def assert_clean(facts, home: Path, seconds: float = 15.0) -> None:
+    end = time.monotonic() + seconds
+    while (left(facts) or Path(facts["folder"]).exists()) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert left(facts) == []
+    assert not Path(facts["folder"]).exists()
+    assert list(home.iterdir()) == []
+
+
+def test_kill_9_leaves_nothing(tmp_path):
+    program, facts = start("wait", tmp_path)
+    program.kill()
+    program.communicate(timeout=30)
+    assert_clean(facts, tmp_path)
+
+
+def test_ctrl_c_leaves_nothing(tmp_path):
+    program, facts = start("wait", tmp_path)
+    os.killpg(program.pid, signal.SIGINT)
+    _, errors = program.communicate(timeout=60)
+    assert "KeyboardInterrupt" in errors
+    assert_clean(facts, tmp_path)
+
+
+def test_sigterm_ends_in_order_without_a_frightening_stack(tmp_path):
+    program, facts = start("wait", tmp_path)
+    program.terminate()
+    _, errors = program.communicate(timeout=60)
+    assert program.returncode == 128 + signal.SIGTERM
+    assert "SIGTERM received" not in errors
+    assert_clean(facts, tmp_path)
+
+
+def test_a_normal_end_leaves_nothing_was_closed_to_the_network_and_kept_the_loops_own_signal_handler(tmp_path):
+    program, facts = start("own handler", tmp_path)
+    program.terminate()
+    output, errors = program.communicate(timeout=60)
+    assert json.loads(output) == "caught"
+    assert errors == ""
+    assert program.returncode == 0
+    assert len(facts["pids"]) > 5
+    assert all(address.removeprefix("::ffff:") in ("127.0.0.1", "::1") for address in facts["listens"])
+    assert_clean(facts, tmp_path)
+
+
+def test_sessions_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp_path):
+    dead, alive = tmp_path / "dead", tmp_path / "alive"
+    for folder in (dead, alive):
+        folder.mkdir()
+        (folder / "alive").touch()
+    holder = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import fcntl, sys; f = open(sys.argv[1]); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()",
+            str(alive / "alive"),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        holder.stdout.readline()
+        assert ray_runtime.prune_sessions(tmp_path) == [dead]
+        assert not dead.exists()
+        assert alive.exists()
+    finally:
+        holder.kill()
+        holder.communicate()
+    assert ray_runtime.prune_sessions(tmp_path) == [alive]
+
+
+def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(ray_running, monkeypatch):
+    import ray
+
+    monkeypatch.setattr(ray_runtime, "_session", None)
+    with pytest.raises(LaboratoryError, match="Ray of its own"):
+        ray_runtime.start_ray(LaboratorySpec("late"))
+    assert ray.is_initialized()
