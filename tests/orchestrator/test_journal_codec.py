@@ -6,6 +6,7 @@ import json
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -160,6 +161,16 @@ def test_whole_numbers_given_for_floats_are_the_same_request() -> None:
     assert canonical(encode_request(Suggest(SuggestProblem(space, Data(), kappa=2)))) == canonical(
         encode_request(Suggest(SuggestProblem(space, Data(), kappa=2.0)))
     )
+
+
+def test_numbers_that_came_out_of_numpy_are_the_same_request() -> None:
+    plain = Pour("cup", Action(1.0, 0.1, 0.03), 3, seed=5, predicted=Prediction(0.5, 0.25))
+    action = Action(np.float64(1.0), np.float64(0.1), 0.03)
+    drawn = Pour("cup", action, np.int64(3), np.uint64(5), Prediction(np.float32(0.5), np.float64(0.25)))  # type: ignore[arg-type]
+    assert canonical(encode_request(drawn)) == canonical(encode_request(plain))
+    notes = {"readings": np.array([1.0, 2.0]), "count": np.int64(3), "stable": np.bool_(True)}
+    written = encode_outcome(Poured(PourMeasurement(0.2, 0.0, 0.0, notes)))
+    assert written["measurement"]["notes"] == {"readings": [1.0, 2.0], "count": 3, "stable": True}
 
 
 def test_entries_of_a_newer_version_are_refused_by_name() -> None:

@@ -1,6 +1,6 @@
 """A toy campaign on a toy laboratory, in one process and without physics: for tests of journal, scheduler and resume.
 
-Run as a script it is the process that tests kill: `python toy.py DIRECTORY [--resume] [--on-unknown X] [--slow S]`.
+Run as a script it is the process that tests kill: `python toy.py DIRECTORY` with the options of `main`.
 """
 
 from __future__ import annotations
@@ -324,9 +324,14 @@ def main() -> None:
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--on-unknown", default=None)
     parser.add_argument("--slow", type=float, default=0.0)
+    parser.add_argument("--hang-after", type=int, default=None)
     options = parser.parse_args()
     ask = answering(options.on_unknown) if options.on_unknown else None
-    asyncio.run(run_toy(options.directory, slow_laboratory(options.slow), resume=options.resume, ask_operator=ask))
+    laboratory = slow_laboratory(options.slow)
+    if options.hang_after is not None:
+        pauses = iter([options.slow] * options.hang_after)
+        laboratory.simulators.pauses = lambda: next(pauses, 1e6)
+    asyncio.run(run_toy(options.directory, laboratory, resume=options.resume, ask_operator=ask))
 
 
 if __name__ == "__main__":
