@@ -17,9 +17,7 @@ def spacing(volume: float, particles: int) -> float:
     return float((volume / particles) ** (1.0 / 3.0))
 
 
-def fill(
-    vessel: Vessel, volume: float, particles: int, seed: int, wall_distance: float = 0.5
-) -> NDArray[np.float32]:
+def fill(vessel: Vessel, volume: float, particles: int, seed: int, wall_distance: float = 0.5) -> NDArray[np.float32]:
     """Positions of exactly `particles` particles of volume V/N each.
 
     Args:

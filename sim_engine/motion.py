@@ -193,7 +193,13 @@ class SampledMotion:
 
 
 def plan_motion(
-    scene: Scene, action: Action, pourer: Vessel, receiver: Vessel, *, tilt_error: float = 0.0, speed_factor: float = 1.0
+    scene: Scene,
+    action: Action,
+    pourer: Vessel,
+    receiver: Vessel,
+    *,
+    tilt_error: float = 0.0,
+    speed_factor: float = 1.0,
 ) -> PourMotion:
     """The pourer's motion for an action.
 

@@ -259,7 +259,8 @@ def _to_world(points: NDArray[np.float32], pose: NDArray[np.float64]) -> NDArray
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return (points @ rotation.T + pose[:3]).astype(np.float32)
+    moved: NDArray[np.float32] = (points @ rotation.T + pose[:3]).astype(np.float32)
+    return moved
 
 
 def _frames(frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]], motion: Motion) -> RecordedFrames:

@@ -1,11 +1,12 @@
 """The density constraint: C_i = ρ_i/ρ₀ − 1 ≤ 0, solved for positions by damped Jacobi with accumulated multipliers.
 
 Walls enter as the kernel's integral over a half-space at the wall's distance, so that liquid keeps half a spacing from
-them and feels their pressure. Multipliers are kept from step to step (warm start), which is what carries a resting column.
+them and feels their pressure. Part of the multipliers is kept from step to step (warm start) and carries a resting column;
+keeping all of them would integrate the error a third time and swing up.
 
-Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chentanez 2016 (accumulated multipliers);
-wall integral: after Bender et al. 2019 (volume maps), here with the analytic half-space. Limitations: concave corners see
-only the nearer wall.
+Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chentanez 2016 (accumulated multipliers); wall
+integral: after Bender et al. 2019 (volume maps), here with the analytic half-space. Limitations: concave corners see only
+the nearer wall.
 """
 
 import taichi as ti

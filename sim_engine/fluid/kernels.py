@@ -1,7 +1,7 @@
 """Smoothing kernel and its planar wall integrals, as Taichi functions.
 
-Wendland C2 in three dimensions with support h: W(q) = σ (1 − q)⁴ (1 + 4q), q = r/h, σ = 21 / (2π h³). It needs one square
-root per pair, its gradient is finite at r = 0, and it does not pair particles up.
+Wendland C2 in three dimensions with support h: W(q) = σ (1 − q)⁴ (1 + 4q), q = r/h, σ = 21 / (2π h³). It needs one
+square root per pair, its gradient is finite at r = 0, and it does not pair particles up.
 
 Source: Wendland 1995; Dehnen & Aly 2012 (no pairing instability). Wall integrals: ours, by integration.
 """
@@ -58,7 +58,7 @@ ATTRACTION_MOMENT = 64.0 * math.factorial(7) * math.factorial(3) / math.factoria
 def cohesion_strength(tension: float, spacing: float, support: float) -> float:
     """Peak pair force [N] that gives a liquid of that spacing a surface tension.
 
-    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for the amplitude of f.
+    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for f's amplitude.
 
     Args:
         tension: σ [N/m].

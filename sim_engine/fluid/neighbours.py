@@ -1,4 +1,4 @@
-"""Neighbour lists: particles sorted by cell (counting sort), then explicit lists that last until someone has moved half a skin.
+"""Neighbour lists: particles sorted by cell (counting sort), explicit lists that last until one has moved half a skin.
 
 Source: Green 2010 (counting sort on a grid); Verlet 1967 (lists with a skin).
 """

@@ -1,7 +1,7 @@
 """One time step, and the loop over steps. Serial within a scene; scenes run side by side.
 
-Step: move the pourer, predict, sweep against the walls, refresh neighbour lists if needed, look up wall distances, warm start,
-iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion, classify.
+Step: move the pourer, predict, sweep against the walls, refresh neighbour lists if needed, look up wall distances, warm
+start, iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion, classify.
 
 Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 """
@@ -66,6 +66,7 @@ class Stepper:
 
     @ti.func
     def choose_step(self, s):
+        """dt from the fastest particle (CFL) [s]."""
         f = self.state
         fastest = ti.cast(0.0, ti.f32)
         for i in range(f.moving[s]):
@@ -101,6 +102,7 @@ class Stepper:
 
     @ti.func
     def look_at_walls(self, s, grids: ti.template()):
+        """Distance and normal of both vessels at every moving particle, for the iterations to linearise."""
         f = self.state
         for i in range(f.moving[s]):
             x = f.x[s, i]
@@ -187,6 +189,7 @@ class Stepper:
 
     @ti.func
     def interact(self, s, dt):
+        """Viscosity and cohesion."""
         f = self.state
         for i in range(f.moving[s]):
             f.dv[s, i] = velocity_change(f, s, i, dt)
@@ -195,7 +198,7 @@ class Stepper:
 
     @ti.func
     def classify(self, s, cavities: ti.template()):
-        """Where every moving particle is now. A cavity ends at its opening plane; half a spacing above it still counts."""
+        """Where every moving particle is now. Half a spacing above its opening plane still belongs to the receiver."""
         f = self.state
         lift = ti.Vector([0.0, 0.0, 0.5 * f.spacing[s]])
         compressed = ti.cast(0.0, ti.f32)
@@ -234,6 +237,7 @@ class Stepper:
 
     @ti.func
     def step(self, s, grids: ti.template(), cavities: ti.template(), poses: ti.template()):
+        """One time step of one scene."""
         f = self.state
         dt = self.choose_step(s)
         ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)

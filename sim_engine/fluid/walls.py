@@ -1,8 +1,8 @@
 """Vessels as moving signed distance grids: lookup, swept contact, cavity membership.
 
-A thin wall can't hold water by its distance alone: a particle that steps over the middle of the wall is pushed out on the
-far side. So every step is also swept: the particle's path in the vessel's own frame (which includes the vessel's motion) is
-traced through the grid, and stops where it meets solid.
+A thin wall can't hold water by its distance alone: a particle that steps over the middle of the wall is pushed out on
+the far side. So every step is also swept: the particle's path in the vessel's own frame (which includes the vessel's
+motion) is traced through the grid, and stops where it meets solid.
 """
 
 import taichi as ti
@@ -151,7 +151,7 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
 
 @ti.func
 def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1):
-    """1 if a straight step in the vessel frame goes through the middle of a wall. Independent of the sweep: plain samples."""
+    """1 if a straight step in the vessel frame goes through the middle of a wall. Plain samples, apart from the sweep."""
     way = y1 - y0
     length = way.norm()
     hit = 0

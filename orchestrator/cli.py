@@ -1,0 +1,157 @@
+"""The `decant` command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orchestrator.commands.common import RefusalError, fail
+
+app = typer.Typer(
+    name="decant",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="""Teach a robot arm to pour without spilling.
+
+A campaign (YAML) says what is poured from where into what, which actions may be tried, how the simulator is calibrated
+(C4) and how pours are found (D1 in simulation, D2 on the bench, D3 by both). Start with:
+
+    decant run configs/campaigns/quickstart.yaml
+
+Exit codes: 0 done, 1 failed, 2 bad input (nothing was started), 3 a person has to answer, 130 interrupted.
+""",
+)
+
+Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the newest unfinished run of this campaign.")]
+RunId = Annotated[str | None, typer.Option("--run", help="With --resume: the run, by its folder's name.")]
+InProcess = Annotated[
+    bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
+]
+Parameters = Annotated[
+    Path | None, typer.Option(help="θ: a theta.json of a calibration, or your own YAML or JSON.", show_default=False)
+]
+Receiver = Annotated[
+    Path | None, typer.Option(help="Vessel file (YAML) in place of the campaign's receiver.", show_default=False)
+]
+
+
+def _call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
+    try:
+        verb(*args, **kwargs)
+    except RefusalError as refusal:
+        fail(refusal)
+
+
+@app.command()
+def run(
+    campaign: Campaign,
+    resume: Resume = False,
+    run_id: RunId = None,
+    in_process: InProcess = False,
+    as_json: Json = False,
+) -> None:
+    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/."""
+    from orchestrator.commands import campaigns
+
+    _call(campaigns.run, campaign, resume=resume, run_id=run_id, in_process=in_process, as_json=as_json)
+
+
+@app.command()
+def calibrate(
+    campaign: Campaign,
+    resume: Resume = False,
+    run_id: RunId = None,
+    in_process: InProcess = False,
+    as_json: Json = False,
+) -> None:
+    """Only calibrate: find the θ whose simulated spills match the weighed ones (C4), and score it on unseen pours."""
+    from orchestrator.commands import campaigns
+
+    _call(campaigns.calibrate, campaign, resume=resume, run_id=run_id, in_process=in_process, as_json=as_json)
+
+
+@app.command()
+def plan(
+    campaign: Campaign,
+    parameters: Parameters = None,
+    receiver: Receiver = None,
+    iterations: Annotated[int | None, typer.Option(min=2, help="Iterations of the optimiser.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="In place of the campaign's.")] = None,
+    in_process: InProcess = False,
+    as_json: Json = False,
+) -> None:
+    """Plan a pour in simulation (D1), for the campaign's receivers or one that it never saw."""
+    from orchestrator.commands import campaigns
+
+    _call(
+        campaigns.plan_pour,
+        campaign,
+        parameters=parameters,
+        receiver=receiver,
+        iterations=iterations,
+        seed=seed,
+        in_process=in_process,
+        as_json=as_json,
+    )
+
+
+@app.command()
+def simulate(
+    campaign: Campaign,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
+    ] = None,
+    parameters: Parameters = None,
+    receiver: Receiver = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the initial positions.")] = 0,
+    as_json: Json = False,
+    rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
+) -> None:
+    """Simulate one pour of a campaign's scene and say where the liquid went."""
+    from orchestrator.commands import single
+
+    _call(
+        single.simulate,
+        campaign,
+        assignments=assignments or [],
+        parameters=parameters,
+        receiver=receiver,
+        seed=seed,
+        as_json=as_json,
+        rrd=rrd,
+        png=png,
+    )
+
+
+@app.command()
+def validate(
+    files: Annotated[list[Path], typer.Argument(help="Campaign, vessel or laboratory files.", show_default=False)],
+) -> None:
+    """Check files without starting anything: keys, units, bounds, vessels, and that some action can be poured."""
+    from orchestrator.commands import single
+
+    _call(single.validate, files)
+
+
+@app.command()
+def schema(
+    which: Annotated[str, typer.Argument(help="campaign, vessel or laboratory.")] = "campaign",
+) -> None:
+    """Print the JSON schema of campaign files (editors complete YAML with it)."""
+    from orchestrator.commands import single
+
+    _call(single.schema, which)
+
+
+def main() -> None:
+    """Entry point."""
+    app()

@@ -1,0 +1,198 @@
+"""`decant run`, `decant calibrate`, `decant plan`: the verbs that run stages in a laboratory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.commands.common import (
+    BAD_INPUT,
+    Finished,
+    RefusalError,
+    check_campaign_can_run,
+    print_json,
+    read_campaign,
+    run_in_front_of_people,
+    say,
+)
+
+if TYPE_CHECKING:
+    from orchestrator.plan import CampaignPlan
+    from orchestrator.stages import StageDefinition
+
+THETA_FILE = "theta.json"
+
+
+def run(path: Path, *, resume: bool, run_id: str | None, in_process: bool, as_json: bool) -> None:
+    """The whole campaign."""
+    plan = read_campaign(path)
+    check_campaign_can_run(plan)
+    finished = _run(plan, "run", path, resume, run_id, in_process, None)
+    if as_json:
+        print_json({"run": finished.result.directory.name, **finished.summary})
+
+
+def calibrate(path: Path, *, resume: bool, run_id: str | None, in_process: bool, as_json: bool) -> None:
+    """Only what finds θ*, and how good it is beside its rivals."""
+    from orchestrator.stages import calibration_stages
+
+    plan = read_campaign(path)
+    if plan.calibration is None:
+        raise RefusalError(f"{path}: has no 'calibration' section; there is nothing to calibrate", BAD_INPUT)
+    # The deployment stays out: its vessels need not be there yet.
+    stages = calibration_stages(plan.calibration)
+    plan = dataclasses.replace(plan, deployment=None)
+    check_campaign_can_run(plan)
+    finished = _run(plan, "calibrate", path, resume, run_id, in_process, stages)
+    if as_json:
+        print_json(calibration_json(finished))
+
+
+def calibration_json(finished: Finished) -> dict[str, Any]:
+    """θ* and mean |r − c_s| by split: its own, the median of random θ, the mean predictor's, the regression's."""
+    results = finished.result.results
+    evaluation, theta = results["evaluation"], results["calibration"]["theta"]
+    ours = evaluation["discrepancy"]["theta"]
+    rivals = {
+        "random_theta": evaluation["random_median"],
+        "mean_predictor": evaluation.get("mean_predictor", {}),
+        "regression": evaluation.get("regression", {}),
+    }
+    data: dict[str, Any] = {"theta": theta}
+    for split in ("train", "test", "transfer"):
+        data[f"{split}_discrepancy"] = ours.get(split)
+        if split != "train":
+            data |= {f"{split}_discrepancy_{name}": values.get(split) for name, values in rivals.items()}
+    return {
+        **data,
+        "simulations": finished.result.simulations,
+        "calibration_simulations": results["calibration"].get("simulations"),
+        "cpu_s": finished.result.cpu_s,
+        "run": str(finished.result.directory),
+        "figures": finished.figures,
+        "recording": finished.recording,
+    }
+
+
+def plan_pour(
+    path: Path,
+    *,
+    parameters: Path | None,
+    receiver: Path | None,
+    iterations: int | None,
+    seed: int | None,
+    in_process: bool,
+    as_json: bool,
+) -> None:
+    """D1 for one receiver: the action that the calibrated simulator would pour with."""
+    from orchestrator.runs import create_run
+    from orchestrator.stages import deployment_stages
+
+    plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
+    check_campaign_can_run(plan)
+    assert plan.deployment is not None
+    stages = deployment_stages(plan, plan.deployment)
+    directory = create_run(plan)
+    finished = run_in_front_of_people(
+        plan, directory, resume=False, stages=stages, in_process=in_process, again=f"decant plan {path} (plans anew)"
+    )
+    answers = []
+    for stage in stages:
+        result = finished.result.results[stage.name]
+        if "action" not in result:
+            raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
+        answers.append(
+            {
+                "receiver": stage.name.partition(":")[2],
+                "action": result["action"],
+                "action_si": result["action_si"],
+                "predicted_loss": result["predicted_loss"],
+                "predicted_spillage": result.get("predicted_spillage", result["predicted_loss"]),
+                "predicted_deviation": result["predicted_deviation"],
+                "loss": plan.deployment.loss.name,
+            }
+        )
+    theta = plan.parameters.model_dump()
+    if as_json:
+        totals = {"simulations": finished.result.simulations, "cpu_s": finished.result.cpu_s, "run": str(directory)}
+        first = answers[0]
+        print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
+
+
+def planning_plan(
+    plan: CampaignPlan, parameters: Path | None, receiver: Path | None, iterations: int | None, seed: int | None
+) -> CampaignPlan:
+    """A campaign turned into D1 without pours.
+
+    Raises:
+        RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
+    """
+    from orchestrator.config.errors import ConfigError
+    from orchestrator.config.load import load_parameters, load_vessel
+
+    theta = plan.parameters
+    try:
+        if parameters is not None:
+            theta = load_parameters(parameters, plan.parameters)
+        elif plan.calibration is not None:
+            say(
+                "note: no --parameters given; planning with the campaign's uncalibrated parameters "
+                f"({json.dumps(theta.model_dump())})"
+            )
+        vessel = load_vessel(receiver) if receiver is not None else None
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    deployment = plan.deployment
+    if deployment is None:
+        raise RefusalError(
+            f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)",
+            BAD_INPUT,
+        )
+    scenes = deployment.scenes
+    if vessel is not None:
+        scenes = (dataclasses.replace(scenes[0], name=f"plan:{vessel.name}", receiver=vessel),)
+    deployment = dataclasses.replace(
+        deployment,
+        strategy="D1",
+        scenes=scenes,
+        pours=0,
+        iterations=iterations if iterations is not None else deployment.iterations,
+    )
+    return dataclasses.replace(
+        plan,
+        name=f"{plan.name}-plan",
+        parameters=theta,
+        calibration=None,
+        deployment=deployment,
+        seed=plan.seed if seed is None else seed,
+    )
+
+
+def _run(
+    plan: CampaignPlan,
+    verb: str,
+    path: Path,
+    resume: bool,
+    run_id: str | None,
+    in_process: bool,
+    stages: list[StageDefinition] | None,
+) -> Finished:
+    from orchestrator.errors import RunError
+    from orchestrator.runs import create_run, find_run
+
+    try:
+        directory = find_run(plan, run_id) if resume else create_run(plan)
+    except RunError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{plan.outputs.directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+    again = f"decant {verb} {path} --resume --run {directory.name}"
+    finished = run_in_front_of_people(plan, directory, resume=resume, stages=stages, in_process=in_process, again=again)
+    calibrated = finished.result.results.get("calibration")
+    if calibrated is not None:
+        content = json.dumps({"theta": calibrated["theta"]}, indent=2) + "\n"
+        (directory / THETA_FILE).write_text(content, encoding="utf-8")
+        say(f"θ* is in {directory / THETA_FILE}; use it with --parameters")
+    return finished

@@ -1,0 +1,225 @@
+"""What all verbs share: exit codes, reading a campaign, running one in front of a person."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import signal
+import sys
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from actors.protocols import Laboratory
+    from orchestrator.campaign import CampaignResult
+    from orchestrator.plan import CampaignPlan
+    from orchestrator.stages import StageDefinition
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+"""Exit codes beside 0 (done) and 3 (a person has to answer; `RunError.exit_code`)."""
+
+
+class RefusalError(Exception):
+    """A command can't do what was asked; printed as it is, without a traceback."""
+
+    def __init__(self, message: str, code: int = FAILED) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def say(text: str) -> None:
+    """A line for people: stderr, so that stdout stays for results."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def print_json(data: dict[str, Any]) -> None:
+    """One line of JSON on stdout. Numbers that JSON has no word for become null."""
+    print(json.dumps(_plain(data), ensure_ascii=False), flush=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def read_campaign(path: Path) -> CampaignPlan:
+    """A campaign's plan.
+
+    Raises:
+        RefusalError: with all problems of its files, exit code 2.
+    """
+    from orchestrator.config.errors import ConfigError
+    from orchestrator.config.load import load_campaign
+
+    try:
+        return load_campaign(path)
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+
+
+def check_campaign_can_run(plan: CampaignPlan) -> None:
+    """Vessels, loads and motions, before anything starts.
+
+    Raises:
+        RefusalError: with everything that is wrong, exit code 2.
+    """
+    from orchestrator.config.check import check_campaign
+
+    problems = check_campaign(plan)
+    if problems:
+        raise RefusalError("\n".join(f"{plan.source}: {problem}" for problem in problems), BAD_INPUT)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A campaign that ran to its end, and what was written about it."""
+
+    result: CampaignResult
+    summary: dict[str, Any]
+    figures: dict[str, Path]
+    recording: Path | None
+
+
+def run_in_front_of_people(
+    plan: CampaignPlan,
+    directory: Path,
+    *,
+    resume: bool,
+    stages: Sequence[StageDefinition] | None = None,
+    in_process: bool = False,
+    again: str,
+) -> Finished:
+    """Run a campaign with a live display, a recording, figures and a summary.
+
+    Args:
+        directory: of the run.
+        stages: in place of the plan's.
+        in_process: everything in this process, without Ray (slower; for debugging).
+        again: the command that resumes, for the message after an interruption.
+
+    Raises:
+        RefusalError: it failed, was interrupted, or needs a person.
+    """
+    import dataclasses
+
+    from actors.laboratory import open_laboratory
+    from actors.protocols import LaboratoryError
+    from orchestrator.campaign import run_campaign
+    from orchestrator.errors import RunError
+    from orchestrator.events import Watcher
+    from orchestrator.monitor.monitor import RerunMonitor
+    from orchestrator.progress import ProgressDisplay
+    from orchestrator.stages import stages_of
+
+    chosen = tuple(stages_of(plan) if stages is None else stages)
+    spec = dataclasses.replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
+    say(f"run {directory}  ({spec.mode} bench)" if any(s.pours for s in chosen) else f"run {directory}")
+    monitor: RerunMonitor | None = None
+    try:
+        laboratory = open_laboratory(spec, need_bench=any(stage.pours for stage in chosen))
+        if plan.outputs.rrd:
+            monitor = RerunMonitor(directory / "campaign.rrd", plan)
+        with ProgressDisplay(plan) as display:
+            watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]
+
+            async def work(laboratory: Laboratory) -> CampaignResult:
+                return await run_campaign(
+                    plan,
+                    laboratory,
+                    directory,
+                    resume=resume,
+                    watchers=watchers,
+                    ask_operator=_ask_on_terminal if sys.stdin.isatty() else None,
+                    stages=chosen,
+                )
+
+            result = asyncio.run(_until_signalled(lambda: work(laboratory), again))
+    except (RunError, LaboratoryError) as error:
+        raise RefusalError(
+            f"{error}\nwhat is done so far is kept: {again}", getattr(error, "exit_code", FAILED)
+        ) from None
+    except (asyncio.CancelledError, KeyboardInterrupt):
+        raise RefusalError(f"interrupted; nothing is lost. Go on with: {again}", INTERRUPTED) from None
+    finally:
+        if monitor is not None:
+            monitor.close()
+    return _report(plan, result, monitor)
+
+
+def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finished:
+    from rich.console import Console
+
+    from orchestrator.report.campaign import draw_figures
+    from orchestrator.report.summary import summarise, summary_table, write_summary
+
+    evaluation = result.results.get("evaluation", {})
+    baselines = {
+        split: {name: evaluation.get(name, {}).get(split) for name in ("mean_predictor", "regression")}
+        for split in ("train", "test", "transfer")
+    }
+    figures = (
+        draw_figures(result.directory / "figures", plan, result.results, baselines=baselines)
+        if (plan.outputs.figures)
+        else {}
+    )
+    recording = monitor.path if monitor is not None else None
+    summary = summarise(
+        plan,
+        result.results,
+        figures=figures,
+        recording=recording,
+        dropped_events=monitor.dropped if monitor is not None else 0,
+        baselines=baselines,
+        totals={
+            "simulations": result.simulations,
+            "pours": result.pours,
+            "cpu_s": result.cpu_s,
+            "seconds": result.seconds,
+        },
+    )
+    write_summary(result.directory, summary)
+    Console(stderr=True).print(summary_table(plan, summary))
+    return Finished(result, summary, figures, recording)
+
+
+async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], again: str) -> CampaignResult:
+    """Run; the first SIGINT or SIGTERM pauses at the next safe point, a second one gives up what is under way."""
+    task = asyncio.ensure_future(work())
+    asked = 0
+
+    def stop() -> None:
+        nonlocal asked
+        asked += 1
+        if asked == 1:
+            say("\npausing: a pour that has begun is finished and weighed first; once more to give it up")
+        else:
+            say("\nstopping now; a pour that has begun will have to be accounted for on resume")
+        task.cancel()
+
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop)
+    try:
+        return await task
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+
+
+async def _ask_on_terminal(question: str, options: Sequence[str]) -> str:
+    say(f"\n{question}\n  answer with one of: {' | '.join(options)}")
+    return (await asyncio.to_thread(input, "> ")).strip()
+
+
+def fail(refusal: RefusalError) -> NoReturn:
+    """Print a refusal and leave with its code."""
+    say(f"decant: {refusal}" if refusal.code != BAD_INPUT else str(refusal))
+    raise SystemExit(refusal.code)

@@ -1,0 +1,167 @@
+"""`decant simulate`, `decant validate`, `decant schema`: verbs that need no laboratory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, read_campaign, say
+
+if TYPE_CHECKING:
+    from orchestrator.plan import CampaignPlan
+    from sim_engine.space import Space
+    from sim_engine.task import Scene
+
+
+def simulate(
+    path: Path,
+    *,
+    assignments: list[str],
+    parameters: Path | None,
+    receiver: Path | None,
+    seed: int,
+    as_json: bool,
+    rrd: Path | None,
+    png: Path | None,
+) -> None:
+    """One pour in the simulator of this process."""
+    from rich.console import Console
+
+    from orchestrator.config.assignments import AssignmentError, assigned_action
+    from orchestrator.config.errors import ConfigError
+    from orchestrator.config.load import load_parameters, load_vessel
+    from sim_engine.pour import InvalidSceneError, PourSimulator
+    from sim_engine.task import PourTask
+
+    plan = read_campaign(path)
+    try:
+        theta = plan.parameters if parameters is None else load_parameters(parameters, plan.parameters)
+        vessel = None if receiver is None else load_vessel(receiver)
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    scene, space = scene_to_simulate(plan)
+    if vessel is not None:
+        scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
+    try:
+        action = assigned_action(assignments, fixed=scene.fixed, space=space)
+    except AssignmentError as error:
+        raise RefusalError(f"--set: {error}", BAD_INPUT) from None
+    except ValueError as error:
+        raise RefusalError(f"--set: {error}", BAD_INPUT) from None
+    for target in (rrd, png):
+        if target is not None and not target.absolute().parent.is_dir():
+            raise RefusalError(f"{target}: its folder does not exist", BAD_INPUT)
+    task = PourTask(scene, action, theta, seed, record_rate=20.0 if rrd or png else 0.0)
+    simulator = PourSimulator()
+    try:
+        with Console(stderr=True).status("simulating (the first pour ever also compiles kernels, about 10 s) …"):
+            run = simulator.simulate(task)
+    except InvalidSceneError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    finally:
+        simulator.close()
+    outcome = run.outcome
+    if rrd is not None or png is not None:
+        _show(task, run, rrd, png)
+    if as_json:
+        print_json({**outcome.as_json(), "action": action.values(), "theta": theta.model_dump(), "scene": scene.name})
+    else:
+        say(f"{scene.name}: {action.display()}")
+        print(
+            f"received {100 * outcome.received:.1f} %  spilled {100 * outcome.spilled:.1f} %  "
+            f"retained {100 * outcome.retained:.1f} %  in flight {100 * outcome.in_flight:.1f} %  "
+            f"escaped {100 * outcome.escaped:.2f} %   ({outcome.particles} particles, "
+            f"{1e3 * outcome.spacing:.2f} mm apart, {outcome.cpu_s:.1f} CPU s)"
+        )
+    if outcome.invalid is not None:
+        raise RefusalError(f"this outcome must not be used: {outcome.invalid}", FAILED)
+
+
+def scene_to_simulate(plan: CampaignPlan) -> tuple[Scene, Space]:
+    """The campaign's scene with its searched actions: deployment's first, else calibration's."""
+    if plan.deployment is not None:
+        return plan.deployment.scenes[0], plan.deployment.actions
+    assert plan.calibration is not None, "a campaign calibrates or deploys"
+    return plan.calibration.scene, plan.calibration.actions
+
+
+def _show(task: Any, run: Any, rrd: Path | None, png: Path | None) -> None:
+    from actors.protocols import Frames, SimulationResult
+
+    assert run.frames is not None
+    frames = Frames(run.frames.times, run.frames.positions, run.frames.states, run.frames.pourer_poses)
+    result = SimulationResult(run.outcome, frames)
+    if rrd is not None:
+        from orchestrator.monitor.simulation import simulation_rrd
+
+        say(f"recording: {simulation_rrd(rrd, task, result)} (open it with: rerun {rrd})")
+    if png is not None:
+        from orchestrator.report.scene import simulation_png
+
+        say(f"picture: {simulation_png(png, task, result)}")
+
+
+def validate(paths: list[Path]) -> None:
+    """Check files; every problem of every file, exit code 2 if there is one."""
+    from orchestrator.config.check import check_campaign
+    from orchestrator.config.errors import ConfigError
+    from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
+    from orchestrator.config.yaml_source import Document
+    from sim_engine.vessel.build import build_vessel
+    from sim_engine.vessel.errors import VesselError
+
+    bad = 0
+    for path in paths:
+        problems: list[str] = []
+        try:
+            kind = kind_of(Document.read(path.resolve()).data)
+            if kind == "vessel":
+                vessel = build_vessel(load_vessel(path))
+                note = f"vessel, holds {1e6 * vessel.capacity:.4g} mL to the brim"
+            elif kind == "laboratory":
+                note = f"laboratory, {load_laboratory(path).mode}"
+            else:
+                plan = load_campaign(path)
+                problems = [f"{path}: {problem}" for problem in check_campaign(plan)]
+                note = f"campaign, seed {plan.seed}"
+        except ConfigError as error:
+            problems = [str(error)]
+        except VesselError as error:
+            problems = [f"{path}: {error}"]
+        if problems:
+            bad += 1
+            say("\n".join(problems))
+        else:
+            print(f"{path}: ok ({note})")
+    if bad:
+        raise RefusalError(f"{bad} of {len(paths)} file(s) can't be used", BAD_INPUT)
+
+
+def kind_of(data: Any) -> str:
+    """What a YAML file describes, by its keys."""
+    keys = set(data) if isinstance(data, dict) else set()
+    if keys & {"calibration", "deployment", "seed", "liquid", "pourer", "receiver"}:
+        return "campaign"
+    if keys & {"inner", "profile", "mesh", "wall"}:
+        return "vessel"
+    if keys & {"bench", "mode", "simulators"}:
+        return "laboratory"
+    return "campaign"
+
+
+def schema(which: str) -> None:
+    """The JSON schema that editors complete campaign files with."""
+    from orchestrator.config import schema as schemas
+
+    known = {
+        "campaign": schemas.campaign_schema,
+        "vessel": schemas.vessel_schema,
+        "laboratory": schemas.laboratory_schema,
+    }
+    if which not in known:
+        raise RefusalError(f"no schema '{which}'; there are {', '.join(known)}", BAD_INPUT)
+    json.dump(known[which](), sys.stdout, indent=2, ensure_ascii=False)
+    print()
