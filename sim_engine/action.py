@@ -53,7 +53,7 @@ ACTION_DIMENSIONS: dict[str, Dimension] = {
             "deg/s^2",
             10 * DEG,
             20_000 * DEG,
-            "acceleration into and out of every turn; 'step' starts and stops at once, for replaying recorded data only",
+            "acceleration into and out of every turn; 'step' starts and stops at once, to replay recorded data only",
             optional=True,
         ),
         Dimension(

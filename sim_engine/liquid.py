@@ -54,13 +54,13 @@ class SimulationParameters(BaseModel):
     Below about one capillary length per spacing (2.7 mm for water) it only acts on drips."""
 
     viscosity: float = Field(default=3.0, ge=0.0, le=60.0, json_schema_extra={"unit": "1/s"})
-    """Rate at which a particle's velocity relaxes to its neighbours' mean (XSPH) [1/s], independent of the time step."""
+    """Rate at which a particle's velocity relaxes to its neighbours' mean (XSPH) [1/s], whatever the time step."""
 
     friction: float = Field(default=0.05, ge=0.0, le=1.0, json_schema_extra={"unit": "1"})
     """Coulomb coefficient between particles and vessel walls."""
 
     wall_distance: float = Field(default=0.5, ge=0.3, le=1.5, json_schema_extra={"unit": "1"})
-    """Distance from a wall at which liquid comes to rest, in particle spacings (FleX: collision distance). At 0.5 a vessel
+    """Distance from a wall at which particles come to rest, in spacings (FleX: collision distance). At 0.5 a vessel
     holds its true volume; more narrows vessels and raises lips, as walls made of particles do."""
 
     @classmethod

@@ -68,10 +68,12 @@ class Space:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Of the axes, in order."""
         return tuple(axis.name for axis in self.axes)
 
     @property
     def dimension(self) -> int:
+        """Number of axes."""
         return len(self.axes)
 
     def decode(self, unit: Sequence[float] | NDArray[np.float64]) -> dict[str, float]:

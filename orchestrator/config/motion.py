@@ -28,12 +28,14 @@ EXAMPLES = {
     "x_offset": "90 mm",
     "y_offset": "0 mm",
     "height": "60 mm",
-    "particles": "1500",
-    "cohesion": "0.02 N/m",
-    "viscosity": "3 1/s",
-    "friction": "0.05",
-    "wall_distance": "0.5",
+} | {
+    # A parameter's default is a good example of it.
+    name: f"{default:g}" if info.unit == "1" else f"{default:g} {info.unit}"
+    for (name, info), default in zip(
+        SimulationParameters.info().items(), SimulationParameters().model_dump().values(), strict=True
+    )
 }
+"""A right value of every action dimension and simulation parameter, for messages and schemas."""
 
 
 def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity:

@@ -60,19 +60,17 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
 
 
 def _cut(data: Any, loc: Loc) -> bool:
-    """Take what stands at a location out of the data; False where that would be everything."""
+    """Take what stands at a location out of the data; False where that is everything, or gone already."""
     # An item of a list can't be left out without changing the meaning of its neighbours: the list goes as a whole.
     target = loc
     while target and isinstance(target[-1], int):
         target = target[:-1]
-    if not target:
+    if not target or _loc_in(data, target) != target:
         return False
     node = data
     for part in target[:-1]:
-        if not isinstance(node, dict) or part not in node:
-            return True
         node = node[part]
-    node.pop(target[-1], None)
+    del node[target[-1]]
     return True
 
 

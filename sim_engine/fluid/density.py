@@ -1,12 +1,12 @@
 """The density constraint: C_i = ρ_i/ρ₀ − 1 ≤ 0, solved for positions by damped Jacobi with accumulated multipliers.
 
 Walls enter as the kernel's integral over a half-space at the wall's distance, so that liquid keeps half a spacing from
-them and feels their pressure. Part of the multipliers is kept from step to step (warm start) and carries a resting column;
-keeping all of them would integrate the error a third time and swing up.
+them and feels their pressure. Part of the multipliers is kept from step to step (warm start), which helps to carry a
+resting column; keeping all of them would integrate the error a third time and swing up.
 
 Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chentanez 2016 (accumulated multipliers); wall
-integral: after Bender et al. 2019 (volume maps), here with the analytic half-space. Limitations: concave corners see only
-the nearer wall.
+integral: after Bender et al. 2019 (volume maps), here with the analytic half-space. Limitations: concave corners see
+only the nearer wall.
 """
 
 import taichi as ti
@@ -18,7 +18,7 @@ PACKING = 1.032
 """Kernel sum of a relaxed bulk of spacing d over its continuum value, measured on a cup at rest."""
 
 RELAXATION = 0.4
-"""Damping of the Jacobi step: for this kernel at h = 2d the iteration matrix reaches about 4, so above ½ it diverges."""
+"""Damping of the Jacobi step: for this kernel at h = 2d the iteration matrix reaches about 4; above ½ it diverges."""
 
 
 @ti.func

@@ -151,7 +151,7 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
 
 @ti.func
 def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1):
-    """1 if a straight step in the vessel frame goes through the middle of a wall. Plain samples, apart from the sweep."""
+    """1 if a straight step in the vessel frame goes through the middle of a wall. Samples, apart from the sweep."""
     way = y1 - y0
     length = way.norm()
     hit = 0

@@ -201,6 +201,13 @@ BAD_CAMPAIGNS = {
         "",
         "deployment.receivers[1]: a receiver is called 'cup' already",
     ),
+    "bad name of an inline receiver": (
+        CAMPAIGN + "deployment: {strategy: D2, pours: 3, receivers: [{name: /cup, mesh: x.stl}], "
+        "motion: {angular_velocity: 9 deg/s}, actions: {x_offset: [80 mm, 99 mm]}}",
+        "x.stl",
+        "beaker.yaml",
+        "deployment.receivers[0].name: '/cup' should consist of letters, digits",
+    ),
     "bad indentation": (CAMPAIGN, "  simulations: 20", "   simulations: 20", "13:4: not YAML: "),
     "tab": (CAMPAIGN, "  simulations: 20", "\tsimulations: 20", "a tab; YAML is indented with spaces"),
     "open bracket": (CAMPAIGN, "0.1 N/m]", "0.1 N/m", "not YAML: "),

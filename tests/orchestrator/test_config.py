@@ -242,9 +242,136 @@ def test_parameters_as_a_program_or_a_person_writes_them(text: str, tmp_path: Pa
     (tmp_path / "theta.json").write_text(text)
     base = SimulationParameters(friction=0.2)
     loaded = load_parameters(tmp_path / "theta.json", base)
-    assert loaded.model_dump() == pytest.approx(
-        {"particles": 1500, "cohesion": 0.03, "viscosity": 2.5, "friction": 0.2}
+    expected = base.model_copy(update={"particles": 1500, "cohesion": 0.03, "viscosity": 2.5})
+    assert loaded.model_dump() == pytest.approx(expected.model_dump())
+
+
+def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path: Path) -> None:
+    vessels = CONFIGS / "vessels"
+    text = textwrap.dedent(f"""\
+        name: everything
+        seed: 41
+        laboratory:
+          name: odd
+          simulators: 3
+          in_process: true
+          object_store: 300 MB
+          bench:
+            liquid: {{particles: 3100, cohesion: 31 mN/m, viscosity: 7 Hz, friction: 0.31}}
+            pose_error: {{x: 1.1 mm, y: -2 mm, tilt: 0.7 deg, speed_factor: 1.03}}
+            pose_noise: {{x: 0.3 mm, y: 0.4 mm, tilt: 0.2 deg, speed_factor: 0.02}}
+            balance: {{resolution: 0.01 g, noise: 0.2 g, drift: 0.5 g/min, settling_time: 2.5 s}}
+            time_scale: 12
+            operator_time: 1 min
+        liquid: {{name: oil, mass: 0.15 kg, density: 0.92 g/cm^3}}
+        pourer: {vessels}/beaker.yaml
+        motion:
+          pivot: {{x: 30 mm, z: 70 mm}}
+          angular_acceleration: 300 deg/s^2
+          hold_time: 0.7 s
+          hold_cap: 2 s
+          return_velocity: 45 deg/s
+          y_offset: 3 mm
+          height: 55 mm
+        simulator:
+          parameters: {{particles: {{range: [700, 900], scale: log}}, cohesion: 0.04 N/m, viscosity: [1 1/s, 9 1/s]}}
+        calibration:
+          receiver: {vessels}/tumbler.yaml
+          motion: {{x_offset: 97 mm}}
+          actions: {{angular_velocity: {{range: [20 deg/s, 90 deg/s], scale: log}}, max_angle: [80 deg, 110 deg]}}
+          pours: {{count: 9, holdout: 3}}
+          simulations: 33
+          initial: 5
+          kappa: 1.5
+          random_baseline: 4
+        deployment:
+          strategy: D3
+          receivers: [{vessels}/narrow.yaml, {vessels}/mug.yaml]
+          motion: {{max_angle: 115 deg, return_velocity: 30 deg/s}}
+          actions: {{angular_velocity: [20 deg/s, 90 deg/s], x_offset: [90 mm, 130 mm]}}
+          loss: {{name: spilled_and_retained, retained_weight: 0.5}}
+          pours: 6
+          prior_simulations: 11
+          per_pour: free
+          kappa: 3
+          initial: 4
+          on_failed_pour: ignore
+        on_unknown: repeat
+        parallel_simulations: 5
+        outputs: {{directory: here, rrd: false, figures: false, record_rate: 4 1/s, recorded_simulations: 2}}
+        """)
+    (tmp_path / "all.yaml").write_text(text)
+    plan = load_campaign(tmp_path / "all.yaml")
+    calibration, deployment, bench = plan.calibration, plan.deployment, plan.laboratory.bench
+    assert calibration is not None
+    assert deployment is not None
+    assert bench is not None
+    assert (plan.name, plan.seed, plan.parallel_simulations, plan.on_unknown) == ("everything", 41, 5, "repeat")
+    assert dataclasses.astuple(plan.outputs) == (tmp_path / "here", False, False, 4.0, 2)
+    lab = plan.laboratory
+    assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
+    assert (bench.liquid.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
+    assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03))
+    assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02))
+    assert (bench.time_scale, bench.operator_time, bench.settling_time) == pytest.approx((12.0, 60.0, 2.5))
+    assert (bench.balance_resolution, bench.balance_noise) == pytest.approx((1e-5, 2e-4))
+    assert bench.balance_drift == pytest.approx(0.5e-3 / 60.0)
+    scene = calibration.scene
+    assert (scene.liquid.name, scene.liquid.mass, scene.liquid.density) == ("oil", 0.15, pytest.approx(920.0))
+    assert (scene.pivot.kind, scene.pivot.x, scene.pivot.z, scene.hold_cap) == ("point", 0.03, 0.07, 2.0)
+    assert scene.fixed == pytest.approx(
+        {
+            "angular_acceleration": 300 * DEG,
+            "hold_time": 0.7,
+            "return_velocity": 45 * DEG,
+            "y_offset": 0.003,
+            "height": 0.055,
+            "x_offset": 0.097,
+        }
     )
+    assert [(a.name, a.lower, a.upper, a.scale, a.integer) for a in calibration.parameters.axes] == [
+        ("particles", 700.0, 900.0, "log", True),
+        ("viscosity", 1.0, 9.0, "linear", False),
+    ]
+    assert calibration.fixed_parameters["cohesion"] == pytest.approx(0.04)
+    assert plan.parameters.particles == 900, "the default, as far as the range allows"
+    assert [(a.name, a.scale) for a in calibration.actions.axes] == [
+        ("angular_velocity", "log"),
+        ("max_angle", "linear"),
+    ]
+    budgets = (calibration.pour_count, calibration.holdout, calibration.simulations, calibration.initial)
+    assert budgets == (9, 3, 33, 5)
+    assert (calibration.kappa, calibration.random_baseline) == (1.5, 4)
+    assert [s.receiver.name for s in deployment.scenes] == ["narrow", "mug"]
+    assert deployment.scenes[0].fixed["return_velocity"] == pytest.approx(30 * DEG)
+    assert (deployment.loss.name, deployment.loss.retained_weight) == ("spilled_and_retained", 0.5)
+    assert (deployment.pours, deployment.prior_simulations, deployment.per_pour) == (6, 11, None)
+    assert (deployment.kappa, deployment.initial, deployment.on_failed_pour) == (3.0, 4, "ignore")
+    (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
+    again = load_campaign(tmp_path / "again.json")
+    assert dataclasses.replace(again, source=plan.source) == plan
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ("strategy: D1", ("D1", 1, 15, 2, 0)),
+        ("strategy: D1\n  pours: 0\n  iterations: 7\n  simulations_per_iteration: 3", ("D1", 0, 7, 3, 0)),
+        ("strategy: D2\n  pours: 9\n  mean: zero", ("D2", 9, 15, 2, 0)),
+        ("strategy: D3\n  pours: 9\n  per_pour: 0", ("D3", 9, 15, 2, 0)),
+        ("strategy: D3\n  pours: 9", ("D3", 9, 15, 2, 2)),
+    ],
+)
+def test_strategies_have_their_own_budgets(keys: str, expected: tuple[object, ...], tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+    head, tail = text.split("  prior_simulations: 10\n")
+    tail = tail[tail.index("on_unknown") :]
+    (tmp_path / "campaign.yaml").write_text(head.replace("strategy: D3", keys) + tail)
+    plan = load_campaign(tmp_path / "campaign.yaml").deployment
+    assert plan is not None
+    budgets = (plan.strategy, plan.pours, plan.iterations, plan.simulations_per_iteration, plan.per_pour)
+    assert budgets == expected
+    assert plan.mean == ("zero" if "zero" in keys else "constant")
 
 
 def test_section_overrides_the_motion_of_the_campaign(tmp_path: Path) -> None:
