@@ -202,10 +202,11 @@ BAD_CAMPAIGNS = {
         "deployment.receivers[1]: a receiver is called 'cup' already",
     ),
     "bad name of an inline receiver": (
-        CAMPAIGN + "deployment: {strategy: D2, pours: 3, receivers: [{name: /cup, mesh: x.stl}], "
+        CAMPAIGN + "deployment: {strategy: D2, pours: 3, receivers: [{name: /cup, profile: "
+        "{unit: mm, inner: [[0, 0], [32, 0], [32, 100]], wall: 4 mm, floor: 4 mm}}], "
         "motion: {angular_velocity: 9 deg/s}, actions: {x_offset: [80 mm, 99 mm]}}",
-        "x.stl",
-        "beaker.yaml",
+        "",
+        "",
         "deployment.receivers[0].name: '/cup' should consist of letters, digits",
     ),
     "bad indentation": (CAMPAIGN, "  simulations: 20", "   simulations: 20", "13:4: not YAML: "),
