@@ -182,7 +182,7 @@ class Document:
     def _syntax_problem(self, error: MarkedYAMLError) -> Problem:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark is not None else (1, 1)
-        what = (error.problem or "unreadable").replace("<", "'").replace(">", "'")
+        what = (error.problem or "unreadable").replace("<", "").replace(">", "")
         source = self.line(line)
         if "another document" in what:
             hint = "a file holds one document; remove the '---' line"
