@@ -44,7 +44,7 @@ class Liquid(BaseModel):
 class SimulationParameters(BaseModel):
     """What calibration may turn (θ_s). Names follow FleX where it has one; meanings are ours."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     particles: int = Field(default=2_000, ge=200, le=50_000)
     """Number of particles at fixed liquid volume; sets the spacing d = (V/N)^(1/3)."""

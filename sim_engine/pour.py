@@ -179,6 +179,7 @@ class PourSimulator:
             grids=[pourer.grid, receiver.grid],
             masks=[self._masks[scene.pourer], self._masks[scene.receiver]],
             walls=[pourer.wall_thickness, receiver.wall_thickness],
+            rims=[pourer.rim_height, receiver.rim_height],
             receiver_at=np.array([error.x, error.y, 0.0]),
             spill_level=receiver.rim_height - d,
             poses=poses,

@@ -50,6 +50,7 @@ class FluidEngine:
         grids: list[SignedDistanceGrid],
         masks: list[NDArray[np.uint8]],
         walls: list[float],
+        rims: list[float],
         receiver_at: NDArray[np.float64],
         spill_level: float,
         poses: NDArray[np.float64],
@@ -64,7 +65,8 @@ class FluidEngine:
             viscosity: XSPH rate [1/s].
             friction: Coulomb coefficient.
             wall_distance: where liquid comes to rest before a wall, in spacings.
-            grids, masks, walls: of pourer and receiver; a mask is 1 where a particle counts as inside.
+            grids, masks, walls, rims: of pourer and receiver; a mask is 1 where a particle counts as inside; thinnest
+                wall [m]; height of the lip in the vessel's frame [m].
             receiver_at: (3,) [m].
             spill_level: below it and in no vessel a particle is spilled [m].
             poses: (T, 7) of the pourer, `POSE_STEP` apart, from time 0 on; before it the first pose holds.
@@ -81,7 +83,7 @@ class FluidEngine:
         for b in range(VESSELS):
             f.grid_offset[0, b], f.grid_size[0, b] = offset, list(grids[b].values.shape)
             f.grid_origin[0, b], f.grid_spacing[0, b] = list(grids[b].origin), grids[b].spacing
-            f.wall[0, b] = walls[b]
+            f.wall[0, b], f.rim[0, b] = walls[b], rims[b]
             offset += grids[b].values.size
         self._grids = np.concatenate([g.values.ravel() for g in grids]).astype(np.float32, copy=False)
         self._cavities = np.concatenate([m.ravel() for m in masks]).astype(np.uint8, copy=False)

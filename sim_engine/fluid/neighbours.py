@@ -25,10 +25,11 @@ def rebuild(f: ti.template(), s, skin: ti.template()):
         if f.home[s, i] < SPILLED:
             low = ti.min(low, f.x[s, i])
             high = ti.max(high, f.x[s, i])
-    # The domain follows the liquid; if it spreads too far for the table, cells grow.
+    # The domain follows the liquid; if it spreads too far for the table, cells grow. With nobody left it is one cell.
+    low = ti.min(low, high)
     edge = reach
     size = ti.cast((high - low) / edge, ti.i32) + 1
-    while size[0] * size[1] * size[2] > f.cells:
+    while ti.cast(size[0], ti.f32) * size[1] * size[2] > f.cells:
         edge *= 1.25
         size = ti.cast((high - low) / edge, ti.i32) + 1
     cells = size[0] * size[1] * size[2]

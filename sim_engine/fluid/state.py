@@ -84,4 +84,5 @@ class FluidState:
         self.grid_size = ti.Vector.field(3, ti.i32, shape=(scenes, VESSELS))
         self.grid_origin = ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS))
         self.grid_spacing = ti.field(ti.f32, shape=(scenes, VESSELS))
+        self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]

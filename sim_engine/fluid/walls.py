@@ -1,5 +1,10 @@
 """Vessels as moving signed distance grids: lookup, swept contact, cavity membership.
 
+Particles' centres stand half a spacing off the solid, the liquid's surface stands half a spacing above the topmost
+centres, and of the layer on top half a spacing, in the mean, is too little to flow: a lip would hold back one and a
+half spacings of liquid too much. So for particles every rim is lowered by as much: the grid is looked up a little
+higher, by an offset that grows from nothing to `LIP_DROP` over the uppermost spacings.
+
 A thin wall can't hold water by its distance alone: a particle that steps over the middle of the wall is pushed out on
 the far side. So every step is also swept: the particle's path in the vessel's own frame (which includes the vessel's
 motion) is traced through the grid, and stops where it meets solid.
@@ -11,6 +16,23 @@ FAR = 1.0
 """Distance [m] reported beyond a grid."""
 
 TRACE_STEPS = 24
+
+LIP_DROP = 1.5
+"""Rims are lower for particles by so many spacings: thrice a half, see above."""
+
+LIP_BLEND = 6.0
+"""… which builds up over so many spacings below the rim; it stretches distances by up to 1 + LIP_DROP / LIP_BLEND."""
+
+STRIDE = 0.8
+"""Sphere tracing takes this part of a distance, for that stretch."""
+
+
+@ti.func
+def look_up(f: ti.template(), s, b, y):
+    """Where the grid is read for a point of the vessel frame."""
+    d = f.spacing[s]
+    part = ti.min(ti.max((y[2] - f.rim[s, b]) / (LIP_BLEND * d) + 1.0 + LIP_DROP / LIP_BLEND, 0.0), 1.0)
+    return ti.Vector([y[0], y[1], y[2] + LIP_DROP * d * part])
 
 
 @ti.func
@@ -34,7 +56,7 @@ def to_world(f: ti.template(), s, b, y):
 def distance(f: ti.template(), grids: ti.template(), s, b, y):
     """Trilinear signed distance at a point of the vessel frame [m]; `FAR` beyond the grid."""
     size = f.grid_size[s, b]
-    u = (y - f.grid_origin[s, b]) / f.grid_spacing[s, b]
+    u = (look_up(f, s, b, y) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
     result = ti.cast(FAR, ti.f32)
     if (
         u[0] >= 0.0
@@ -63,7 +85,7 @@ def distance(f: ti.template(), grids: ti.template(), s, b, y):
 def distance_and_gradient(f: ti.template(), grids: ti.template(), s, b, y):
     """(∂φ/∂y normalised, φ) as a 4-vector; gradient 0 and `FAR` beyond the grid."""
     size = f.grid_size[s, b]
-    u = (y - f.grid_origin[s, b]) / f.grid_spacing[s, b]
+    u = (look_up(f, s, b, y) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
     result = ti.Vector([0.0, 0.0, 0.0, FAR])
     if (
         u[0] >= 0.0
@@ -129,8 +151,8 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
         length = way.norm()
         phi = distance(f, grids, s, b, y)
         if stride == 0:
-            clear = ti.min(clear, 0.9 * ti.max(phi, 0.0))
-        free = phi - clear
+            clear = ti.min(clear, 0.9 * STRIDE * ti.max(phi, 0.0))
+        free = STRIDE * phi - clear
         if length <= free or length < 1e-9:
             y += way
             leg = 2
