@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.commands.common import RefusalError, fail
+from orchestrator.commands.common import INTERRUPTED, RefusalError, fail
 
 app = typer.Typer(
     name="decant",
@@ -42,14 +42,26 @@ Receiver = Annotated[
 ]
 
 
+def examples(*commands: str) -> str:
+    """The end of a command's help: what one may type."""
+    return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
+
+
 def _call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
     try:
         verb(*args, **kwargs)
     except RefusalError as refusal:
         fail(refusal)
+    except KeyboardInterrupt:
+        fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "decant run configs/campaigns/quickstart.yaml",
+        "decant run my.yaml --resume   # after a stop, a crash or a power cut; nothing finished is done again",
+    )
+)
 def run(
     campaign: Campaign,
     resume: Resume = False,
@@ -57,13 +69,21 @@ def run(
     in_process: InProcess = False,
     as_json: Json = False,
 ) -> None:
-    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/."""
+    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/.
+
+    Ctrl-C pauses: a pour that has begun is finished and weighed first. `--resume` goes on where it stopped.
+    """
     from orchestrator.commands import campaigns
 
     _call(campaigns.run, campaign, resume=resume, run_id=run_id, in_process=in_process, as_json=as_json)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "decant calibrate configs/campaigns/recorded.yaml --json",
+        "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",
+    )
+)
 def calibrate(
     campaign: Campaign,
     resume: Resume = False,
@@ -71,13 +91,21 @@ def calibrate(
     in_process: InProcess = False,
     as_json: Json = False,
 ) -> None:
-    """Only calibrate: find the θ whose simulated spills match the weighed ones (C4), and score it on unseen pours."""
+    """Only calibrate: find the θ whose simulated spills match the weighed ones (C4), and score it on unseen pours.
+
+    θ* goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
+    """
     from orchestrator.commands import campaigns
 
     _call(campaigns.calibrate, campaign, resume=resume, run_id=run_id, in_process=in_process, as_json=as_json)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "decant plan my.yaml --parameters theta.json",
+        "decant plan my.yaml --parameters theta.json --receiver vase.yaml --json",
+    )
+)
 def plan(
     campaign: Campaign,
     parameters: Parameters = None,
@@ -87,7 +115,10 @@ def plan(
     in_process: InProcess = False,
     as_json: Json = False,
 ) -> None:
-    """Plan a pour in simulation (D1), for the campaign's receivers or one that it never saw."""
+    """Plan a pour in simulation (D1), for the campaign's receivers or one that it never saw.
+
+    Nothing is poured. Actions are shown in deg, deg/s, mm and s.
+    """
     from orchestrator.commands import campaigns
 
     _call(
@@ -102,7 +133,12 @@ def plan(
     )
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
+        "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
+    )
+)
 def simulate(
     campaign: Campaign,
     assignments: Annotated[
@@ -116,7 +152,11 @@ def simulate(
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
     png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
 ) -> None:
-    """Simulate one pour of a campaign's scene and say where the liquid went."""
+    """Simulate one pour of a campaign's scene and say where the liquid went.
+
+    Actions without a unit are in deg, deg/s, deg/s^2, mm and s; what the campaign fixes needs no `--set`. With `--json`
+    fractions are of the load: received + spilled + retained + in_flight + escaped = 1.
+    """
     from orchestrator.commands import single
 
     _call(
@@ -132,7 +172,9 @@ def simulate(
     )
 
 
-@app.command()
+@app.command(
+    epilog=examples("decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml"),
+)
 def validate(
     files: Annotated[list[Path], typer.Argument(help="Campaign, vessel or laboratory files.", show_default=False)],
 ) -> None:
@@ -142,7 +184,9 @@ def validate(
     _call(single.validate, files)
 
 
-@app.command()
+@app.command(
+    epilog=examples("decant schema > campaign.json", "decant schema vessel > vessel.json"),
+)
 def schema(
     which: Annotated[str, typer.Argument(help="campaign, vessel or laboratory.")] = "campaign",
 ) -> None:

@@ -87,14 +87,15 @@ def plan_pour(
     as_json: bool,
 ) -> None:
     """D1 for one receiver: the action that the calibrated simulator would pour with."""
-    from orchestrator.runs import create_run
     from orchestrator.stages import deployment_stages
 
     plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
     check_campaign_can_run(plan)
     assert plan.deployment is not None
+    if parameters is None:
+        say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
     stages = deployment_stages(plan, plan.deployment)
-    directory = create_run(plan)
+    directory = _run_directory(plan, resume=False, run_id=None)
     finished = run_in_front_of_people(
         plan, directory, resume=False, stages=stages, in_process=in_process, again=f"decant plan {path} (plans anew)"
     )
@@ -136,11 +137,6 @@ def planning_plan(
     try:
         if parameters is not None:
             theta = load_parameters(parameters, plan.parameters)
-        elif plan.calibration is not None:
-            say(
-                "note: no --parameters given; planning with the campaign's uncalibrated parameters "
-                f"({json.dumps(theta.model_dump())})"
-            )
         vessel = load_vessel(receiver) if receiver is not None else None
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
@@ -179,15 +175,7 @@ def _run(
     in_process: bool,
     stages: list[StageDefinition] | None,
 ) -> Finished:
-    from orchestrator.errors import RunError
-    from orchestrator.runs import create_run, find_run
-
-    try:
-        directory = find_run(plan, run_id) if resume else create_run(plan)
-    except RunError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
-    except OSError as error:
-        raise RefusalError(f"{plan.outputs.directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+    directory = _run_directory(plan, resume=resume, run_id=run_id)
     again = f"decant {verb} {path} --resume --run {directory.name}"
     finished = run_in_front_of_people(plan, directory, resume=resume, stages=stages, in_process=in_process, again=again)
     calibrated = finished.result.results.get("calibration")
@@ -196,3 +184,23 @@ def _run(
         (directory / THETA_FILE).write_text(content, encoding="utf-8")
         say(f"θ* is in {directory / THETA_FILE}; use it with --parameters")
     return finished
+
+
+def _run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:
+    """A new run's directory, or the one to go on with.
+
+    Raises:
+        RefusalError: there is none, or it can't be made (exit code 2).
+    """
+    from orchestrator.errors import RunError
+    from orchestrator.runs import create_run, find_run
+
+    if run_id is not None and not resume:
+        raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun", BAD_INPUT)
+    try:
+        directory = find_run(plan, run_id) if resume else create_run(plan)
+    except RunError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{plan.outputs.directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+    return directory

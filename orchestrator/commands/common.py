@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
+import os
 import signal
 import sys
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -72,10 +74,50 @@ def check_campaign_can_run(plan: CampaignPlan) -> None:
         RefusalError: with everything that is wrong, exit code 2.
     """
     from orchestrator.config.check import check_campaign
+    from orchestrator.config.errors import shown_path
 
     problems = check_campaign(plan)
     if problems:
-        raise RefusalError("\n".join(f"{plan.source}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+
+
+def check_output(path: Path | None, option: str, suffix: str) -> None:
+    """A file that a command is to write, before hours are spent on what goes into it.
+
+    Raises:
+        RefusalError: it can't be written there, or has the wrong suffix (exit code 2).
+    """
+    if path is None:
+        return
+    folder = path.absolute().parent
+    if path.is_dir():
+        problem = "is a folder; name a file in it"
+    elif path.suffix.lower() != suffix:
+        problem = f"should end in {suffix}"
+    elif not folder.is_dir():
+        problem = "its folder does not exist"
+    elif not os.access(path if path.exists() else folder, os.W_OK):
+        problem = "can't be written; the permission is missing"
+    else:
+        return
+    raise RefusalError(f"{option} {path}: {problem}", BAD_INPUT)
+
+
+@contextlib.contextmanager
+def stdout_for_results() -> Iterator[None]:
+    """While libraries are at work, whatever they print goes to stderr: stdout is for the result alone.
+
+    Done to the file descriptor, since some of them print from C++ and from processes of their own.
+    """
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 @dataclass(frozen=True)
@@ -141,7 +183,8 @@ def run_in_front_of_people(
                     stages=chosen,
                 )
 
-            result = asyncio.run(_until_signalled(lambda: work(laboratory), again))
+            with stdout_for_results():
+                result = asyncio.run(_until_signalled(lambda: work(laboratory), again))
     except (RunError, LaboratoryError) as error:
         raise RefusalError(
             f"{error}\nwhat is done so far is kept: {again}", getattr(error, "exit_code", FAILED)

@@ -8,7 +8,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, read_campaign, say
+from orchestrator.commands.common import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    check_output,
+    print_json,
+    read_campaign,
+    say,
+    stdout_for_results,
+)
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -31,7 +40,8 @@ def simulate(
     from rich.console import Console
 
     from orchestrator.config.assignments import AssignmentError, assigned_action
-    from orchestrator.config.errors import ConfigError
+    from orchestrator.config.check import check_vessels
+    from orchestrator.config.errors import ConfigError, shown_path
     from orchestrator.config.load import load_parameters, load_vessel
     from sim_engine.pour import InvalidSceneError, PourSimulator
     from sim_engine.task import PourTask
@@ -51,18 +61,25 @@ def simulate(
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
     except ValueError as error:
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
-    for target in (rrd, png):
-        if target is not None and not target.absolute().parent.is_dir():
-            raise RefusalError(f"{target}: its folder does not exist", BAD_INPUT)
+    check_output(rrd, "--rrd", ".rrd")
+    check_output(png, "--png", ".png")
+    problems = check_vessels(scene)
+    if problems:
+        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
     task = PourTask(scene, action, theta, seed, record_rate=20.0 if rrd or png else 0.0)
     simulator = PourSimulator()
     try:
-        with Console(stderr=True).status("simulating (the first pour ever also compiles kernels, about 10 s) …"):
-            run = simulator.simulate(task)
+        simulator.prepare(task)  # refused before Taichi starts
     except InvalidSceneError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
-    finally:
-        simulator.close()
+    with (
+        stdout_for_results(),
+        Console(stderr=True).status("simulating (the first pour ever also compiles kernels, about 10 s) …"),
+    ):
+        try:
+            run = simulator.simulate(task)
+        finally:
+            simulator.close()
     outcome = run.outcome
     if rrd is not None or png is not None:
         _show(task, run, rrd, png)
@@ -108,6 +125,7 @@ def validate(paths: list[Path]) -> None:
     """Check files; every problem of every file, exit code 2 if there is one."""
     from orchestrator.config.check import check_campaign
     from orchestrator.config.errors import ConfigError
+    from orchestrator.config.kinds import kind_of
     from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
     from orchestrator.config.yaml_source import Document
     from sim_engine.vessel.build import build_vessel
@@ -138,18 +156,6 @@ def validate(paths: list[Path]) -> None:
             print(f"{path}: ok ({note})")
     if bad:
         raise RefusalError(f"{bad} of {len(paths)} file(s) can't be used", BAD_INPUT)
-
-
-def kind_of(data: Any) -> str:
-    """What a YAML file describes, by its keys."""
-    keys = set(data) if isinstance(data, dict) else set()
-    if keys & {"calibration", "deployment", "seed", "liquid", "pourer", "receiver"}:
-        return "campaign"
-    if keys & {"inner", "profile", "mesh", "wall"}:
-        return "vessel"
-    if keys & {"bench", "mode", "simulators"}:
-        return "laboratory"
-    return "campaign"
 
 
 def schema(which: str) -> None:

@@ -122,6 +122,17 @@ def check_campaign(plan: CampaignPlan) -> list[str]:
     return list(dict.fromkeys(checker.problems))
 
 
+def check_vessels(scene: Scene) -> list[str]:
+    """Build the vessels of one scene.
+
+    Returns:
+        What is wrong (a vessel that is none, or can't hold the load), one text each.
+    """
+    checker = _Checker()
+    checker.scene(scene, f"{scene.pourer.name} into {scene.receiver.name}")
+    return checker.problems
+
+
 def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:
     """Where the vessels touch during an action, in words; None when they stay clear.
 

@@ -11,6 +11,7 @@ from pydantic import create_model
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign import CampaignFile
 from orchestrator.config.errors import ConfigError, Problem
+from orchestrator.config.kinds import wrong_kind
 from orchestrator.config.laboratory import LaboratoryFile, resolve_laboratory
 from orchestrator.config.motion import parameter_quantity
 from orchestrator.config.quantities import Quantity
@@ -34,6 +35,8 @@ def load_campaign(path: Path) -> CampaignPlan:
     """
     report = Report()
     place = Place(Document.read(path.resolve()))
+    if (other := wrong_kind(place.document, "campaign")) is not None:
+        raise ConfigError([other])
     section = validate(CampaignFile, place, report)
     plan = None if section is None else resolve_campaign(section, place, report)
     report.raise_if_any()

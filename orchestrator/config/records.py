@@ -101,6 +101,9 @@ def read_records(
     except OSError as error:
         table.problems.append(Problem(path, 0, 0, "", f"can't be read: {error.strerror}"))
         return table
+    if not text.strip():
+        table.problems.append(Problem(path, 0, 0, "", "is empty; it needs a header and a line for each pour"))
+        return table
     lines = text.splitlines()
     reader = csv.reader(io.StringIO(text))
     header = [cell.strip() for cell in next(reader, [])]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from orchestrator.config.errors import ConfigError
+from orchestrator.config.kinds import wrong_kind
 from orchestrator.config.laboratory import LaboratoryFile, resolve_laboratory
 from orchestrator.config.sections import Section
 from orchestrator.config.validate import validate
@@ -25,6 +26,9 @@ from sim_engine.vessel.spec import VesselSpec
 S = TypeVar("S", bound=Section)
 
 YAML_SUFFIXES = (".yaml", ".yml", ".json")
+
+KINDS: dict[type[Section], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
+"""Kinds of whole files that can be told apart by their keys."""
 
 
 @dataclass
@@ -65,7 +69,11 @@ class References:
                 self.report.problems.extend(error.problems)
                 self._read[key] = None
             else:
-                read = validate(model, place, self.report)
+                kind = KINDS.get(model)
+                other = None if kind is None else wrong_kind(place.document, kind)
+                if other is not None:
+                    self.report.problems.append(other)
+                read = None if other is not None else validate(model, place, self.report)
                 self._read[key] = None if read is None else (read, place)
         found = self._read[key]
         if found is None:

@@ -13,6 +13,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
 
 from orchestrator.config.errors import ConfigError, Problem, dotted
 
@@ -83,6 +84,12 @@ class Document:
             root = YAML(typ="rt").compose(text)
         except MarkedYAMLError as error:
             raise ConfigError([document._syntax_problem(error)]) from None
+        except ReaderError as error:
+            # The parser counts characters of the text; people count lines.
+            before = text[: error.position]
+            line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
+            message = f"not YAML: an unprintable character (code {ord(text[error.position])}); is this a text file?"
+            raise ConfigError([Problem(path, line, column, "", message)]) from None
         except (YAMLError, YAMLStreamError) as error:
             raise ConfigError([Problem(path, 0, 0, "", f"is not YAML: {error}")]) from None
         if root is None:
