@@ -1,0 +1,219 @@
+"""Writes the tables of the pages under docs/ from the code's own declarations, between their markers.
+
+A page holds `<!-- table: NAME -->` and `<!-- end of table -->`; what stands between is replaced. A test fails when a
+page is not current. Run from the project's root: python docs/make_tables.py
+"""
+
+from __future__ import annotations
+
+import re
+import types
+import typing
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from orchestrator.config import campaign, laboratory, vessel
+from orchestrator.config.motion import SWITCHED_OFF
+from orchestrator.config.quantities import Quantity
+from orchestrator.config.records import MASS_COLUMNS, SPLITS, column_name
+from orchestrator.config.scenes import DEFAULTS, NEEDED
+from orchestrator.config.sections import Section
+from orchestrator.states import State
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.liquid import SimulationParameters
+
+FOLDER = Path(__file__).parent
+MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+
+SECTIONS: dict[str, type[Section]] = {
+    "campaign": campaign.CampaignFile,
+    "simulator": campaign.SimulatorSection,
+    "calibration": campaign.CalibrationSection,
+    "pours": campaign.PoursSection,
+    "transfer": campaign.TransferSection,
+    "deployment": campaign.DeploymentSection,
+    "loss": campaign.LossSection,
+    "outputs": campaign.OutputsSection,
+    "liquid": vessel.LiquidFile,
+    "vessel": vessel.VesselFile,
+    "profile": vessel.ProfileSection,
+    "laboratory": laboratory.LaboratoryFile,
+    "bench": laboratory.BenchSection,
+    "balance": laboratory.BalanceSection,
+    "pose-error": laboratory.PoseErrorSection,
+}
+
+OF_SECTIONS = {
+    **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
+    "BalanceSection": "[balance](#bench)",
+    "HiddenLiquid": "[parameters](#simulator), one value each",
+    "PoseErrorSection": "[pose error](#bench)",
+    "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
+    "TransferSection": "[transfer](#pours)",
+    "LossSection": "[loss](#losses)",
+    "ProfileSection": "[profile](#vessels)",
+    "Motion": "[motion](#motion-and-actions)",
+    "Actions": "[actions](#motion-and-actions)",
+    "Parameters": "[parameters](#simulator)",
+    "VesselFile": "[vessel](#vessels) or the path of its file",
+    "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
+    "LiquidFile": "[liquid](#liquid) or the path of its file",
+}
+
+
+def render(text: str) -> str:
+    """The page with its tables as the code has them now.
+
+    Raises:
+        KeyError: a marker names a table that does not exist.
+    """
+    return MARKED.sub(lambda m: f"{m[1]}{TABLES[m[2]]()}{m[3]}", text)
+
+
+def pages() -> list[Path]:
+    """All pages that hold tables."""
+    return [page for page in sorted(FOLDER.glob("*.md")) if MARKED.search(page.read_text(encoding="utf-8"))]
+
+
+def actions() -> str:
+    """What an action consists of."""
+    rows = []
+    for name, d in ACTION_DIMENSIONS.items():
+        default: Any = DEFAULTS[name]
+        if name in NEEDED:
+            given = "none: fix it or search it"
+        elif default is None:
+            given = f"`{SWITCHED_OFF[name]}`"
+        else:
+            given = f"{default / d.factor:g} {d.display_unit}"
+        bounds = f"{d.lower / d.factor:g} … {d.upper / d.factor:g} {d.display_unit}"
+        rows.append((f"`{name}`", bounds, given, d.meaning))
+    return _table(("name", "bounds", "unless given", "meaning"), rows)
+
+
+def parameters() -> str:
+    """What calibration may turn."""
+    default = SimulationParameters().model_dump()
+    rows = []
+    for name, info in SimulationParameters.info().items():
+        unit = "" if info.unit == "1" else f" {info.unit}"
+        rows.append(
+            (f"`{name}`", f"{info.lower:g} … {info.upper:g}{unit}", f"{default[name]:g}{unit}", _one_line(info.meaning))
+        )
+    return _table(("name", "bounds", "default", "meaning"), rows)
+
+
+def columns() -> str:
+    """Columns of a file of weighed pours."""
+    rows = [(f"`{name}`", "g") for name in MASS_COLUMNS] + [("`split`", ", ".join(SPLITS))]
+    rows += [(f"`{column_name(d)}`", d.display_unit) for d in ACTION_DIMENSIONS.values()]
+    return _table(("column", "unit or words"), rows)
+
+
+def states() -> str:
+    """States of a campaign, each with its docstring."""
+    source = Path(State.__module__.replace(".", "/")).with_suffix(".py")
+    text = (FOLDER.parent / source).read_text(encoding="utf-8")
+    said = dict(re.findall(r'^    ([A-Z_]+) = "[^"]+"\n    """(.*?)"""', text, re.MULTILINE))
+    return _table(("state", "meaning"), [(f"{state}", said[state.name]) for state in State])
+
+
+def section(model: type[Section]) -> str:
+    """Keys of a section as people write them."""
+    rows = []
+    for key, name in model.written_keys().items():
+        info = model.model_fields[name]
+        default = _default(key, info, model)
+        rows.append((f"`{key}`", _value(info.annotation, info.metadata), default, _one_line(info.description or "")))
+    return _table(("key", "value", "unless given", "meaning"), rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "actions": actions,
+    "parameters": parameters,
+    "columns": columns,
+    "states": states,
+    **{name: partial(section, model) for name, model in SECTIONS.items()},
+}
+
+
+def _default(key: str, info: FieldInfo, model: type[Section]) -> str:
+    if key in model.required:
+        return "must be given"
+    value = info.get_default()
+    if value is None or value is PydanticUndefined or isinstance(value, Section):
+        return ""
+    quantity = next((m for m in info.metadata if isinstance(m, Quantity)), None)
+    if quantity is not None and quantity.unit != "1":
+        return f"{_shown(value, quantity)} {quantity.display}"
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
+    """What may be written for a field, from its annotation."""
+    quantity = next((m for m in metadata if isinstance(m, Quantity)), None)
+    if quantity is not None:
+        words = "".join(f" or `{word}`" for word in quantity.words)
+        bounds = f"number, {quantity.bounds()}" if quantity.unit == "1" else quantity.bounds()
+        if quantity.positive:
+            bounds = f"above 0, up to {bounds.removesuffix(' and less')}"
+        return bounds + words
+    origin = typing.get_origin(annotation)
+    if origin is typing.Annotated:
+        inner, *more = typing.get_args(annotation)
+        return _value(inner, [*more, *metadata])
+    if origin in (typing.Union, types.UnionType):
+        parts = [_value(part) for part in typing.get_args(annotation) if part is not type(None)]
+        sections = [part for part in parts if "or the path of its file" in part]
+        return " or ".join(dict.fromkeys(sections or parts))
+    if origin is Literal:
+        return ", ".join(f"`{word}`" for word in typing.get_args(annotation))
+    if origin is list:
+        return f"list of: {_value(typing.get_args(annotation)[0])}"
+    if origin is tuple:
+        return "list of `[r, z]`"
+    if origin is dict:
+        return "mapping"
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return OF_SECTIONS[annotation.__name__]
+    metadata = [deep for m in metadata for deep in (m.metadata if isinstance(m, FieldInfo) else [m])]
+    if annotation is int:
+        lowest = next((m.ge for m in metadata if getattr(m, "ge", None) is not None), None)
+        highest = next((m.le for m in metadata if getattr(m, "le", None) is not None), None)
+        return f"whole number, {lowest} … {highest}" if highest is not None else f"whole number, {lowest} or more"
+    return {bool: "`true` or `false`", str: "text"}[annotation]
+
+
+def _shown(value: float, quantity: Quantity) -> str:
+    from orchestrator.config.quantities import format_quantity
+
+    return format_quantity(float(value), quantity.unit, quantity.display).split(" ", 1)[0]
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(cell if cell else " " for cell in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Bring all pages up to date."""
+    for page in pages():
+        old = page.read_text(encoding="utf-8")
+        new = render(old)
+        if new != old:
+            page.write_text(new, encoding="utf-8")
+            print(f"{page}: updated")
+
+
+if __name__ == "__main__":
+    main()
