@@ -1,0 +1,144 @@
+"""What the pages say must be so: commands parse, links and paths lead somewhere, tables are the code's."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import typer.main
+
+from orchestrator.cli import app
+from orchestrator.commands import common
+from orchestrator.config.load import load_vessel
+from orchestrator.journal import Kind
+from orchestrator.unknown import OperatorNeededError
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "configs").rglob("*.md")])
+IDS = [str(page.relative_to(ROOT)) for page in PAGES]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=IDS)
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def prose_of(page: Path) -> str:
+    return FENCE.sub("", text_of(page))
+
+
+def commands_of(page: Path) -> list[str]:
+    """Every `decant …` that a reader could copy."""
+    blocks = [line for _, block in FENCE.findall(text_of(page)) for line in block.splitlines()]
+    spans = re.findall(r"`([^`\n]+)`", prose_of(page))
+    known = (re.sub(r"^(\.venv/bin/)", "", line.strip()) for line in [*blocks, *spans])
+    return [line for line in known if line.startswith("decant ") and not line.startswith("decant …")]
+
+
+def anchors_of(page: Path) -> set[str]:
+    headings = re.findall(r"^#+ (.+)$", prose_of(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.fixture(scope="module")
+def tables() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("make_tables", ROOT / "docs" / "make_tables.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_pages_show_commands_to_check() -> None:
+    verbs = {command.split()[1] for page in PAGES for command in commands_of(page)}
+    assert set(typer.main.get_command(app).commands) <= verbs  # type: ignore[attr-defined]
+
+
+@each_page
+def test_shown_commands_are_understood(page: Path) -> None:
+    verbs = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    for line in commands_of(page):
+        _, verb, *arguments = shlex.split(line, comments=True)
+        assert verb in verbs, line
+        if not arguments:
+            continue  # a verb that is only mentioned
+        verbs[verb].make_context(verb, list(arguments)).close()  # raises on what the command does not know
+        for argument in arguments:
+            if argument.startswith("configs/"):
+                assert (ROOT / argument).exists(), line
+
+
+@each_page
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
+        if link.startswith(("https://", "http://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors_of(target), link
+
+
+@each_page
+def test_named_files_exist(page: Path) -> None:
+    floors = r"`((?:orchestrator|actors|sim_engine|tests|docs|configs)/[\w./-]*)`"
+    for path in re.findall(floors, text_of(page)):
+        assert (ROOT / path).exists(), path
+
+
+def test_tables_are_what_the_code_declares(tables: ModuleType) -> None:
+    pages = tables.pages()
+    assert {page.name for page in pages} >= {"user-guide.md", "how-it-works.md", "architecture.md"}
+    for page in pages:
+        assert tables.render(text_of(page)) == text_of(page), "run: python docs/make_tables.py"
+
+
+def test_every_table_stands_on_some_page(tables: ModuleType) -> None:
+    used = {name for page in tables.pages() for _, name, _ in tables.MARKED.findall(text_of(page))}
+    assert used == set(tables.TABLES)
+
+
+def test_every_room_is_on_the_plan() -> None:
+    plan = text_of(ROOT / "docs" / "architecture.md")
+    for floor in ("sim_engine", "actors", "orchestrator"):
+        for room in sorted(path.parent for path in (ROOT / floor).glob("*/__init__.py")):
+            assert f"`{room.relative_to(ROOT)}`" in plan, f"{room} is not in docs/architecture.md"
+        for file in sorted((ROOT / floor).glob("[a-z]*.py")):
+            named = f"`{file.relative_to(ROOT)}`" in plan
+            assert named or file.name == "errors.py", f"{file} is not in docs/architecture.md"
+
+
+def test_journal_kinds_are_the_journal_s() -> None:
+    chapter = text_of(ROOT / "docs" / "architecture.md").partition("## The journal")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`.+?) \|", chapter, re.MULTILINE)
+    assert {word for row in rows for word in re.findall(r"`([\w.]+)`", row)} == {str(kind) for kind in Kind}
+
+
+def test_exit_codes_are_the_commands() -> None:
+    chapter = text_of(ROOT / "docs" / "user-guide.md").partition("### exit codes")[2].partition("\n## ")[0]
+    codes = {int(code) for code in re.findall(r"^\| (\d+) \|", chapter, re.MULTILINE)}
+    assert codes == {0, common.FAILED, common.BAD_INPUT, OperatorNeededError.exit_code, common.INTERRUPTED}
+
+
+def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:
+    shown = [block for kind, block in FENCE.findall(text_of(ROOT / "docs" / "user-guide.md")) if "profile:" in block]
+    assert len(shown) == 1
+    path = tmp_path / "vessel.yaml"
+    path.write_text(shown[0], encoding="utf-8")
+    assert load_vessel(path) == load_vessel(ROOT / "configs" / "vessels" / "narrow.yaml")
+
+
+def test_changelog_has_this_version() -> None:
+    project = tomllib.loads(text_of(ROOT / "pyproject.toml"))["project"]
+    assert f"## [{project['version']}]" in text_of(ROOT / "CHANGELOG.md")
