@@ -92,10 +92,10 @@ def plan_pour(
     plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
     check_campaign_can_run(plan)
     assert plan.deployment is not None
-    if parameters is None:
-        say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
     stages = deployment_stages(plan, plan.deployment)
     directory = _run_directory(plan, resume=False, run_id=None)
+    if parameters is None:
+        say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
     finished = run_in_front_of_people(
         plan, directory, resume=False, stages=stages, in_process=in_process, again=f"decant plan {path} (plans anew)"
     )
