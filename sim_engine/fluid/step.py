@@ -15,12 +15,12 @@ from sim_engine.fluid.state import VESSELS, FluidState, ParticleState
 from sim_engine.fluid.walls import FAR, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
 
 GRAVITY = 9.81
-CFL = 0.8
+CFL = 1.0
 """Largest displacement per step, in spacings."""
 LONGEST_STEP = 3e-3
 SHORTEST_STEP = 1e-4
 ITERATIONS = 3
-SKIN = 0.25
+SKIN = 0.15
 """Neighbour lists reach that many spacings beyond the support."""
 CONTACT = 0.2
 """Particles' centres keep that many spacings from solid; the density constraint keeps about half a spacing."""
