@@ -1,0 +1,85 @@
+"""The shipped campaigns are what they say they are. Cheap: nothing runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orchestrator.config.check import check_campaign
+from orchestrator.config.load import load_campaign
+from orchestrator.plan import CampaignPlan
+from orchestrator.stages import stages_of
+from sim_engine.task import PoseError
+
+CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
+
+
+def plan(name: str) -> CampaignPlan:
+    return load_campaign(CAMPAIGNS / f"{name}.yaml")
+
+
+@pytest.mark.parametrize("path", sorted(CAMPAIGNS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_campaign_can_start(path: Path) -> None:
+    assert check_campaign(load_campaign(path)) == []
+
+
+def test_paper_has_the_budgets_of_the_paper() -> None:
+    paper = plan("paper")
+    calibration, deployment = paper.calibration, paper.deployment
+    assert calibration is not None
+    assert deployment is not None
+    assert (calibration.pour_count, calibration.holdout) == (32, 4)
+    assert (calibration.strategy, calibration.simulations) == ("C4", 108)
+    assert (deployment.strategy, deployment.prior_simulations, deployment.pours) == ("D3", 37, 15)
+    receivers = {scene.receiver.name for scene in deployment.scenes}
+    assert len(receivers) == 3
+    assert calibration.scene.receiver.name not in receivers
+
+
+def test_quickstart_calibrates_and_then_pours_into_a_cup_that_calibration_never_saw() -> None:
+    quickstart = plan("quickstart")
+    assert quickstart.calibration is not None
+    assert quickstart.deployment is not None
+    assert [stage.name.partition(":")[0] for stage in stages_of(quickstart)] == [
+        "pours",
+        "calibration",
+        "evaluation",
+        "deployment",
+    ]
+    assert quickstart.deployment.strategy == "D3"
+    assert quickstart.deployment.scenes[0].receiver != quickstart.calibration.scene.receiver
+
+
+@pytest.mark.parametrize("name", ["quickstart", "paper"])
+def test_a_resumed_run_of_a_shipped_campaign_is_exact_and_asks_nobody(name: str) -> None:
+    campaign = plan(name)
+    assert campaign.on_unknown == "repeat"
+    assert campaign.deployment is not None
+    assert campaign.deployment.per_pour is not None, "with 'free' the clock decides what is asked for"
+    assert {stage.order for stage in stages_of(campaign)} == {"logical"}
+
+
+@pytest.mark.parametrize("name", ["quickstart", "paper"])
+def test_what_is_real_differs_from_what_simulation_starts_with(name: str) -> None:
+    """Else calibration would have nothing to find out."""
+    campaign = plan(name)
+    bench = campaign.laboratory.bench
+    assert campaign.calibration is not None
+    assert bench is not None
+    hidden, assumed = bench.liquid.model_dump(), campaign.parameters.model_dump()
+    assert any(hidden[axis] != assumed[axis] for axis in campaign.calibration.parameters.names)
+    assert bench.pose_error != PoseError()
+    assert bench.pose_noise != PoseError()
+
+
+def test_recorded_fits_28_pours_keeps_4_and_scores_another_receiver() -> None:
+    calibration = plan("recorded").calibration
+    assert calibration is not None
+    assert calibration.records is not None
+    assert calibration.transfer is not None
+    splits = [pour.split for pour in calibration.records.pours]
+    assert (splits.count("train"), splits.count("test")) == (28, 4)
+    assert calibration.transfer.scene.receiver != calibration.scene.receiver
+    assert len({pour.action.x_offset for pour in calibration.transfer.pours}) > 1
+    assert plan("recorded").laboratory.bench is None
