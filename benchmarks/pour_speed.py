@@ -2,8 +2,8 @@
 
     python benchmarks/pour_speed.py --particles 2000 [--repeats 3] [--json]
 
-Kernels are compiled (or loaded from the cache) by a short pour before anything is measured. One thread. The pour is over
-when nothing can change any more, at most 6 s; all CPU seconds of the process count.
+Kernels are compiled (or loaded from the cache) by a short pour before anything is measured. One thread. The pour is
+over when nothing can change any more, at most 6 s; all CPU seconds of the process count.
 """
 
 from __future__ import annotations

@@ -13,23 +13,38 @@ from sim_engine.fluid.state import SUPPORT
 
 
 @ti.func
-def velocity_change(f: ti.template(), s, i, dt):
-    """Change of a particle's velocity over dt by cohesion and viscosity [m/s]."""
+def interact(f: ti.template(), s, dt):
+    """Change all velocities by cohesion and viscosity over dt."""
     inv_h = 1.0 / (SUPPORT * f.spacing[s])
-    xi = f.x[s, i]
-    vi = f.v[s, i]
-    pull = ti.Vector([0.0, 0.0, 0.0])
-    drift = ti.Vector([0.0, 0.0, 0.0])
-    total = ti.cast(1e-6, ti.f32)
-    for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
-        j = f.neighbour[s, k]
-        r = xi - f.x[s, j]
-        distance = ti.sqrt(r.dot(r)) + 1e-9
-        u = ti.max(1.0 - distance * inv_h, 0.0)
-        w = weight(u)
-        total += w
-        drift += w * (f.v[s, j] - vi)
-        pull -= (attraction(u) / distance) * r
-    # A lone pair is drawn together slowly: weight of the neighbourhood relative to a full one is left in `drift`.
+    for i in range(f.moving[s]):
+        f.dx[s, i] = ti.Vector([0.0, 0.0, 0.0])  # drift towards the neighbours' velocities
+        f.dv[s, i] = ti.Vector([0.0, 0.0, 0.0])  # pull
+        f.squares[s, i] = 0.0
+    for i in range(f.moving[s]):
+        xi = f.x[s, i]
+        vi = f.v[s, i]
+        pull = ti.Vector([0.0, 0.0, 0.0])
+        drift = ti.Vector([0.0, 0.0, 0.0])
+        total = ti.cast(0.0, ti.f32)
+        for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
+            j = f.neighbour[s, k]
+            r = xi - f.x[s, j]
+            distance = ti.sqrt(r.dot(r)) + 1e-9
+            u = ti.max(1.0 - distance * inv_h, 0.0)
+            w = weight(u)
+            towards = w * (f.v[s, j] - vi)
+            force = (attraction(u) / distance) * r
+            total += w
+            drift += towards
+            pull -= force
+            f.squares[s, j] = f.squares[s, j] + w
+            f.dx[s, j] = f.dx[s, j] - towards
+            f.dv[s, j] = f.dv[s, j] + force
+        f.squares[s, i] = f.squares[s, i] + total
+        f.dx[s, i] = f.dx[s, i] + drift
+        f.dv[s, i] = f.dv[s, i] + pull
     relax = 1.0 - ti.exp(-f.viscosity[s] * dt)
-    return relax * drift / ti.max(total, 1.0) + (f.attraction[s] * dt) * pull
+    strength = f.attraction[s] * dt
+    for i in range(f.moving[s]):
+        # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
+        f.v[s, i] = f.v[s, i] + (relax / ti.max(f.squares[s, i], 1.0) * f.dx[s, i] + strength * f.dv[s, i])

@@ -1,4 +1,4 @@
-"""Neighbour lists: particles sorted by cell (counting sort), explicit lists that last until one has moved half a skin.
+"""Neighbour lists: particles sorted by cell (counting sort), explicit half lists that last until one has moved too far.
 
 Source: Green 2010 (counting sort on a grid); Verlet 1967 (lists with a skin).
 """
@@ -14,8 +14,8 @@ SPILLED = int(ParticleState.SPILLED)
 
 
 @ti.func
-def rebuild(f: ti.template(), s, skin: ti.template()):
-    """Sort the moving particles by cell, put the others last, and list all pairs within h + skin·d."""
+def rebuild(f: ti.template(), s, skin):
+    """Sort the moving particles by cell, put the others last, and list all pairs within h + skin·d, each once."""
     d = f.spacing[s]
     reach = (SUPPORT + skin) * d
     low = ti.Vector([1e9, 1e9, 1e9])
@@ -41,7 +41,7 @@ def rebuild(f: ti.template(), s, skin: ti.template()):
             q = ti.cast((f.x[s, i] - low) / edge, ti.i32)
             c = (q[0] * size[1] + q[1]) * size[2] + q[2]
         f.cell[s, i] = c
-        f.cell_start[s, c + 1] += 1
+        f.cell_start[s, c + 1] = f.cell_start[s, c + 1] + 1
         f.x_copy[s, i] = f.x[s, i]
         f.v_copy[s, i] = f.v[s, i]
         f.dx[s, i] = f.x0[s, i]
@@ -49,7 +49,7 @@ def rebuild(f: ti.template(), s, skin: ti.template()):
         f.home_copy[s, i] = f.home[s, i]
         f.name_copy[s, i] = f.name[s, i]
     for c in range(cells + 1):
-        f.cell_start[s, c + 1] += f.cell_start[s, c]
+        f.cell_start[s, c + 1] = f.cell_start[s, c + 1] + f.cell_start[s, c]
     f.moving[s] = f.cell_start[s, cells]
     for i in range(n_before):
         c = f.cell[s, i]
@@ -69,22 +69,29 @@ def rebuild(f: ti.template(), s, skin: ti.template()):
         xi = f.x[s, i]
         q = ti.cast((xi - low) / edge, ti.i32)
         f.first[s, i] = entries
-        for a in range(ti.max(q[0] - 1, 0), ti.min(q[0] + 2, size[0])):
-            for b in range(ti.max(q[1] - 1, 0), ti.min(q[1] + 2, size[1])):
+        # Every pair once, at the particle that comes first: what is left is the rest of the own column of cells and the
+        # columns behind it. Particles of up to three cells of a column lie side by side.
+        for a in range(q[0], ti.min(q[0] + 2, size[0])):
+            b0 = q[1]
+            if a > q[0]:
+                b0 = ti.max(q[1] - 1, 0)
+            for b in range(b0, ti.min(q[1] + 2, size[1])):
                 column = (a * size[1] + b) * size[2]
-                c0 = column + ti.max(q[2] - 1, 0)
-                c1 = column + ti.min(q[2] + 1, size[2] - 1)
-                begin = 0
-                if c0 > 0:
-                    begin = f.cell_start[s, c0 - 1]
-                for j in range(begin, f.cell_start[s, c1]):
+                begin = i + 1
+                if a != q[0] or b != q[1]:
+                    c0 = column + ti.max(q[2] - 1, 0)
+                    begin = 0
+                    if c0 > 0:
+                        begin = f.cell_start[s, c0 - 1]
+                for j in range(begin, f.cell_start[s, column + ti.min(q[2] + 1, size[2] - 1)]):
                     # Branch-free: write always, keep by counting on.
                     r = xi - f.x[s, j]
                     f.neighbour[s, entries] = j
-                    entries += ti.cast(r.dot(r) < reach2, ti.i32) * ti.cast(j != i, ti.i32)
+                    entries += ti.cast(r.dot(r) < reach2, ti.i32)
         f.count[s, i] = entries - f.first[s, i]
         if entries > f.list_capacity - LIST_RESERVE:
             f.fault[s] = 1
             entries = 0
     f.rebuilds[s] += 1
     f.stale[s] = 0
+    f.skin[s] = skin

@@ -32,10 +32,11 @@ class FluidState:
         phi, normal: signed distance to each vessel [m] at the last look, linearised in between; its gradient.
         push: normal displacement given by each wall in this step [m].
         home: see `ParticleState`; `name`: index before any sorting.
-        first, count, neighbour: neighbour lists (compressed rows).
+        gradient, squares: sums over pairs for the density constraint.
+        first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
     """
 
-    def __init__(self, scenes: int, capacity: int, neighbours: int = 56, cells: int = 1 << 17) -> None:
+    def __init__(self, scenes: int, capacity: int, neighbours: int = 32, cells: int = 1 << 17) -> None:
         self.scenes, self.capacity, self.cells = scenes, capacity, cells
         self.list_capacity = capacity * neighbours
         row = (scenes, capacity)
@@ -53,6 +54,7 @@ class FluidState:
         self.push = ti.Vector.field(VESSELS, ti.f32, shape=row)
         self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=row)
         self.home, self.home_copy, self.name, self.name_copy, self.cell = (scalars(ti.i32) for _ in range(5))
+        self.gradient, self.squares = vectors(), scalars()
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
         self.neighbour = ti.field(ti.i32, shape=(scenes, self.list_capacity))
         self.cell_start = ti.field(ti.i32, shape=(scenes, cells + 2))
@@ -74,6 +76,7 @@ class FluidState:
         self.time = ti.field(ti.f64, shape=scenes)
         self.dt = ti.field(ti.f32, shape=scenes)
         self.steps = ti.field(ti.i32, shape=scenes)
+        self.skin = ti.field(ti.f32, shape=scenes)  # lists reach so many spacings beyond the support
         self.rebuilds = ti.field(ti.i32, shape=scenes)
         self.moving = ti.field(ti.i32, shape=scenes)
         self.stale = ti.field(ti.i32, shape=scenes)  # 1: neighbour lists must be rebuilt

@@ -9,7 +9,7 @@ Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 import taichi as ti
 
 from sim_engine.fluid.density import displace, measure
-from sim_engine.fluid.forces import velocity_change
+from sim_engine.fluid.forces import interact
 from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.state import VESSELS, FluidState, ParticleState
 from sim_engine.fluid.walls import FAR, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
@@ -20,8 +20,10 @@ CFL = 1.0
 LONGEST_STEP = 3e-3
 SHORTEST_STEP = 1e-4
 ITERATIONS = 3
-SKIN = 0.15
-"""Neighbour lists reach that many spacings beyond the support."""
+SKIN = 0.3
+"""Neighbour lists reach that many spacings beyond the support, so that they last for several steps …"""
+SHORT_SKIN = 0.03
+"""… unless somebody moves so fast that they would not."""
 CONTACT = 0.2
 """Particles' centres keep that many spacings from solid; the density constraint keeps about half a spacing."""
 WARM = 0.5
@@ -65,21 +67,20 @@ class Stepper:
         f.turn[s, 0] = rotation(q)
 
     @ti.func
-    def choose_step(self, s):
-        """dt from the fastest particle (CFL) [s]."""
+    def top_speed(self, s):
+        """Of the moving particles [m/s]."""
         f = self.state
         fastest = ti.cast(0.0, ti.f32)
         for i in range(f.moving[s]):
             fastest = ti.max(fastest, f.v[s, i].norm_sqr())
-        fastest = ti.sqrt(fastest)
-        return ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), LONGEST_STEP)
+        return ti.sqrt(fastest)
 
     @ti.func
     def predict(self, s, dt, grids: ti.template()):
         """Ballistic prediction, stopped by walls; asks for new lists if someone has moved too far."""
         f = self.state
         clear = CONTACT * f.spacing[s]
-        limit = 0.45 * SKIN * f.spacing[s]
+        limit = 0.45 * f.skin[s] * f.spacing[s]
         for i in range(f.moving[s]):
             x0 = f.x[s, i]
             f.x0[s, i] = x0
@@ -127,7 +128,7 @@ class Stepper:
                     phi += n.dot(f.dx[s, i])
                     if phi < clear:
                         x += (clear - phi) * n
-                        f.push[s, i][b] += clear - phi
+                        f.push[s, i][b] = f.push[s, i][b] + (clear - phi)
                         phi = clear
                     f.phi[s, i][b] = phi
             f.x[s, i] = x
@@ -137,16 +138,13 @@ class Stepper:
         """`ratio`: this step's dt² over the last one's, which scales the multipliers of the warm start."""
         f = self.state
         for i in range(f.moving[s]):
-            f.pressure[s, i] *= WARM * ratio
+            f.pressure[s, i] = f.pressure[s, i] * WARM * ratio
             f.dp[s, i] = f.pressure[s, i]
-        for i in range(f.moving[s]):
-            displace(f, s, i)
+        displace(f, s)
         self.apply(s)
         for _ in range(ITERATIONS):
-            for i in range(f.moving[s]):
-                measure(f, s, i)
-            for i in range(f.moving[s]):
-                displace(f, s, i)
+            measure(f, s)
+            displace(f, s)
             self.apply(s)
 
     @ti.func
@@ -188,15 +186,6 @@ class Stepper:
                 f.fault[s] = 2
 
     @ti.func
-    def interact(self, s, dt):
-        """Viscosity and cohesion."""
-        f = self.state
-        for i in range(f.moving[s]):
-            f.dv[s, i] = velocity_change(f, s, i, dt)
-        for i in range(f.moving[s]):
-            f.v[s, i] += f.dv[s, i]
-
-    @ti.func
     def classify(self, s, cavities: ti.template()):
         """Where every moving particle is now. Half a spacing above its opening plane still belongs to the receiver."""
         f = self.state
@@ -218,7 +207,7 @@ class Stepper:
                     home = SPILLED
                     f.stale[s] = 1
                 f.home[s, i] = home
-                if f.count[s, i] >= 24:
+                if f.density[s, i] > 0.95:
                     inside += 1
                     compressed += ti.max(f.density[s, i] - 1.0, 0.0)
         if inside > 0:
@@ -230,7 +219,7 @@ class Stepper:
         f = self.state
         for i in range(f.moving[s], f.particles[s]):
             if f.x[s, i][2] > 0.0:
-                f.v[s, i][2] -= GRAVITY * dt
+                f.v[s, i][2] = f.v[s, i][2] - GRAVITY * dt
                 x = f.x[s, i] + dt * f.v[s, i]
                 x[2] = ti.max(x[2], 0.0)
                 f.x[s, i] = x
@@ -239,7 +228,8 @@ class Stepper:
     def step(self, s, grids: ti.template(), cavities: ti.template(), poses: ti.template()):
         """One time step of one scene."""
         f = self.state
-        dt = self.choose_step(s)
+        fastest = self.top_speed(s)
+        dt = ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), LONGEST_STEP)
         ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)
         f.dt[s] = dt
         f.origin0[s, 0] = f.origin[s, 0]
@@ -248,11 +238,15 @@ class Stepper:
         self.place_pourer(s, f.time[s], poses)
         self.predict(s, dt, grids)
         if f.stale[s] == 1:
-            rebuild(f, s, SKIN)
+            skin = SKIN
+            if fastest * dt > 0.3 * SKIN * f.spacing[s]:
+                skin = SHORT_SKIN
+            rebuild(f, s, skin)
         self.look_at_walls(s, grids)
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
-        self.interact(s, dt)
+        if f.viscosity[s] > 0.0 or f.attraction[s] > 0.0:
+            interact(f, s, dt)
         self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1
