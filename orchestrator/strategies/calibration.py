@@ -21,6 +21,11 @@ CONTEXT_SIZE = 24
 
 MAP_RESOLUTION = 30
 
+LIVE_MAP_EVERY = 10
+"""Simulations between two maps for those who watch; one costs about 20 ms."""
+
+LIVE_MAP_RESOLUTION = 20
+
 
 class ContinuousBayesianCalibration:
     """C4: minimise O2(θ) = E_{a~g} |c_r(a) − c_s(a, θ)| with one simulation per iteration.
@@ -73,6 +78,7 @@ class ContinuousBayesianCalibration:
         self._trials = Trials()
         self._started = False
         self._width_known = False
+        self._mapped = 0
         self._final: Suggestion | None = None
         self._actions: tuple[Point, ...] = ()
         self._measured_at: tuple[float, ...] = ()
@@ -152,7 +158,14 @@ class ContinuousBayesianCalibration:
             problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
             self._questions.put(problem, "start", self._queue)
         elif self._trials.ready:
-            self._questions.put(self._problem(), "calibrate", self._queue)
+            self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
+
+    def _live_resolution(self) -> int:
+        """Resolution of the map that the next answer carries for those who watch; mostly 0, for none."""
+        if len(self._trials) - self._mapped < LIVE_MAP_EVERY:
+            return 0
+        self._mapped = len(self._trials)
+        return LIVE_MAP_RESOLUTION
 
     def _problem(self, *, everything: bool = False, acquisition: str = "lcb", resolution: int = 0) -> SuggestProblem:
         data = self._trials.data(everything=everything)
@@ -187,7 +200,7 @@ class ContinuousBayesianCalibration:
             self._expected[request] = self._measured_at[index]
             self._trials.add(Trial(point, (request,), context))
             if suggestion.means:
-                text = f"θ {_described(self._values(point))}: expected |Δ| {suggestion.means[i]:.3f}"
+                text = f"θ {_described(self._values(point))}: expected |Δ| {max(suggestion.means[i], 0.0):.3f}"
                 self.decisions.append(Decision(text, {"mean": suggestion.means[i], "sd": suggestion.deviations[i]}))
 
     def _discrepancy(self, request: Simulate, outcome: Outcome) -> float | None:
@@ -209,7 +222,7 @@ class ContinuousBayesianCalibration:
             )
         self._final = suggestion
         values = _described(self._values(suggestion.points[0]))
-        text = f"θ* {values}: |Δ| {suggestion.means[0]:.3f} ± {suggestion.deviations[0]:.3f}"
+        text = f"θ* {values}: |Δ| {max(suggestion.means[0], 0.0):.3f} ± {suggestion.deviations[0]:.3f}"
         self.decisions.append(Decision(text, {"mean": suggestion.means[0], "sd": suggestion.deviations[0]}))
 
     # -- results ---------------------------------------------------------------------------------------------------
@@ -237,7 +250,7 @@ class ContinuousBayesianCalibration:
         return self._trials.answered, self._plan.simulations
 
     def result(self) -> dict[str, object]:
-        """θ* with its predicted discrepancy, every trial, and the discrepancy's map over θ where it is 2-D."""
+        """θ* with its predicted discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
         result: dict[str, object] = {
             "simulations": self._trials.answered,
             "lost": self._trials.lost,

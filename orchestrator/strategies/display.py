@@ -32,13 +32,19 @@ def described_action(values: Mapping[str, float | None], names: tuple[str, ...])
 
 
 def displayed_map(surrogate: SurrogateMap | None, space: Space) -> dict[str, object] | None:
-    """A 2-D surrogate with its axes' values [SI]: row i of mean and deviation is the second axis' i-th value."""
+    """A surrogate over two axes, with their values [SI]: row i of mean and deviation is the second axis' i-th value.
+
+    'over' names the two axes in their order; 'held' has the values [SI] of the others, at which the surrogate was cut.
+    """
     if surrogate is None:
         return None
     size = len(surrogate.mean)
     places = [i / (size - 1) if size > 1 else 0.5 for i in range(size)]
+    plane = surrogate.plane(space)
     return {
-        "axes": {axis.name: [axis.decode(u) for u in places] for axis in space.axes},
+        "over": list(plane.names),
+        "held": surrogate.held(space),
+        "axes": {axis.name: [axis.decode(u) for u in places] for axis in plane.axes},
         "mean": [list(row) for row in surrogate.mean],
         "deviation": [list(row) for row in surrogate.deviation],
     }

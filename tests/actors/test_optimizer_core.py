@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -192,6 +193,41 @@ def test_the_map_has_the_second_axis_in_its_rows():
     assert mean.shape == (5, 5)
     assert mean[:, 2] == pytest.approx(np.linspace(0, 1, 5), abs=0.1)
     assert mean[2, :] == pytest.approx(np.full(5, 0.5), abs=0.1)
+
+
+def test_of_many_axes_the_map_shows_the_two_that_matter_through_the_best_place():
+    box = Space(tuple(Axis(name, 0.0, 1.0) for name in "vwxyz"))
+    points = cover(60, 9, dimension=5)
+    costs = 2.0 * ((points[:, [1, 3]] - (0.3, 0.6)) ** 2).sum(axis=1) + 0.1 * points[:, 4]
+    asked = SuggestProblem(box, data_of(points, costs), acquisition="posterior_minimum", map_resolution=5, seed=1)
+    answer = propose(asked)
+    drawn = answer.surrogate
+    assert drawn.axes == ("w", "y")
+    assert drawn.at == answer.points[0]
+    assert drawn.plane(box).names == ("w", "y")
+    assert drawn.held(box) == {name: answer.points[0][i] for i, name in enumerate("vwxyz") if name in "vxz"}
+    v, _, x, _, z = answer.points[0]
+    row = propose(replace(asked, predict_at=tuple((v, w, x, 0.75, z) for w in np.linspace(0, 1, 5))))
+    assert drawn.mean[3] == pytest.approx(row.predictions)
+    assert drawn.deviation[3] == pytest.approx(row.prediction_deviations)
+
+
+def test_without_a_minimiser_the_map_goes_through_the_best_place_that_was_observed():
+    box = Space(tuple(Axis(name, 0.0, 1.0) for name in "xyz"))
+    points = cover(20, 3, dimension=3)
+    for acquisition, count in (("lcb", 2), ("posterior_minimum", 0)):
+        asked = SuggestProblem(box, data_of(points, bowl(points[:, :2])), acquisition=acquisition, count=count)
+        answer = propose(replace(asked, map_resolution=3))
+        assert answer.surrogate.at == answer.best_point
+
+
+def test_around_a_simulated_mean_the_simulations_say_which_axes_matter():
+    box = Space(tuple(Axis(name, 0.0, 1.0) for name in "xyz"))
+    cheap, dear = cover(40, 4, dimension=3), cover(3, 5, dimension=3)
+    asked = SuggestProblem(
+        box, data_of(dear, bowl(dear[:, 1:])), mean="simulated", simulated=data_of(cheap, bowl(cheap[:, 1:])), count=0
+    )
+    assert propose(replace(asked, map_resolution=3)).surrogate.axes == ("y", "z")
 
 
 def test_a_suggestion_at_a_hundred_points_takes_far_less_than_a_simulation():

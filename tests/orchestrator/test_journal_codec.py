@@ -79,7 +79,8 @@ suggestions = st.builds(
     best_point=st.none() | point,
     best_mean=st.none() | number,
     hyperparameters=st.none() | st.dictionaries(st.text(), number, max_size=3),
-    surrogate=st.none() | st.builds(SurrogateMap, rows, rows),
+    surrogate=st.none()
+    | st.builds(SurrogateMap, rows, rows, axes=st.just(()) | st.tuples(st.text(), st.text()), at=point),
 )
 outcomes = st.builds(
     PourOutcome,

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orchestrator.requests import Failed, Simulate, Simulated, Suggest
+from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
 from orchestrator.strategies.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration import ContinuousBayesianCalibration
 from orchestrator.strategies.design import (
@@ -16,6 +16,7 @@ from orchestrator.strategies.design import (
 )
 from orchestrator.strategies.evaluation import Evaluation, ScoredPour, random_parameters
 from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis, Space
 
 from .play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play, calibration_plan, outcome_of, replay, unit
 from .toys import TRUE_THETA, calibration_spill, weighed
@@ -202,6 +203,53 @@ def test_signed_differences_calibrate_better_than_noise_at_the_same_price():
             Play(calibration_spill)(strategy)
             scores[averaging].append(true_discrepancy(strategy.theta))
     assert np.mean(scores["differences"]) < 0.7 * np.mean(scores["noise"])
+
+
+BOX = Space((*PARAMETERS.axes, Axis("viscosity", 0.0, 1.0), Axis("friction", 0.0, 0.5)))
+
+
+def spill_by_two(action, theta, rng):
+    """Of four searched parameters cohesion and friction matter."""
+    u, v = unit(action, CALIBRATION_ACTIONS)
+    return 0.2 * u + 0.1 * v + 5.0 * abs(theta.cohesion - 0.04) ** 1.5 + 0.8 * (theta.friction - 0.2) ** 2
+
+
+def calibrated_in_four():
+    truth = SimulationParameters(cohesion=0.04, friction=0.2)
+    pours = [replace(p, spillage=spill_by_two(p.action, truth, None)) for p in measured()]
+    strategy = ContinuousBayesianCalibration(calibration_plan(parameters=BOX, simulations=40), pours, 4)
+    return strategy, Play(spill_by_two)(strategy)
+
+
+def test_of_four_parameters_the_result_maps_the_two_that_matter_with_the_others_at_theta_star():
+    strategy, _ = calibrated_in_four()
+    result = strategy.result()
+    drawn, theta = result["map"], result["theta"]
+    assert drawn["over"] == ["cohesion", "friction"]
+    assert drawn["held"] == {"particles": theta["particles"], "viscosity": theta["viscosity"]}
+    mean, deviation = np.array(drawn["mean"]), np.array(drawn["deviation"])
+    assert mean.shape == deviation.shape == (30, 30)
+    # the map goes through θ*: what it says there is what the result expects there, and nowhere is less expected
+    across, up = (np.abs(np.array(drawn["axes"][name]) - theta[name]).argmin() for name in drawn["over"])
+    assert mean[up, across] == pytest.approx(result["predicted_discrepancy"], abs=0.01)
+    assert mean.min() > result["predicted_discrepancy"] - 1e-4
+    assert mean.max() > 5 * mean.min()
+
+
+def test_those_who_watch_get_a_map_about_every_ten_simulations_and_replay_asks_for_the_same():
+    _, played = calibrated_in_four()
+    maps, simulations = [], 0
+    for request, outcome in played.told:
+        simulations += isinstance(request, Simulate)
+        if isinstance(outcome, Suggested) and outcome.suggestion.surrogate is not None:
+            maps.append((simulations, len(outcome.suggestion.surrogate.axes)))
+    assert maps[-1] == (40, 2)
+    assert len(maps) == 4
+    assert all(abs(many - 10 * (i + 1)) <= 2 for i, (many, _) in enumerate(maps))
+    truth = SimulationParameters(cohesion=0.04, friction=0.2)
+    pours = [replace(p, spillage=spill_by_two(p.action, truth, None)) for p in measured()]
+    fresh = ContinuousBayesianCalibration(calibration_plan(parameters=BOX, simulations=40), pours, 4)
+    assert replay(fresh, played) == played.asked
 
 
 def test_an_optimiser_that_keeps_failing_stops_the_calibration_with_its_reason():

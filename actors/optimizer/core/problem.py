@@ -54,7 +54,8 @@ class SuggestProblem:
         acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
             answer the penalised 'lcb'); 'random' and 'sobol' only draw.
         kappa: κ of the lower confidence bound, constant as in the paper.
-        map_resolution: if > 0 and the space has two dimensions, the answer carries the surrogate on a square grid.
+        map_resolution: if > 0 and the space has at least two dimensions, the answer carries the surrogate on a square
+            grid over the two axes that matter most.
         predict_at: further points at which the posterior is wanted (a regression, with `count=0`).
         context: if given, the observations are signed differences that also depend on coordinates which nobody chooses
             (in calibration: c_r − c_s, and the action that was simulated), and what is minimised is the mean of their
@@ -78,10 +79,30 @@ class SuggestProblem:
 
 @dataclass(frozen=True)
 class SurrogateMap:
-    """The surrogate on a square grid over the unit square, for pictures: row i is the second axis' i-th place."""
+    """The surrogate on a square grid over two axes of the space, for pictures.
+
+    Attributes:
+        mean: posterior means, row i at the second axis' i-th place in 0 … 1.
+        deviation: their standard deviations.
+        axes: names of the two axes, in the space's order: those with the shortest fitted lengthscales. Empty for a
+            space that has no others.
+        at: point of the unit cube that the grid goes through: every other axis is held at its value there. It is where
+            the posterior mean is least: the minimiser that 'posterior_minimum' found, else `Suggestion.best_point`.
+    """
 
     mean: tuple[tuple[float, ...], ...]
     deviation: tuple[tuple[float, ...], ...]
+    axes: tuple[str, ...] = ()
+    at: Point = ()
+
+    def plane(self, space: Space) -> Space:
+        """The two axes of the grid, out of those that were searched: the first across, the second up."""
+        return Space(tuple(axis for axis in space.axes if not self.axes or axis.name in self.axes))
+
+    def held(self, space: Space) -> dict[str, float]:
+        """Values of the axes that the grid does not show [SI]; empty if it shows them all."""
+        shown = self.plane(space).names
+        return {name: value for name, value in space.decode(self.at).items() if name not in shown} if self.at else {}
 
 
 @dataclass(frozen=True)

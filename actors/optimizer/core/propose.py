@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+from threadpoolctl import threadpool_limits
 
 from actors.optimizer.core import acquisition
 from actors.optimizer.core.problem import Point, Suggestion, SuggestProblem, SurrogateMap
@@ -75,8 +75,18 @@ def _answer(problem: SuggestProblem) -> Suggestion:
 
 @dataclass(frozen=True)
 class _Model:
+    """A fitted surrogate.
+
+    Attributes:
+        surrogate: of what is minimised.
+        process: with the observations in it.
+        lengths: (dimension,) lengthscales of the searched axes. Around a simulated mean they are the simulations':
+            a handful of pours says little about what the pours' remainder depends on.
+    """
+
     surrogate: Surrogate
     process: GaussianProcess
+    lengths: Array
 
 
 def _fit(problem: SuggestProblem) -> _Model | None:
@@ -88,16 +98,17 @@ def _fit(problem: SuggestProblem) -> _Model | None:
         process = constant_mean_process(
             _array(problem.simulated.points, dimension), np.array(problem.simulated.costs, dtype=np.float64)
         )
+        lengths = process.lengths
         if len(problem.data):
             process = simulated_mean_process(process, points, costs)
-        return _Model(process, process)
+        return _Model(process, process, lengths)
     if len(problem.data) < 2:
         return None
     process = zero_mean_process(points, costs) if problem.mean == "zero" else constant_mean_process(points, costs)
     if problem.context:
         context = _array(problem.context, contextual - dimension)
-        return _Model(AbsoluteProcess(process, context), process)
-    return _Model(process, process)
+        return _Model(AbsoluteProcess(process, context), process, process.lengths[:dimension])
+    return _Model(process, process, process.lengths)
 
 
 def _search(
@@ -142,8 +153,9 @@ def _describe(problem: SuggestProblem, model: _Model, known: Array, points: Arra
         predictions, spreads = model.surrogate.predict(_array(problem.predict_at, problem.space.dimension))
         description["predictions"] = tuple(map(float, predictions))
         description["prediction_deviations"] = tuple(map(float, spreads))
-    if problem.map_resolution and problem.space.dimension == 2:
-        description["surrogate"] = _map(model.surrogate, problem.map_resolution)
+    if problem.map_resolution and problem.space.dimension >= 2:
+        sought = problem.acquisition == "posterior_minimum" and len(points) > 0
+        description["surrogate"] = _map(problem, model, points[0] if sought else known[best])
     return description
 
 
@@ -152,11 +164,19 @@ def _axis_names(problem: SuggestProblem) -> list[str]:
     return [*problem.space.names, *(f"context{i + 1}" for i in range(contexts))]
 
 
-def _map(surrogate: Surrogate, resolution: int) -> SurrogateMap:
-    places = np.linspace(0.0, 1.0, resolution)
+def _map(problem: SuggestProblem, model: _Model, at: Array) -> SurrogateMap:
+    """The surrogate on the plane through `at` (dimension,) that its two most important axes span."""
+    across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
+    places = np.linspace(0.0, 1.0, problem.map_resolution)
     first, second = np.meshgrid(places, places)
-    mean, deviation = surrogate.predict(np.column_stack([first.ravel(), second.ravel()]))
-    return SurrogateMap(_tuples(mean.reshape(first.shape)), _tuples(deviation.reshape(first.shape)))
+    grid = np.tile(at, (first.size, 1))
+    grid[:, across], grid[:, up] = first.ravel(), second.ravel()
+    mean, deviation = model.surrogate.predict(grid)
+    shape, names = first.shape, problem.space.names
+    cut: tuple[tuple[str, ...], Point] = ((), ())
+    if problem.space.dimension > 2:
+        cut = (names[across], names[up]), tuple(map(float, at))
+    return SurrogateMap(_tuples(mean.reshape(shape)), _tuples(deviation.reshape(shape)), *cut)
 
 
 def _observed(problem: SuggestProblem) -> Array:
