@@ -90,7 +90,7 @@ class ProgressDisplay:
             case CampaignStateChanged() if event.reason:
                 self._print(f"{event.before} → {event.after}: {event.reason}")
             case CampaignClosed():
-                self._print(f"campaign {event.state}; {self._tally.pool_line()}")
+                self._print(f"campaign {event.state}; {self._tally.counts_line()}")
             case LogLine():
                 self._print(event.text, _LEVEL_STYLE[event.level])
             case _ if event.replayed:
@@ -116,7 +116,10 @@ class ProgressDisplay:
         self._last_line = now
         remaining = stage.remaining(event.time)
         eta = f"  about {_duration(remaining)} left" if remaining is not None else ""
-        self._print(f"{stage.name} {stage.done}/{stage.total}  {self._tally.pool_line()}{eta}")
+        # Lines come at moments when something has just ended; who is busy at that moment says nothing about the pool.
+        load = self._tally.load()
+        pool = f"pool {100 * load:.0f} % busy · " if load is not None else ""
+        self._print(f"{stage.name} {stage.done}/{stage.total}  {pool}{self._tally.counts_line()}{eta}")
 
     def _print(self, text: str, look: str = "") -> None:
         from rich.text import Text

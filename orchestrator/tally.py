@@ -19,6 +19,7 @@ from orchestrator.events import (
 )
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
+from orchestrator.report.names import receiver_name
 from orchestrator.report.units import LossUnit, is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
 
@@ -95,7 +96,7 @@ class Tally:
         simulations, failed_simulations: finished ones.
         simulation_seconds: wall seconds that finished simulations took, all together (replayed ones not counted).
         timed_simulations: how many these were.
-        best: by receiver.
+        best: by scene.
     """
 
     plan: CampaignPlan
@@ -111,8 +112,14 @@ class Tally:
     pour: PourTally | None = None
     best: dict[str, Best] = field(default_factory=dict)
 
+    _busy_seconds: float = 0.0
+    _load_from: float | None = None
+    _load_to: float = 0.0
+
     def __call__(self, event: Event) -> None:
         """Count an event."""
+        if not event.replayed:
+            self._pass_time(event.time)
         match event:
             case CampaignOpened():
                 self.mode, self.simulators = event.mode, event.simulators
@@ -193,11 +200,31 @@ class Tally:
                 if self.pour is not None:
                     self.pour.result = f"failed: {failed.reason}"
 
+    def _pass_time(self, now: float) -> None:
+        if self._load_from is None:
+            self._load_from = now
+        else:
+            self._busy_seconds += min(len(self.running), self.simulators) * max(now - self._load_to, 0.0)
+        self._load_to = now
+
+    def load(self) -> float | None:
+        """Mean share of the pool (0 … 1) that was busy since this was asked last; None if no time has passed."""
+        elapsed = 0.0 if self._load_from is None else self._load_to - self._load_from
+        if elapsed <= 0.0 or not self.simulators:
+            return None
+        share = self._busy_seconds / (elapsed * self.simulators)
+        self._load_from, self._busy_seconds = self._load_to, 0.0
+        return share
+
     def pool_line(self, scene: str | None = None) -> str:
         """'pool 2/2 busy · 214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
-        parts = [f"pool {len(self.running)}/{self.simulators} busy"] if self.simulators else []
+        pool = f"pool {len(self.running)}/{self.simulators} busy · " if self.simulators else ""
+        return pool + self.counts_line(scene)
+
+    def counts_line(self, scene: str | None = None) -> str:
+        """'214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
         each = f", {self.simulation_seconds / self.timed_simulations:.1f} s each" if self.timed_simulations else ""
-        parts.append(f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}")
+        parts = [f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}"]
         if self.failed_simulations:
             parts.append(f"{self.failed_simulations} failed")
         wanted = self.pour.scene if scene is None and self.pour is not None else scene
@@ -217,7 +244,7 @@ class Tally:
         elif self.plan.deployment is not None:
             total = self.plan.deployment.pours
         of = f"/{total}" if total else ""
-        line = f"pour {pour.number}{of} into {pour.scene}  {pour.action}"
+        line = f"pour {pour.number}{of} into {receiver_name(self.plan, pour.scene)}  {pour.action}"
         if pour.predicted:
             line += f"  predicted {pour.predicted}"
         if pour.result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.report.style import safe_name
@@ -47,26 +48,26 @@ def simulation_blueprint() -> rrb.Blueprint:
     )
 
 
-def campaign_blueprint(receivers: tuple[str, ...], loss_label: str) -> rrb.Blueprint:
+def campaign_blueprint(receivers: Mapping[str, str], loss_label: str) -> rrb.Blueprint:
     """For a campaign: scene and pool to the left, losses and maps in the middle, events and state to the right.
 
     Args:
-        receivers: names of the deployment scenes.
+        receivers: what people call each deployment scene, by its name.
         loss_label: of the pours' loss.
     """
     import rerun.blueprint as rrb
 
     losses = [
         rrb.TimeSeriesView(
-            origin=f"/pours/{safe_name(name)}", name=f"{name}: {loss_label}", plot_legend=rrb.Corner2D.RightTop
+            origin=f"/pours/{safe_name(scene)}", name=f"{name}: {loss_label}", plot_legend=rrb.Corner2D.RightTop
         )
-        for name in receivers
+        for scene, name in receivers.items()
     ]
     losses.append(rrb.TimeSeriesView(origin="/calibration/loss", name="Calibration pours: spilled / poured [%]"))
     maps = []
     for place, title in (
         ("/maps/calibration", "Discrepancy"),
-        *((f"/maps/{safe_name(name)}", name) for name in receivers),
+        *((f"/maps/{safe_name(scene)}", name) for scene, name in receivers.items()),
     ):
         for which, meaning in (("mean", "mean"), ("deviation", "± 1 σ")):
             maps.append(
@@ -80,7 +81,7 @@ def campaign_blueprint(receivers: tuple[str, ...], loss_label: str) -> rrb.Bluep
         rrb.TensorView(origin=f"{place}/mean/values", name=f"{title}: numbers")
         for place, title in (
             ("/maps/calibration", "Discrepancy"),
-            *((f"/maps/{safe_name(name)}", name) for name in receivers),
+            *((f"/maps/{safe_name(scene)}", name) for scene, name in receivers.items()),
         )
     ]
     return rrb.Blueprint(

@@ -24,8 +24,16 @@ from orchestrator.monitor.streams import Streams
 from orchestrator.monitor.worker import Worker
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
+from orchestrator.report.names import receiver_names
 from orchestrator.report.style import safe_name
-from orchestrator.report.units import DISCREPANCY, is_calibration, loss_of_pour, loss_unit, unit_of_pour
+from orchestrator.report.units import (
+    DISCREPANCY,
+    at_least_nothing,
+    is_calibration,
+    loss_of_pour,
+    loss_unit,
+    unit_of_pour,
+)
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated, Suggest, Suggested
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.task import Scene
@@ -60,7 +68,9 @@ class RerunMonitor:
         self.path = free_path(path)
         scenes = plan.deployment.scenes if plan.deployment is not None else ()
         unit = loss_unit(plan.deployment.loss) if plan.deployment is not None else DISCREPANCY
-        streams = Streams(self.path, name=plan.name, receivers=tuple(s.name for s in scenes), loss_label=unit.label)
+        names = receiver_names(plan)
+        receivers = {scene.name: names[scene.name] for scene in scenes}
+        streams = Streams(self.path, name=plan.name, receivers=receivers, loss_label=unit.label)
         self._translator = _Translator(streams, plan)
         self._worker: Worker[Event] = Worker(
             self._translator.handle, self._finish, capacity=capacity, name=f"recording {self.path.name}"
@@ -122,6 +132,7 @@ class _Translator:
             self._scenes[plan.calibration.scene.name] = plan.calibration.scene
         if plan.deployment is not None:
             self._scenes.update({scene.name: scene for scene in plan.deployment.scenes})
+        self._names = receiver_names(plan)
         self._scene_of_stage: dict[str, str] = {}
         self._best: dict[str, float] = {}
         self._running: set[int] = set()
@@ -251,7 +262,8 @@ class _Translator:
         shown = unit.factor * value
         self.streams.number(f"{place}/measured", shown, name="measured", colour=style.MEASURED, points=True)
         if request.predicted is not None:
-            mean, sigma = unit.factor * request.predicted.mean, unit.factor * request.predicted.deviation
+            mean = unit.factor * at_least_nothing(request.predicted.mean)
+            sigma = unit.factor * request.predicted.deviation
             self.streams.number(f"{place}/predicted", mean, name="predicted", colour=style.PREDICTED)
             self.streams.number(
                 f"{place}/predicted_low", max(mean - 2 * sigma, 0.0), name="predicted − 2 σ", colour=style.PALE
@@ -261,9 +273,9 @@ class _Translator:
             best = min(shown, self._best.get(request.scene, shown))
             self._best[request.scene] = best
             self.streams.number(f"{place}/best", best, name="best so far", colour=style.BEST)
-            self._about[f"best of {request.scene}"] = f"{best:.2f} {unit.unit}"
+            self._about[f"best of {self._name(request.scene)}"] = f"{best:.2f} {unit.unit}"
         self._say(
-            f"pour {request.number} of {request.scene}: {shown:.2f} {unit.unit} "
+            f"pour {request.number} of {self._name(request.scene)}: {shown:.2f} {unit.unit} "
             f"({1e3 * measured.spilled:.1f} g spilled, {1e3 * measured.retained:.1f} g retained)",
             source=event.stage,
         )
@@ -271,7 +283,7 @@ class _Translator:
 
     def _suggested(self, event: RequestFinished, request: Suggest, outcome: Suggested) -> None:
         problem, suggestion = request.problem, outcome.suggestion
-        if suggestion.surrogate is None or problem.space.dimension != 2:
+        if suggestion.surrogate is None:
             return
         # A space of actions belongs to the receiver in question, one of simulation parameters to the calibration.
         acting = problem.space.names[0] in ACTION_DIMENSIONS
@@ -279,8 +291,13 @@ class _Translator:
         place = f"/maps/{safe_name(scene)}" if acting and scene is not None else "/maps/calibration"
         unit = loss_unit(self._plan.deployment.loss) if acting and self._plan.deployment else DISCREPANCY
         said = self.streams.surrogate(place, problem.space, suggestion.surrogate, problem.data.points, unit.factor)
-        self._about[f"map {place.removeprefix('/maps/')}"] = f"{unit.label}: {said}"
+        self._about[f"map {self._name(scene) if acting and scene is not None else 'calibration'}"] = (
+            f"{unit.label}: {said}"
+        )
         self._page()
+
+    def _name(self, scene: str) -> str:
+        return self._names.get(scene, scene)
 
     def _action(self, pour: Pour) -> str:
         plan = self._plan.calibration if is_calibration(self._plan, pour) else self._plan.deployment

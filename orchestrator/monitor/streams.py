@@ -8,6 +8,7 @@ simulations' time, one recording laid out behind the other).
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,7 @@ class Streams:
     Args:
         path: file to write; its folder is made if needed.
         name: of the recording, for people.
-        receivers: names of the deployment scenes; None for a single simulation.
+        receivers: what people call each deployment scene, by its name; None for a single simulation.
         loss_label: of the pours' loss.
 
     Raises:
@@ -57,7 +58,7 @@ class Streams:
     """
 
     def __init__(
-        self, path: Path, *, name: str, receivers: tuple[str, ...] | None = None, loss_label: str = "loss"
+        self, path: Path, *, name: str, receivers: Mapping[str, str] | None = None, loss_label: str = "loss"
     ) -> None:
         import rerun as rr
 
@@ -186,29 +187,31 @@ class Streams:
 
         Args:
             entity: under which it goes.
-            space: two axes; the first to the right, the second upwards.
+            space: searched box; of the map's two axes the first goes to the right, the second upwards.
             surrogate: (R, R) values, row i at the second axis' i-th place.
-            points: observations in the unit cube; further coordinates (`SuggestProblem.context`) are ignored.
+            points: observations in the unit cube, projected on the map; their further coordinates
+                (`SuggestProblem.context`) are ignored.
             factor: shown over own unit of the cost.
 
         Returns:
-            A sentence with the axes and the range of values, since a picture has no ticks.
+            A sentence with the axes, the range of values and where other axes were held: a picture has no ticks.
         """
         said = []
+        plane = surrogate.plane(space)
+        columns = [space.names.index(name) for name in plane.names]
         for name, grid, colours in (
             ("mean", surrogate.mean, "viridis"),
             ("deviation", surrogate.deviation, "cividis"),
         ):
             values = factor * np.asarray(grid, dtype=float)
+            shown = np.maximum(values, 0.0)  # see `orchestrator.report.units.at_least_nothing`
             # Rows of a picture run downwards, our second axis upwards.
-            picture = np.kron(_coloured(values, colours)[::-1], np.ones((MAP_PIXELS, MAP_PIXELS, 1), np.uint8))
+            picture = np.kron(_coloured(shown, colours)[::-1], np.ones((MAP_PIXELS, MAP_PIXELS, 1), np.uint8))
             self._recording.log(f"{entity}/{name}/picture", self._rr.Image(picture))
-            self._recording.log(
-                f"{entity}/{name}/values", self._rr.Tensor(values[::-1], dim_names=(space.names[1], space.names[0]))
-            )
+            self._recording.log(f"{entity}/{name}/values", self._rr.Tensor(values[::-1], dim_names=plane.names[::-1]))
             side = MAP_PIXELS * values.shape[0]
             if points:
-                place = np.asarray(points, dtype=float)
+                place = np.asarray(points, dtype=float)[:, columns]
                 # A grid of R places on [0, 1] puts the first and last place at the middle of the outer cells.
                 pixel = MAP_PIXELS * (0.5 + place * (values.shape[0] - 1))
                 self._recording.log(
@@ -222,11 +225,12 @@ class Streams:
                         draw_order=20.0,
                     ),
                 )
-            said.append(f"{name} {values.min():.3g} … {values.max():.3g}")
-        across, up = space.axes
+            said.append(f"{name} {shown.min():.3g} … {shown.max():.3g}")
+        across, up = plane.axes
+        held = style.display_values(dict(surrogate.held(space)))
         return (
             f"{', '.join(said)}; to the right {_range(across.name, across.lower, across.upper)}, "
-            f"upwards {_range(up.name, up.lower, up.upper)}"
+            f"upwards {_range(up.name, up.lower, up.upper)}{f'; others at {held}' if held else ''}"
         )
 
     def line(self, text: str, level: str = "info", source: str = "campaign") -> None:

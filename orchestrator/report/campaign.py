@@ -8,7 +8,8 @@ from pathlib import Path
 
 from orchestrator.plan import CampaignPlan
 from orchestrator.report.figures import draw_discrepancy, draw_spillage
-from orchestrator.report.maps import draw_surrogate
+from orchestrator.report.maps import draw_surrogate, draw_trials
+from orchestrator.report.names import receiver_name
 from orchestrator.report.results import (
     Results,
     calibration_of,
@@ -32,7 +33,10 @@ def draw_figures(
     *,
     baselines: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> dict[str, Path]:
-    """Draw what the results allow: discrepancy map, test discrepancy, spillage against pours, loss maps.
+    """Draw what the results allow: discrepancy map and trials, test discrepancy, spillage against pours, loss maps.
+
+    Of more than two searched axes a map shows the two that matter most; the trials against every axis are then a figure
+    of their own.
 
     A figure that can't be drawn is reported and left out: days of pouring don't end in a traceback about a picture.
 
@@ -49,20 +53,23 @@ def draw_figures(
     calibration, evaluation = calibration_of(results), evaluation_of(results)
     if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
         jobs["discrepancy map"] = lambda p=picture: draw_surrogate(directory / "discrepancy-map.png", p)  # type: ignore[misc]
+        if picture.held and picture.points:
+            jobs["discrepancy trials"] = lambda p=picture: draw_trials(directory / "discrepancy-trials.png", p)  # type: ignore[misc]
     if evaluation is not None and (groups := discrepancy_groups(evaluation, baselines)):
         jobs["test discrepancy"] = lambda: draw_discrepancy(
             directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the scale: {plan.name}"
         )
     if plan.deployment is not None:
         unit = loss_unit(plan.deployment.loss)
-        if series := pour_series(results, unit):
+        if series := pour_series(plan, results, unit):
             jobs["spillage against pours"] = lambda: draw_spillage(
                 directory / "spillage.png", series, cost=unit.label, title=f"Spillage against pours: {plan.name}"
             )
         for scene, result in deployments_of(results).items():
             if (picture := deployment_picture(plan, result)) is not None:
-                jobs[f"loss map {scene}"] = lambda p=picture, s=scene: draw_surrogate(  # type: ignore[misc]
-                    directory / f"loss-map-{safe_name(s)}.png", p
+                name = receiver_name(plan, scene)
+                jobs[f"loss map {name}"] = lambda p=picture, n=name: draw_surrogate(  # type: ignore[misc]
+                    directory / f"loss-map-{safe_name(n)}.png", p
                 )
     drawn: dict[str, Path] = {}
     for name, job in jobs.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +36,8 @@ class SurrogatePicture:
         mean: (R, R) surrogate mean over the unit square, row i at the second axis' i-th place; None without a map.
         deviation: (R, R) its standard deviation.
         numbers: what to write on the points (pours); None: they are dots (simulations).
+        over: names of the map's two axes; empty: the space has no others.
+        held: values of the other axes at which the map cuts the surrogate, SI.
     """
 
     title: str
@@ -48,10 +50,19 @@ class SurrogatePicture:
     mean: NDArray[np.float64] | None = None
     deviation: NDArray[np.float64] | None = None
     numbers: Sequence[int] | None = None
+    over: tuple[str, ...] = ()
+    held: Values = field(default_factory=dict)
+
+    @property
+    def plane(self) -> Space:
+        """The two axes of the map, the first across, the second up."""
+        return Space(tuple(axis for axis in self.space.axes if not self.over or axis.name in self.over))
 
 
 def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
-    """Write a surrogate's picture: maps of mean and deviation over two axes, else the cost against every axis.
+    """Write a surrogate's picture: maps of mean and deviation over two axes; without a map, as `draw_trials`.
+
+    Of more than two axes the map is a cut through the surrogate; the observations, made anywhere, are projected on it.
 
     Args:
         path: PNG to write.
@@ -65,8 +76,26 @@ def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
     """
     if not picture.points and picture.mean is None:
         raise ValueError(f"'{picture.title}': neither a surrogate nor a single observation to draw")
-    figure = _maps(picture) if picture.space.dimension == 2 else _slices(picture)
-    return style.save(figure, path)
+    mapped = picture.space.dimension == 2 or (picture.mean is not None and picture.space.dimension > 2)
+    return style.save(_maps(picture) if mapped else _slices(picture), path)
+
+
+def draw_trials(path: Path, picture: SurrogatePicture) -> Path:
+    """Write the observed costs against each searched axis, side by side.
+
+    Args:
+        path: PNG to write.
+        picture: at least one point.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: there is nothing to draw.
+    """
+    if not picture.points:
+        raise ValueError(f"'{picture.title}': not a single observation to draw")
+    return style.save(_slices(picture), path)
 
 
 def _maps(picture: SurrogatePicture) -> Figure:
@@ -81,13 +110,23 @@ def _maps(picture: SurrogatePicture) -> Figure:
     figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
     for place, (name, grid) in enumerate(shown):
         _map_panel(figure, axes[0, place], picture, name, grid)
+    if picture.held:
+        figure.supxlabel(_cut_note(picture), fontsize=8.5, color=style.INK, x=0.02, ha="left")
     return figure
+
+
+def _cut_note(picture: SurrogatePicture) -> str:
+    """Where the map lies in the box, for those who'd take it for the whole."""
+    note = f"others at {picture.best_name}: {style.display_values(dict(picture.held))}"
+    if picture.points:
+        note += f"; the {_things(picture)} were made at any values of them"
+    return note
 
 
 def _map_panel(
     figure: Figure, axes: Axes, picture: SurrogatePicture, name: str, grid: NDArray[np.float64] | None
 ) -> None:
-    x_axis, y_axis = picture.space.axes
+    x_axis, y_axis = picture.plane.axes
     # Deviations say how sure the mean is, not how good a place is: another colour map, so that nobody mixes them up.
     colours = "cividis" if name == "standard deviation" else "viridis"
     xs, ys = _column(picture.points, x_axis), _column(picture.points, y_axis)
@@ -155,14 +194,17 @@ def _map_panel(
 
 
 def _panel_title(name: str, picture: SurrogatePicture) -> str:
-    things = "simulations" if picture.numbers is None else "pours"
     match name:
         case "mean":
-            return f"surrogate mean, {len(picture.points)} {things}"
+            return f"surrogate mean, {len(picture.points)} {_things(picture)}"
         case "standard deviation":
             return "its standard deviation"
         case _:
-            return f"{len(picture.points)} {things}"
+            return f"{len(picture.points)} {_things(picture)}"
+
+
+def _things(picture: SurrogatePicture) -> str:
+    return "simulations" if picture.numbers is None else "pours"
 
 
 def _mark_best(axes: Axes, picture: SurrogatePicture, x_axis: Axis, y_axis: Axis) -> None:
@@ -170,7 +212,7 @@ def _mark_best(axes: Axes, picture: SurrogatePicture, x_axis: Axis, y_axis: Axis
     x, y = _column([picture.best], x_axis)[0], _column([picture.best], y_axis)[0]
     axes.scatter([x], [y], marker="*", s=330, color=style.BEST, edgecolors="white", linewidths=1.3, zorder=5)
     # The label goes towards the middle of the picture, where there is room for it.
-    u, v = (picture.space.axes[i].encode(float(picture.best[picture.space.names[i]] or 0.0)) for i in (0, 1))
+    u, v = (axis.encode(float(picture.best[axis.name] or 0.0)) for axis in (x_axis, y_axis))
     axes.annotate(
         picture.best_name,
         (x, y),

@@ -13,7 +13,8 @@ import numpy as np
 from orchestrator.plan import CampaignPlan
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries
 from orchestrator.report.maps import SurrogatePicture
-from orchestrator.report.units import DISCREPANCY, LossUnit, loss_unit
+from orchestrator.report.names import receiver_name
+from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, loss_unit
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]
@@ -110,6 +111,7 @@ def calibration_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture 
         best=result.get("theta"),
         mean=mean,
         deviation=deviation,
+        **_cut(result),
     )
 
 
@@ -123,7 +125,7 @@ def deployment_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture |
     if not pours and mean is None:
         return None
     return SurrogatePicture(
-        title=f"Loss over actions: {result['scene']} ({result['strategy']})",
+        title=f"Loss over actions: {receiver_name(plan, result['scene'])} ({result['strategy']})",
         cost=unit.label,
         space=plan.deployment.actions,
         points=[p["action_si"] for p in pours],
@@ -133,10 +135,11 @@ def deployment_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture |
         mean=mean,
         deviation=deviation,
         numbers=[int(p["number"]) for p in pours],
+        **_cut(result),
     )
 
 
-def pour_series(results: Results, unit: LossUnit) -> list[PourSeries]:
+def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[PourSeries]:
     """Pours by receiver, for `draw_spillage`; refused ones (nothing was poured) are left out."""
     series = []
     for scene, result in deployments_of(results).items():
@@ -145,7 +148,7 @@ def pour_series(results: Results, unit: LossUnit) -> list[PourSeries]:
             continue
         series.append(
             PourSeries(
-                f"{scene} ({result['strategy']})",
+                f"{receiver_name(plan, scene)} ({result['strategy']})",
                 [
                     unit.factor * p["loss"] if p["status"] == "weighed" and p["loss"] is not None else None
                     for p in pours
@@ -153,7 +156,10 @@ def pour_series(results: Results, unit: LossUnit) -> list[PourSeries]:
                 [
                     None
                     if p["predicted"] is None
-                    else (unit.factor * p["predicted"], unit.factor * (p["predicted_deviation"] or 0.0))
+                    else (
+                        unit.factor * at_least_nothing(p["predicted"]),
+                        unit.factor * (p["predicted_deviation"] or 0.0),
+                    )
                     for p in pours
                 ],
             )
@@ -170,4 +176,13 @@ def _grids(result: Result, unit: LossUnit) -> tuple[Any, Any]:
     grids = result.get("map")
     if grids is None:
         return None, None
-    return unit.factor * np.asarray(grids["mean"], float), unit.factor * np.asarray(grids["deviation"], float)
+    mean = np.maximum(np.asarray(grids["mean"], float), 0.0)  # see `at_least_nothing`
+    return unit.factor * mean, unit.factor * np.asarray(grids["deviation"], float)
+
+
+def _cut(result: Result) -> dict[str, Any]:
+    """Which axes a result's map is over, and where the others were held."""
+    grids = result.get("map")
+    if grids is None or "over" not in grids:  # a map of all axes, as the first versions wrote it
+        return {}
+    return {"over": tuple(grids["over"]), "held": dict(grids["held"])}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
+from orchestrator.report.names import receiver_names
 from orchestrator.report.results import (
     SPLITS,
     Result,
@@ -19,12 +20,15 @@ from orchestrator.report.results import (
     evaluation_of,
     weighed,
 )
-from orchestrator.report.units import LossUnit, loss_unit
+from orchestrator.report.units import DISCREPANCY, LossUnit, loss_unit
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import JustifyMethod, RenderableType
 
 SUMMARY_NAME = "summary.json"
+
+PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
+"""Columns of the table where stderr is no terminal: at least, at most."""
 
 
 def summarise(
@@ -50,10 +54,12 @@ def summarise(
 
     Returns:
         'theta' with 'predicted_discrepancy'; 'discrepancy' by split and predictor (fractions of what was poured);
-        'receivers' with first and best losses (the loss' own unit, named in 'loss'), spillage r = spilled / poured, and
-        the best actions in display units and SI; 'figures', 'recording', and `totals`.
+        'receivers' by scene, each with its 'receiver's name, first and best losses (the loss' own unit, named in
+        'loss'), spillage r = spilled / poured, and the best actions in display units and SI; 'figures', 'recording',
+        and `totals`.
     """
     calibration = calibration_of(results)
+    names = receiver_names(plan)
     return {
         "campaign": plan.name,
         "seed": plan.seed,
@@ -63,7 +69,10 @@ def summarise(
         "predicted_deviation": None if calibration is None else calibration.get("predicted_deviation"),
         "discrepancy": _discrepancies(evaluation_of(results), baselines or {}),
         "loss": None if plan.deployment is None else plan.deployment.loss.name,
-        "receivers": {scene: _receiver(result) for scene, result in deployments_of(results).items()},
+        "receivers": {
+            scene: {"receiver": names.get(scene, scene), **_receiver(result)}
+            for scene, result in deployments_of(results).items()
+        },
         "figures": {name: str(path) for name, path in (figures or {}).items()},
         "recording": None if recording is None else str(recording),
         "dropped_events": dropped_events,
@@ -132,11 +141,14 @@ def summary_table(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableT
     parts: list[RenderableType] = [Text(f"\n{summary['campaign']}  seed {summary['seed']}", style="bold")]
     if summary["theta"] is not None:
         parts.append(_theta_line(plan, summary))
-    if summary["discrepancy"]:
-        parts.append(_discrepancy_table(summary["discrepancy"]))
-    if summary["receivers"] and plan.deployment is not None:
-        parts.append(_receiver_table(summary["receivers"], loss_unit(plan.deployment.loss)))
-        parts += _remarks(summary["receivers"])
+    discrepancies = {split: row for split, row in summary["discrepancy"].items() if _has_numbers(row.values())}
+    if discrepancies:
+        parts.append(_discrepancy_table(discrepancies))
+    if plan.deployment is not None:
+        known = [row for row in summary["receivers"].values() if _has_numbers(row[key] for key in _LOSSES)]
+        if known:
+            parts.append(_receiver_table(known, loss_unit(plan.deployment.loss)))
+        parts += _remarks(summary["receivers"].values())
     files = [*summary["figures"].items(), *([("recording", summary["recording"])] if summary["recording"] else [])]
     if files:
         width = max(len(name) for name, _ in files)
@@ -153,11 +165,19 @@ def _theta_line(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableTyp
     text = Text(f"θ*  {style.display_values(summary['theta'])}")
     if summary["predicted_discrepancy"] is not None:
         text.append(
-            f"   expected |Δ| {100 * summary['predicted_discrepancy']:.2f} ± "
-            f"{100 * (summary['predicted_deviation'] or 0.0):.2f} %",
+            "   expected |Δ| "
+            + DISCREPANCY.text(summary["predicted_discrepancy"], summary["predicted_deviation"] or 0.0),
             style="dim",
         )
     return text
+
+
+_LOSSES = ("first_loss", "best_loss", "predicted_loss")
+"""Numbers of a receiver that the table exists for."""
+
+
+def _has_numbers(values: Iterable[Any]) -> bool:
+    return any(value is not None for value in values)
 
 
 def _discrepancy_table(rows: Mapping[str, Mapping[str, float | None]]) -> RenderableType:
@@ -180,51 +200,70 @@ def _discrepancy_table(rows: Mapping[str, Mapping[str, float | None]]) -> Render
     return table
 
 
-def _receiver_table(receivers: Mapping[str, Mapping[str, Any]], unit: LossUnit) -> RenderableType:
+def _receiver_table(rows: Sequence[Mapping[str, Any]], unit: LossUnit) -> RenderableType:
     from rich.table import Table
 
+    columns: dict[str, tuple[JustifyMethod, list[str]]] = {
+        "receiver": ("left", [row["receiver"] for row in rows]),
+        "": ("left", [row["strategy"] for row in rows]),
+        "pours": ("right", [str(row["pours"] or "") for row in rows]),
+        "first": ("right", [_loss(row, "first_loss", unit) for row in rows]),
+        "best measured": ("right", [_best_measured(row, unit) for row in rows]),
+        "best expected": ("right", [_best_expected(row, unit) for row in rows]),
+        "best action": ("left", [style.display_values(row["best_action_si"] or {}) for row in rows]),
+    }
     table = Table(title=unit.label, title_justify="left", title_style="", box=_box())
-    for name, justify in (
-        ("receiver", "left"),
-        ("", "left"),
-        ("pours", "right"),
-        ("first", "right"),
-        ("best measured", "right"),
-        ("best expected", "right"),
-        ("best action", "left"),
-    ):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for scene, row in receivers.items():
-        best = "—" if row["best_loss"] is None else f"{unit.text(row['best_loss'])} (pour {row['best_pour']})"
-        expected = (
-            "—" if row["predicted_loss"] is None else unit.text(row["predicted_loss"], row["predicted_deviation"])
-        )
-        action = style.display_values(row["best_action_si"]) if row["best_action_si"] else "—"
-        table.add_row(
-            scene,
-            row["strategy"],
-            str(row["pours"]),
-            "—" if row["first_loss"] is None else unit.text(row["first_loss"]),
-            best,
-            expected,
-            action,
-        )
+    shown = {name: column for name, column in columns.items() if any(column[1])}
+    for name, (justify, _) in shown.items():
+        table.add_column(name, justify=justify)
+    for cells in zip(*(cells for _, cells in shown.values()), strict=True):
+        table.add_row(*(cell or "—" for cell in cells))
     return table
 
 
-def _remarks(receivers: Mapping[str, Mapping[str, Any]]) -> list[RenderableType]:
+def _loss(row: Mapping[str, Any], key: str, unit: LossUnit) -> str:
+    return "" if row[key] is None else unit.text(row[key])
+
+
+def _best_measured(row: Mapping[str, Any], unit: LossUnit) -> str:
+    return "" if row["best_loss"] is None else f"{unit.text(row['best_loss'])} (pour {row['best_pour']})"
+
+
+def _best_expected(row: Mapping[str, Any], unit: LossUnit) -> str:
+    return "" if row["predicted_loss"] is None else unit.text(row["predicted_loss"], row["predicted_deviation"])
+
+
+def _remarks(rows: Iterable[Mapping[str, Any]]) -> list[RenderableType]:
     from rich.text import Text
 
     remarks: list[RenderableType] = []
-    for scene, row in receivers.items():
+    for row in rows:
+        receiver = row["receiver"]
         if row["untrustworthy_simulation"]:
-            text = f"  {scene}: the first pours were far from what was predicted; the simulator may not fit this vessel"
-            remarks.append(Text(text, style="yellow"))
+            text = "the first pours were far from what was predicted; the simulator may not fit this vessel"
+            remarks.append(Text(f"  {receiver}: {text}", style="yellow"))
         if row["failed_pours"]:
-            remarks.append(Text(f"  {scene}: {row['failed_pours']} pour(s) failed", style="yellow"))
+            remarks.append(Text(f"  {receiver}: {row['failed_pours']} pour(s) failed", style="yellow"))
         if row["gave_up"]:
-            remarks.append(Text(f"  {scene}: {row['gave_up']}", style="yellow"))
+            remarks.append(Text(f"  {receiver}: {row['gave_up']}", style="yellow"))
+        elif not _has_numbers(row[key] for key in _LOSSES):
+            remarks.append(Text(f"  {receiver}: nothing was learnt; see the journal for what failed", style="yellow"))
     return remarks
+
+
+def print_summary(plan: CampaignPlan, summary: Mapping[str, Any]) -> None:
+    """Write the summary's table to stderr.
+
+    Where that is no terminal, nobody has a width to fit in: lines are as long as names and paths want them.
+    """
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    console, table = Console(stderr=True), summary_table(plan, summary)
+    if not console.is_terminal:
+        wanted = Measurement.get(console, console.options.update(max_width=LONGEST_LINE), table).maximum
+        console.width = max(PLAIN_WIDTH, wanted)
+    console.print(table)
 
 
 def _box() -> Any:

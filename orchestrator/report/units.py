@@ -25,16 +25,22 @@ class LossUnit:
     factor: float
 
     def text(self, value: float, deviation: float | None = None) -> str:
-        """A value for people, from the loss' own unit: '1.2 %' or '1.2 ± 0.9 %'."""
-        number = f"{self.factor * value:.{self.decimals}f}"
-        if deviation is not None:
-            number += f" ± {self.factor * deviation:.{self.decimals}f}"
+        """A value for people, from the loss' own unit: '1.2 %', or as a prediction '1.2 ± 0.9 %'."""
+        if deviation is None:
+            return f"{self.factor * value:.{self.decimals}f} {self.unit}"
+        number = f"{self.factor * at_least_nothing(value):.{self.decimals}f}"
+        number += f" ± {self.factor * deviation:.{self.decimals}f}"
         return f"{number} {self.unit}"
 
     @property
     def decimals(self) -> int:
         """Places after the point that mean something: 0.01 % or g (20 mg of 200 g), whole particles."""
         return 0 if self.unit == "particles" else 2
+
+
+def at_least_nothing(predicted: float) -> float:
+    """A predicted loss or discrepancy as it is shown. None is negative; a surrogate, which doesn't know, may say so."""
+    return max(predicted, 0.0)
 
 
 def loss_unit(loss: Loss) -> LossUnit:

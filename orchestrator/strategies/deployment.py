@@ -162,7 +162,7 @@ class Deployment:
             self.decisions.append(Decision(text))
         else:
             expected = {"mean": prediction.mean, "sd": prediction.deviation}
-            text += f"  predicted {prediction.mean:.4g} ± {prediction.deviation:.2g}"
+            text += f"  predicted {max(prediction.mean, 0.0):.4g} ± {prediction.deviation:.2g}"
             self.decisions.append(Decision(text, expected))
 
     def _pour_first(self, suggestion: Suggestion) -> None:
@@ -198,7 +198,7 @@ class Deployment:
         if suggestion.means:
             mean, deviation = suggestion.means[index], suggestion.deviations[index]
             self.decisions.append(
-                Decision(f"{text}  predicted {mean:.4g} ± {deviation:.2g}", {"mean": mean, "sd": deviation})
+                Decision(f"{text}  predicted {max(mean, 0.0):.4g} ± {deviation:.2g}", {"mean": mean, "sd": deviation})
             )
         else:
             self.decisions.append(Decision(f"{text}  (no surrogate yet)"))

@@ -107,6 +107,22 @@ def test_surrogate_maps_of_calibration_and_receiver_are_in_the_recording_with_th
     assert first == pytest.approx([16 * (0.5 + 0.2 * 8), 16 * 9 - 16 * (0.5 + 0.3 * 8)], abs=1e-3)
 
 
+def test_map_of_two_out_of_three_parameters_is_a_cut_with_the_trials_projected_on_it(tmp_path: Path) -> None:
+    plan = watched.campaign()
+    monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
+    for event in watched.three_parameters():
+        monitor(event)
+    assert monitor.close(timeout=30.0)
+    assert (monitor.failed, monitor.dropped) == (0, 0)
+    contents = Contents(monitor.path)
+    assert contents.rows("/maps/calibration/mean/picture") == 1
+    # (0.2, 0.9, 0.3) of the unit cube on a map of the first and third axis, 9 × 9 cells of 16 pixels
+    first = contents.values("/maps/calibration/mean/observed", "Points2D:positions")[0][0]  # type: ignore[index]
+    assert first == pytest.approx([16 * (0.5 + 0.2 * 8), 16 * 9 - 16 * (0.5 + 0.3 * 8)], abs=1e-3)
+    page = str(contents.values("/state", "TextDocument:text")[-1])
+    assert "to the right particles 500 … 4 000, upwards friction 0 … 0.5; others at cohesion 0.04 N/m" in page
+
+
 def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> None:
     lines = [
         str(v[0])  # type: ignore[index]
@@ -116,7 +132,7 @@ def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> N
     ]
     assert "pour 2: least lower bound" in lines
     assert "the balance drifts" in lines
-    assert any(line.startswith("pour 3 of narrow cup: 6.00 %") for line in lines)
+    assert any(line.startswith("pour 3 of narrow: 6.00 %") for line in lines)
 
 
 def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_path: Path) -> None:

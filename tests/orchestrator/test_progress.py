@@ -15,6 +15,7 @@ from orchestrator.events import (
     LogLine,
     PourProgressed,
     RequestFinished,
+    RequestStarted,
     StageOpened,
     StrategyProgressed,
 )
@@ -44,11 +45,11 @@ def test_log_without_terminal_names_stages_pours_and_warnings_in_plain_lines() -
     assert "narrow-cup begins: calibration, narrow cup; mode virtual; runs/narrow-cup-1" in lines
     assert "calibration: stage 1 of 2" in lines
     assert (
-        "pour 3/3 into narrow cup  angular velocity 40 deg/s, x offset 90 mm  predicted 6.67 ± 2.00 %  measured 6.00 %"
+        "pour 3/3 into narrow  angular velocity 40 deg/s, x offset 90 mm  predicted 6.67 ± 2.00 %  measured 6.00 %"
         in lines
     )
     assert "the balance drifts" in lines
-    assert lines[-1].startswith("campaign finished; pool 0/2 busy · 2 simulations, 2.0 s each")
+    assert lines[-1].startswith("campaign finished; 2 simulations, 2.0 s each")
     assert lines[-1].endswith("best so far 6.00 % (pour 3)")
 
 
@@ -63,6 +64,28 @@ def test_log_without_terminal_has_at_most_one_progress_line_in_two_seconds() -> 
     assert len([line for line in written(plain).splitlines() if "/100" in line]) == 5  # at 0, 2, 4, 6 and 8 s
 
 
+def test_plain_lines_say_how_busy_the_pool_was_not_who_is_idle_at_the_moment_a_result_arrives() -> None:
+    now = 0.0
+    plan, plain = watched.campaign(), console(terminal=False)
+    display = ProgressDisplay(plan, console=plain, clock=lambda: now)
+    simulations = [
+        r for r in watched.events(plan) if isinstance(r, RequestFinished) and isinstance(r.request, Simulate)
+    ]
+    display(CampaignOpened(time=0.0, name="x", run_directory=watched.Path("x"), stages=(), mode="none", simulators=2))
+    display(StageOpened(time=0.0, stage="calibration", index=1, count=1))
+    # two simulators: both work from 0 to 6 s, one of them on to 8 s, nobody from there to 10 s
+    for key, finished in enumerate(simulations, start=1):
+        display(RequestStarted(time=0.0, stage="calibration", id=key, request=finished.request))
+    for key, (finished, end) in enumerate(zip(simulations, (6.0, 8.0), strict=True), start=1):
+        display(replace(finished, time=end, id=key, frames=None))
+    for time_now, done in ((10.0, 2), (14.0, 3)):
+        now = time_now
+        display(StrategyProgressed(time=now, stage="calibration", done=done, total=8, result={}))
+    lines = [line for line in written(plain).splitlines() if "/8" in line]
+    assert "pool 70 % busy · 2 simulations" in lines[0]
+    assert "pool 0 % busy · 2 simulations" in lines[1]
+
+
 def test_terminal_shows_bars_the_running_pours_checkpoint_and_the_pool() -> None:
     plan, terminal = watched.campaign(), console(terminal=True)
     display = ProgressDisplay(plan, console=terminal)
@@ -74,7 +97,7 @@ def test_terminal_shows_bars_the_running_pours_checkpoint_and_the_pool() -> None
     screen.print(display._render())
     text = written(screen)
     assert "━" in text
-    assert "pour 1/3 into narrow cup  angular velocity 40 deg/s, x offset 90 mm  predicted 20.00 ± 2.00 %" in text
+    assert "pour 1/3 into narrow  angular velocity 40 deg/s, x offset 90 mm  predicted 20.00 ± 2.00 %" in text
     assert "tilting" in text
     assert "40 %" in text
     assert "tilt 30 deg" in text

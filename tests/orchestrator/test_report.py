@@ -5,23 +5,33 @@ from __future__ import annotations
 import io
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.collections import PathCollection
+from matplotlib.text import Text
 from rich.console import Console
 
 from actors.protocols import SimulationResult
 from orchestrator.report import figures as figures_module
+from orchestrator.report import maps as maps_module
 from orchestrator.report.campaign import draw_figures
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
 from orchestrator.report.maps import SurrogatePicture, draw_surrogate
-from orchestrator.report.results import calibration_picture, deployment_picture, discrepancy_groups, evaluation_of
+from orchestrator.report.results import (
+    calibration_picture,
+    deployment_picture,
+    discrepancy_groups,
+    evaluation_of,
+    pour_series,
+)
 from orchestrator.report.scene import _moments, simulation_png
 from orchestrator.report.section import place, section
 from orchestrator.report.style import display_value, display_values
-from orchestrator.report.summary import summarise, summary_table, write_summary
+from orchestrator.report.summary import print_summary, summarise, summary_table, write_summary
 from orchestrator.report.units import loss_unit
 from orchestrator.strategies.calibration import ContinuousBayesianCalibration
 from orchestrator.strategies.deployment_d3 import Hybrid
@@ -64,8 +74,6 @@ def results() -> dict[str, dict[str, Any]]:
 
 
 def _with_height(plan: Any) -> Any:
-    from dataclasses import replace
-
     return replace(plan, scene=replace(plan.scene, fixed={"height": 0.05}))
 
 
@@ -89,14 +97,14 @@ def is_picture(path: Path) -> bool:
 
 def test_run_gets_every_figure_that_its_results_allow(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
     drawn = draw_figures(tmp_path / "figures", watched.campaign(), results)
-    assert set(drawn) == {"discrepancy map", "test discrepancy", "spillage against pours", "loss map narrow cup"}
+    assert set(drawn) == {"discrepancy map", "test discrepancy", "spillage against pours", "loss map narrow"}
     assert all(is_picture(path) for path in drawn.values())
 
 
 def test_unfinished_run_gets_the_figures_it_can(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
     assert draw_figures(tmp_path, watched.campaign(), {}) == {}
     only_pours = draw_figures(tmp_path, watched.campaign(), {"narrow cup": results["narrow cup"]})
-    assert set(only_pours) == {"spillage against pours", "loss map narrow cup"}
+    assert set(only_pours) == {"spillage against pours", "loss map narrow"}
 
 
 def test_a_figure_that_fails_does_not_take_the_others_with_it(
@@ -117,6 +125,86 @@ def test_discrepancy_map_shows_every_useful_trial_and_theta_in_percent(results: 
     assert list(picture.costs) == [100 * t["discrepancy"] for t in result["trials"] if t["discrepancy"] is not None]
     assert picture.mean is not None
     assert np.allclose(picture.mean, 100 * np.array(result["map"]["mean"]))
+
+
+def in_three_axes(results: dict[str, dict[str, Any]]) -> tuple[Any, dict[str, Any]]:
+    """A plan that searches friction too, and what its calibration gave: a map over particles and cohesion."""
+    plan = watched.campaign()
+    assert plan.calibration is not None
+    box = Space((*watched.THETA.axes, Axis("friction", 0.0, 0.5)))
+    result = results["calibration"]
+    trials = [{**t, "theta": {**t["theta"], "friction": 0.1}} for t in result["trials"]]
+    cut = {**result["map"], "over": ["particles", "friction"], "held": {"cohesion": 0.04}}
+    cut["axes"] = {"particles": cut["axes"]["particles"], "friction": list(np.linspace(0.0, 0.5, 30))}
+    theta = {**result["theta"], "friction": 0.2, "cohesion": 0.04}
+    plan = replace(plan, calibration=replace(plan.calibration, parameters=box))
+    return plan, {**result, "trials": trials, "map": cut, "theta": theta}
+
+
+def test_map_of_three_parameters_says_where_the_third_was_held_and_marks_theta(
+    results: dict[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, result = in_three_axes(results)
+    drawn: list[Any] = []
+    monkeypatch.setattr(maps_module.style, "save", lambda figure, path: drawn.append(figure) or path)
+    picture = calibration_picture(plan, result)
+    assert picture is not None
+    draw_surrogate(tmp_path / "map.png", picture)
+    said = {text.get_text() for text in drawn[0].findobj(Text)}
+    assert "number of particles" in said
+    assert "wall friction" in said
+    assert any(text.startswith("others at θ*: cohesion 0.04 N/m") for text in said)
+    scatters = [c for c in drawn[0].axes[0].collections if isinstance(c, PathCollection)]
+    star = next(c for c in scatters if len(c.get_offsets()) == 1 and c.get_sizes()[0] > 300)
+    assert star.get_offsets()[0].tolist() == pytest.approx([result["theta"]["particles"], 0.2])
+    dots = next(c for c in scatters if len(c.get_offsets()) == len(picture.points))
+    assert dots.get_offsets()[0].tolist() == pytest.approx([picture.points[0]["particles"], 0.1])
+
+
+def test_three_parameters_get_their_trials_against_each_of_them_as_well(
+    results: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    plan, result = in_three_axes(results)
+    drawn = draw_figures(tmp_path, plan, {"calibration": result})
+    assert {name: path.name for name, path in drawn.items()} == {
+        "discrepancy map": "discrepancy-map.png",
+        "discrepancy trials": "discrepancy-trials.png",
+    }
+    assert all(is_picture(path) for path in drawn.values())
+
+
+def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
+    results: dict[str, dict[str, Any]],
+) -> None:
+    plan, deployed = watched.campaign(), dict(results["narrow cup"])
+    deployed |= {"predicted_loss": -0.013, "predicted_deviation": 0.014}
+    deployed["pours"] = [{**p, "predicted": -0.02, "predicted_deviation": 0.01} for p in deployed["pours"]]
+    deployed["map"] = {**deployed["map"], "mean": (np.array(deployed["map"]["mean"]) - 0.5).tolist()}
+    summary = summarise(plan, {"narrow cup": deployed})
+    assert summary["receivers"]["narrow cup"]["predicted_loss"] == -0.013
+    assert "0.00 ± 1.40 %" in shown(summary_table(plan, summary))
+    assert "-" not in loss_unit(Loss()).text(-0.013, 0.014)
+    assert pour_series(plan, {"narrow cup": deployed}, loss_unit(Loss()))[0].predicted == [(0.0, 1.0)] * 4
+    picture = deployment_picture(plan, deployed)
+    assert picture is not None
+    assert picture.mean is not None
+    assert picture.mean.min() == 0.0
+
+
+def test_receivers_are_called_by_their_own_name_unless_two_share_it(
+    results: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    plan = watched.campaign()
+    assert plan.deployment is not None
+    deployed = {"narrow cup": results["narrow cup"]}
+    assert draw_figures(tmp_path, plan, deployed)["loss map narrow"].name == "loss-map-narrow.png"
+    assert pour_series(plan, deployed, loss_unit(Loss()))[0].receiver == "narrow (D3)"
+    text = shown(summary_table(plan, summarise(plan, deployed)))
+    assert "narrow " in text
+    assert "narrow cup" not in text
+    low = replace(watched.NARROW, name="low", fixed={"height": 0.02})
+    twins = replace(plan, deployment=replace(plan.deployment, scenes=(watched.NARROW, low)))
+    assert pour_series(twins, deployed, loss_unit(Loss()))[0].receiver == "narrow cup (D3)"
 
 
 def test_loss_map_numbers_its_pours_as_the_log_does(results: dict[str, dict[str, Any]]) -> None:
@@ -260,6 +348,35 @@ def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_ev
     assert "the simulator may not fit this vessel" in text
     assert "2 pour(s) failed" in text
     assert "lacks 12 events" in text
+
+
+def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results: dict[str, dict[str, Any]]) -> None:
+    plan = watched.campaign()
+    planned = {**results["narrow cup"], "strategy": "D1", "pours": []}
+    nothing = {split: {"mean_predictor": None, "regression": None} for split in ("train", "test", "transfer")}
+    text = shown(summary_table(plan, summarise(plan, {"narrow cup": planned}, baselines=nothing)))
+    assert "best expected" in text
+    assert display_values(planned["action_si"]) in text
+    for absent in ("pours", "first", "best measured", "mean |measured", "—"):
+        assert absent not in text
+    fruitless = {**planned, "predicted_loss": None, "action_si": None}
+    text = shown(summary_table(plan, summarise(plan, {"narrow cup": fruitless})))
+    assert "best expected" not in text
+    assert "narrow: nothing was learnt" in text
+
+
+def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
+    results: dict[str, dict[str, Any]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    plan = watched.campaign()
+    recording = Path("/laboratory") / "a-folder-with-a-rather-long-name" / ("x" * 120) / "campaign.rrd"
+    summary = summarise(plan, {"narrow cup": results["narrow cup"]}, recording=recording)
+    print_summary(plan, summary)
+    lines = capsys.readouterr().err.splitlines()
+    assert any(line.endswith(str(recording)) for line in lines)
+    action = display_values(results["narrow cup"]["action_si"])
+    assert any("narrow" in line and "D3" in line and action in line for line in lines)
 
 
 def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:

@@ -173,6 +173,15 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
     yield CampaignClosed(time=now, state="finished", results={})
 
 
+def three_parameters() -> Iterator[Event]:
+    """An answer about three parameters, mapped over particles and friction."""
+    box = Space((*THETA.axes, Axis("friction", 0.0, 0.5)))
+    question = SuggestProblem(box, Data(((0.2, 0.9, 0.3, 0.5, 0.5),), (0.2,)), map_resolution=9)
+    cut = replace(surrogate(), axes=("particles", "friction"), at=(0.3, 0.4, 0.7))
+    answer = Suggestion(((0.3, 0.4, 0.7),), (0.1,), (0.02,), surrogate=cut)
+    yield RequestFinished(time=1e6, stage="calibration", id=1, request=Suggest(question), outcome=Suggested(answer))
+
+
 def _answered(stage: str, key: int, question: SuggestProblem, now: float) -> RequestFinished:
     answer = Suggestion(((0.5, 0.5),), (0.1,), (0.02,), surrogate=surrogate())
     return RequestFinished(time=now, stage=stage, id=key, request=Suggest(question), outcome=Suggested(answer))
