@@ -198,16 +198,15 @@ def run_in_front_of_people(
 
 
 def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finished:
-    from rich.console import Console
-
     from orchestrator.report.campaign import draw_figures
-    from orchestrator.report.summary import summarise, summary_table, write_summary
+    from orchestrator.report.summary import print_summary, summarise, write_summary
 
     evaluation = result.results.get("evaluation", {})
-    baselines = {
-        split: {name: evaluation.get(name, {}).get(split) for name in ("mean_predictor", "regression")}
-        for split in ("train", "test", "transfer")
-    }
+    baselines: dict[str, dict[str, float | None]] = {}
+    for name in ("mean_predictor", "regression"):
+        for split, value in evaluation.get(name, {}).items():
+            if value is not None:
+                baselines.setdefault(split, {})[name] = value
     figures = (
         draw_figures(result.directory / "figures", plan, result.results, baselines=baselines)
         if (plan.outputs.figures)
@@ -229,7 +228,7 @@ def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finishe
         },
     )
     write_summary(result.directory, summary)
-    Console(stderr=True).print(summary_table(plan, summary))
+    print_summary(plan, summary)
     return Finished(result, summary, figures, recording)
 
 
