@@ -31,6 +31,14 @@ Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar=
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the newest unfinished run of this campaign.")]
 RunId = Annotated[str | None, typer.Option("--run", help="With --resume: the run, by its folder's name.")]
+Answer = Annotated[
+    str | None,
+    typer.Option(
+        help="With --resume: what came of the pour that was under way: 'lost', 'weighed 3.2 0.4' (g spilled, g "
+        "retained), or on the virtual bench 'repeat'.",
+        show_default=False,
+    ),
+]
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
 ]
@@ -66,6 +74,7 @@ def run(
     campaign: Campaign,
     resume: Resume = False,
     run_id: RunId = None,
+    answer: Answer = None,
     in_process: InProcess = False,
     as_json: Json = False,
 ) -> None:
@@ -75,7 +84,7 @@ def run(
     """
     from orchestrator.commands import campaigns
 
-    _call(campaigns.run, campaign, resume=resume, run_id=run_id, in_process=in_process, as_json=as_json)
+    _call(campaigns.run, campaign, resume=resume, run_id=run_id, answer=answer, in_process=in_process, as_json=as_json)
 
 
 @app.command(
@@ -88,6 +97,7 @@ def calibrate(
     campaign: Campaign,
     resume: Resume = False,
     run_id: RunId = None,
+    answer: Answer = None,
     in_process: InProcess = False,
     as_json: Json = False,
 ) -> None:
@@ -97,7 +107,15 @@ def calibrate(
     """
     from orchestrator.commands import campaigns
 
-    _call(campaigns.calibrate, campaign, resume=resume, run_id=run_id, in_process=in_process, as_json=as_json)
+    _call(
+        campaigns.calibrate,
+        campaign,
+        resume=resume,
+        run_id=run_id,
+        answer=answer,
+        in_process=in_process,
+        as_json=as_json,
+    )
 
 
 @app.command(

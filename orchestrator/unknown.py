@@ -118,7 +118,7 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
 async def _ask(
     ask: AskOperator | None, question: str, options: Sequence[str], loaded: float, on_waiting: Callable[[str], None]
 ) -> tuple[str, Outcome | None]:
-    how = f"Resume with one of these answers: {'; '.join(options)} (masses in grams)"
+    how = f"Resume with one of these answers: {'; '.join(options)} (masses in grams), for example --answer lost"
     if ask is None:
         raise OperatorNeededError(f"{question} Nobody is here to be asked. {how}")
     on_waiting(question)

@@ -25,16 +25,18 @@ if TYPE_CHECKING:
 THETA_FILE = "theta.json"
 
 
-def run(path: Path, *, resume: bool, run_id: str | None, in_process: bool, as_json: bool) -> None:
+def run(path: Path, *, resume: bool, run_id: str | None, answer: str | None, in_process: bool, as_json: bool) -> None:
     """The whole campaign."""
     plan = read_campaign(path)
     check_campaign_can_run(plan)
-    finished = _run(plan, "run", path, resume, run_id, in_process, None)
+    finished = _run(plan, "run", path, resume, run_id, answer, in_process, None)
     if as_json:
         print_json({"run": finished.result.directory.name, **finished.summary})
 
 
-def calibrate(path: Path, *, resume: bool, run_id: str | None, in_process: bool, as_json: bool) -> None:
+def calibrate(
+    path: Path, *, resume: bool, run_id: str | None, answer: str | None, in_process: bool, as_json: bool
+) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
     from orchestrator.stages import calibration_stages
 
@@ -45,7 +47,7 @@ def calibrate(path: Path, *, resume: bool, run_id: str | None, in_process: bool,
     stages = calibration_stages(plan.calibration)
     plan = dataclasses.replace(plan, deployment=None)
     check_campaign_can_run(plan)
-    finished = _run(plan, "calibrate", path, resume, run_id, in_process, stages)
+    finished = _run(plan, "calibrate", path, resume, run_id, answer, in_process, stages)
     if as_json:
         print_json(calibration_json(finished))
 
@@ -172,12 +174,17 @@ def _run(
     path: Path,
     resume: bool,
     run_id: str | None,
+    answer: str | None,
     in_process: bool,
     stages: list[StageDefinition] | None,
 ) -> Finished:
+    if answer is not None and not resume:
+        raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
     directory = _run_directory(plan, resume=resume, run_id=run_id)
     again = f"decant {verb} {path} --resume --run {directory.name}"
-    finished = run_in_front_of_people(plan, directory, resume=resume, stages=stages, in_process=in_process, again=again)
+    finished = run_in_front_of_people(
+        plan, directory, resume=resume, stages=stages, in_process=in_process, again=again, answer=answer
+    )
     calibrated = finished.result.results.get("calibration")
     if calibrated is not None:
         content = json.dumps({"theta": calibrated["theta"]}, indent=2) + "\n"

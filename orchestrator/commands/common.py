@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from orchestrator.campaign import CampaignResult
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
+    from orchestrator.unknown import AskOperator
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 """Exit codes beside 0 (done) and 3 (a person has to answer; `RunError.exit_code`)."""
@@ -138,6 +139,7 @@ def run_in_front_of_people(
     stages: Sequence[StageDefinition] | None = None,
     in_process: bool = False,
     again: str,
+    answer: str | None = None,
 ) -> Finished:
     """Run a campaign with a live display, a recording, figures and a summary.
 
@@ -146,6 +148,7 @@ def run_in_front_of_people(
         stages: in place of the plan's.
         in_process: everything in this process, without Ray (slower; for debugging).
         again: the command that resumes, for the message after an interruption.
+        answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
 
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.
@@ -179,7 +182,7 @@ def run_in_front_of_people(
                     directory,
                     resume=resume,
                     watchers=watchers,
-                    ask_operator=_ask_on_terminal if sys.stdin.isatty() else None,
+                    ask_operator=_operator(answer),
                     stages=chosen,
                 )
 
@@ -254,6 +257,13 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], again:
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.remove_signal_handler(number)
+
+
+def _operator(answer: str | None) -> AskOperator | None:
+    """Who is asked about a pour whose outcome is unknown: the command line, the terminal, or nobody."""
+    if answer is not None:
+        return lambda question, options: answer
+    return _ask_on_terminal if sys.stdin.isatty() else None
 
 
 async def _ask_on_terminal(question: str, options: Sequence[str]) -> str:

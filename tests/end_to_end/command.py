@@ -68,9 +68,8 @@ class Workplace:
         process = self.start(*arguments)
         with ended(process):
             self.await_journal(when, process)
-            if number != signal.SIGKILL:
-                process.send_signal(signal.SIGCONT)
             process.send_signal(number)
+            process.send_signal(signal.SIGCONT)
             _, errors = process.communicate(timeout=PATIENCE)
         return process, errors
 
@@ -118,7 +117,7 @@ class Workplace:
         end = time.monotonic() + 30.0
         while (left := self.leftovers()) and time.monotonic() < end:
             time.sleep(0.2)
-        assert left == []
+        assert not left, f"left behind: {left}"
 
     def close(self) -> None:
         """Remove the temporary folder, with processes that a failed test has left."""

@@ -104,7 +104,7 @@ def recording(path: Path) -> dict[str, int]:
     return rows
 
 
-def test_killed_in_a_pour_and_again_in_calibration_it_ends_as_if_undisturbed(
+def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undisturbed(
     workplace: Workplace, undisturbed: Finished
 ) -> None:
     def in_second_pour(entries: list[Entry]) -> bool:
@@ -115,19 +115,43 @@ def test_killed_in_a_pour_and_again_in_calibration_it_ends_as_if_undisturbed(
     workplace.assert_nothing_is_left()
     assert pour_under_way(workplace.entries())
 
+    assert_a_person_is_asked(workplace)
+
     def in_calibration(entries: list[Entry]) -> bool:
         return finished_in("calibration", entries) >= 4 and not closed("calibration", entries)
 
-    workplace.interrupt(in_calibration, signal.SIGKILL, *RESUME)
+    workplace.interrupt(in_calibration, signal.SIGKILL, *RESUME, "--answer", "repeat")
+    workplace.assert_nothing_is_left()
+
+    small.write_campaign(workplace.folder)
+    workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGKILL, *RESUME)
     workplace.assert_nothing_is_left()
 
     result = workplace.finish(*RESUME)
     assert_same_run(workplace, undisturbed)
     attempts = [e.body["attempt"] for e in workplace.entries() if e.kind == Kind.POUR_STARTED]
-    assert attempts == [1, 1, 2, 1, 1, 1]
+    assert attempts == [1, 1, 2, 1, 1, 2, 1]
     assert result["receivers"] == undisturbed.summary["receivers"]
     assert recording(Path(result["recording"]))["/pours/deployment-narrow/measured"] >= 2
     workplace.assert_nothing_is_left()
+
+
+def assert_a_person_is_asked(place: Workplace) -> None:
+    """Unless the campaign says that such pours are repeated."""
+    small.write_campaign(place.folder, small.CAMPAIGN.replace("on_unknown: repeat", "on_unknown: ask"))
+    before = len(place.entries())
+    process = place.start(*RESUME)
+    with ended(process):
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 3
+    assert "pour 2 of stage pours" in errors
+    assert "what came of it?" in errors
+    assert "for example --answer lost" in errors
+    assert all(entry.kind == Kind.CAMPAIGN_STATE for entry in place.entries()[before:])
+
+
+def pouring_into_the_narrow_cup(entries: list[Entry]) -> bool:
+    return finished_in("deployment:narrow", entries) > 0 and pour_under_way(entries)
 
 
 def closed(stage: str, entries: list[Entry]) -> bool:
@@ -135,9 +159,6 @@ def closed(stage: str, entries: list[Entry]) -> bool:
 
 
 def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Workplace, undisturbed: Finished) -> None:
-    def pouring_into_the_narrow_cup(entries: list[Entry]) -> bool:
-        return finished_in("deployment:narrow", entries) > 0 and pour_under_way(entries)
-
     process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
@@ -160,8 +181,8 @@ def test_a_simulator_killed_under_way_is_replaced_and_nobody_notices(
     with ended(process):
         workplace.await_journal(lambda entries: finished_in("calibration", entries) >= 3, process)
         victims = simulators(process)
-        assert len(victims) >= 2
-        for victim in victims[:2]:
+        assert len(victims) == 2 + 1, "two simulators and the bench's liquid"
+        for victim in victims:
             os.kill(victim.pid, signal.SIGKILL)
         process.send_signal(signal.SIGCONT)
         output, errors = process.communicate(timeout=240)

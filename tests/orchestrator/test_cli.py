@@ -127,6 +127,7 @@ BAD: dict[str, str] = {
     "run small.yaml --resume": "no unfinished run of campaign 'small'; begin one without --resume",
     "run small.yaml --resume --run nope": "runs/nope: no such run; known: none",
     "run small.yaml --run nope": "--run nope: goes with --resume",
+    "run small.yaml --answer lost": "--answer 'lost': goes with --resume",
     "plan small.yaml --parameters misspelt-theta.yaml": "misspelt-theta.yaml:1:9: theta.cohesoin: unknown key; did you",
     "plan small.yaml --parameters wild-theta.json": "theta.cohesion: 50 N/m is outside 0 … 0.2 N/m",
     "plan small.yaml --parameters list-theta.json": "should be a mapping with keys such as particles",
