@@ -4,8 +4,8 @@ Walls enter as the kernel's integral over a half-space at the wall's distance, s
 them and feels their pressure. Part of the multipliers is kept from step to step (warm start), which helps to carry a
 resting column; keeping all of them would integrate the error a third time and swing up.
 
-Pairs are visited once and add to both of their particles. Such sums are written out (a = a + b): Taichi turns += on a field
-into an atomic operation, four times slower.
+Pairs are visited once and add to both of their particles. Such sums are written out (a = a + b): Taichi turns += on a
+field into an atomic operation, which made a pour four times slower.
 
 Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chentanez 2016 (accumulated multipliers); wall
 integral: after Bender et al. 2019 (volume maps), here with the analytic half-space. Limitations: concave corners see
@@ -25,13 +25,11 @@ RELAXATION = 0.4
 
 
 @ti.func
-def measure(f: ti.template(), s):
-    """Density and constraint gradients of all particles → change of their multipliers."""
+def measure_first(f: ti.template(), s):
+    """Density of all particles and, for the whole step, what their constraints' gradients amount to."""
     d = f.spacing[s]
-    h = SUPPORT * d
-    inv_h = 1.0 / h
-    volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
-    scale = volume * inv_h * inv_h
+    inv_h = 1.0 / (SUPPORT * d)
+    scale = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING * inv_h * inv_h
     for i in range(f.moving[s]):
         f.density[s, i] = 1.0  # W(0) of the particle itself
         f.gradient[s, i] = ti.Vector([0.0, 0.0, 0.0])
@@ -59,20 +57,49 @@ def measure(f: ti.template(), s):
         f.gradient[s, i] = f.gradient[s, i] + total
         f.squares[s, i] = f.squares[s, i] + squares
     for i in range(f.moving[s]):
-        rho = f.density[s, i] * volume
         total = -scale * f.gradient[s, i]
-        squares = scale * scale * f.squares[s, i]
+        for b in ti.static(range(VESSELS)):
+            q = f.phi[s, i][b] * inv_h - f.wall_shift[s]
+            if q < 1.0:
+                n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
+                total -= wall_slope(q) * inv_h * n
+        f.squares[s, i] = scale * scale * f.squares[s, i] + total.dot(total) + 0.05 * inv_h * inv_h
+
+
+@ti.func
+def measure(f: ti.template(), s):
+    """Density of all particles."""
+    inv_h = 1.0 / (SUPPORT * f.spacing[s])
+    for i in range(f.moving[s]):
+        f.density[s, i] = 1.0
+    for i in range(f.moving[s]):
+        xi = f.x[s, i]
+        rho = ti.cast(0.0, ti.f32)
+        for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
+            j = f.neighbour[s, k]
+            r = xi - f.x[s, j]
+            w = weight(ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0))
+            rho += w
+            f.density[s, j] = f.density[s, j] + w
+        f.density[s, i] = f.density[s, i] + rho
+
+
+@ti.func
+def multiply(f: ti.template(), s):
+    """Change of all multipliers, from the measured density and the walls' share."""
+    d = f.spacing[s]
+    inv_h = 1.0 / (SUPPORT * d)
+    volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
+    for i in range(f.moving[s]):
+        rho = f.density[s, i] * volume
         for b in ti.static(range(VESSELS)):
             q = f.phi[s, i][b] * inv_h - f.wall_shift[s]
             if q < 1.0:
                 rho += wall_density(q)
-                n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
-                total -= wall_slope(q) * inv_h * n
         f.density[s, i] = rho
         # C is dimensionless, its gradients 1/m: multipliers are m².
-        c = (rho - 1.0) / (squares + total.dot(total) + 0.05 * inv_h * inv_h)
         before = f.pressure[s, i]
-        after = ti.max(before + RELAXATION * c, 0.0)
+        after = ti.max(before + RELAXATION * (rho - 1.0) / f.squares[s, i], 0.0)
         f.pressure[s, i] = after
         f.dp[s, i] = after - before
 

@@ -11,6 +11,9 @@ import taichi as ti
 from sim_engine.fluid.kernels import attraction, weight
 from sim_engine.fluid.state import SUPPORT
 
+LARGEST_PULL = 0.1
+"""Cohesion moves a particle by at most so many spacings in a step: a strong tension at fine spacing stays stable."""
+
 
 @ti.func
 def interact(f: ti.template(), s, dt):
@@ -45,6 +48,9 @@ def interact(f: ti.template(), s, dt):
         f.dv[s, i] = f.dv[s, i] + pull
     relax = 1.0 - ti.exp(-f.viscosity[s] * dt)
     strength = f.attraction[s] * dt
+    bound = LARGEST_PULL * f.spacing[s] / dt
     for i in range(f.moving[s]):
+        pull = strength * f.dv[s, i]
+        pull *= ti.min(1.0, bound / (pull.norm() + 1e-9))
         # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
-        f.v[s, i] = f.v[s, i] + (relax / ti.max(f.squares[s, i], 1.0) * f.dx[s, i] + strength * f.dv[s, i])
+        f.v[s, i] = f.v[s, i] + relax / ti.max(f.squares[s, i], 1.0) * f.dx[s, i] + pull

@@ -32,7 +32,7 @@ class FluidState:
         phi, normal: signed distance to each vessel [m] at the last look, linearised in between; its gradient.
         push: normal displacement given by each wall in this step [m].
         home: see `ParticleState`; `name`: index before any sorting.
-        gradient, squares: sums over pairs for the density constraint.
+        gradient, squares: Σ∇W and what the constraint's gradients amount to, Σ|∇C|².
         first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
     """
 
@@ -87,5 +87,6 @@ class FluidState:
         self.grid_size = ti.Vector.field(3, ti.i32, shape=(scenes, VESSELS))
         self.grid_origin = ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS))
         self.grid_spacing = ti.field(ti.f32, shape=(scenes, VESSELS))
+        self.swing = ti.field(ti.f32, shape=scenes)  # farthest that the pourer carries a point in this step [m]
         self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]

@@ -8,25 +8,30 @@ Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 
 import taichi as ti
 
-from sim_engine.fluid.density import displace, measure
+from sim_engine.fluid.density import displace, measure, measure_first, multiply
 from sim_engine.fluid.forces import interact
 from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.state import VESSELS, FluidState, ParticleState
-from sim_engine.fluid.walls import FAR, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
+from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
 
 GRAVITY = 9.81
-CFL = 1.0
+CFL = 1.2
 """Largest displacement per step, in spacings."""
-LONGEST_STEP = 3e-3
+LONGEST_STEP = 4e-3
+PACE = 0.18
+"""… and the longest step in units of √(d/g): in a longer one gravity presses layers together faster than the iterations
+part them."""
 SHORTEST_STEP = 1e-4
 ITERATIONS = 3
 SKIN = 0.3
 """Neighbour lists reach that many spacings beyond the support, so that they last for several steps …"""
 SHORT_SKIN = 0.03
 """… unless somebody moves so fast that they would not."""
+SWING_ARM = 0.5
+"""Liquid is never farther from the pourer's origin than this [m]."""
 CONTACT = 0.2
 """Particles' centres keep that many spacings from solid; the density constraint keeps about half a spacing."""
-WARM = 0.5
+WARM = 0.6
 """Share of the last step's multipliers that a step starts with."""
 
 IN_POURER, IN_FLIGHT, RECEIVED, SPILLED, ESCAPED = (int(s) for s in ParticleState)
@@ -87,9 +92,9 @@ class Stepper:
             v = f.v[s, i]
             v[2] -= GRAVITY * dt
             x = x0 + dt * v
-            reach = 2.0 * clear + dt * v.norm() + 2.0 * f.spacing[s]
+            # φ is that of the end of the last step: solid farther off than the way can't be met.
+            reach = STRETCH * (dt * v.norm() + f.swing[s]) + 2.0 * clear
             for b in range(VESSELS):
-                # φ is a step old: everything that can have changed since is within `reach`.
                 if f.phi[s, i][b] < reach:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
@@ -142,8 +147,12 @@ class Stepper:
             f.dp[s, i] = f.pressure[s, i]
         displace(f, s)
         self.apply(s)
-        for _ in range(ITERATIONS):
-            measure(f, s)
+        for n in range(ITERATIONS):
+            if n == 0:
+                measure_first(f, s)
+            else:
+                measure(f, s)
+            multiply(f, s)
             displace(f, s)
             self.apply(s)
 
@@ -156,18 +165,25 @@ class Stepper:
         for i in range(f.moving[s]):
             x = f.x[s, i]
             x0 = f.x0[s, i]
+            reach = STRETCH * ((x - x0).norm() + f.swing[s]) + d
             for b in range(VESSELS):
-                if f.phi[s, i][b] < 3.0 * d:
+                if f.phi[s, i][b] < reach:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
-                    y = swept(f, grids, s, b, y0, y1, 0.5 * clear)
+                    y = y1
                     look = distance_and_gradient(f, grids, s, b, y)
+                    risky = look[3] < STRETCH * (y1 - y0).norm()
+                    if risky:
+                        y = swept(f, grids, s, b, y0, y1, 0.5 * clear)
+                        look = distance_and_gradient(f, grids, s, b, y)
                     n = ti.Vector([look[0], look[1], look[2]])
+                    phi = look[3]
                     push = f.push[s, i][b]
-                    if look[3] < clear and look[3] > 0.0:
-                        y += (clear - look[3]) * n
-                        push += clear - look[3]
-                    if push > 0.0 and look[3] < 1.5 * d:
+                    if phi < clear and phi > 0.0:
+                        y += (clear - phi) * n
+                        push += clear - phi
+                        phi = clear
+                    if push > 0.0 and phi < 1.5 * d:
                         # Coulomb: the wall, which moves with the vessel's frame, holds back at most μ times its push.
                         way = y - y0
                         along = way - way.dot(n) * n
@@ -176,9 +192,11 @@ class Stepper:
                             y -= along * ti.min(f.friction[s] * push / length, 1.0)
                     if (y - y1).norm_sqr() > 0.0:
                         x = to_world(f, s, b, y)
-                    if crossed(f, grids, s, b, y0, y) == 1:
-                        f.home[s, i] = ESCAPED
-                        f.stale[s] = 1
+                    f.phi[s, i][b] = phi
+                    if risky:
+                        if crossed(f, grids, s, b, y0, y) == 1:
+                            f.home[s, i] = ESCAPED
+                            f.stale[s] = 1
             f.x[s, i] = x
             v = (x - x0) / dt
             f.v[s, i] = v
@@ -229,13 +247,17 @@ class Stepper:
         """One time step of one scene."""
         f = self.state
         fastest = self.top_speed(s)
-        dt = ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), LONGEST_STEP)
+        longest = ti.min(LONGEST_STEP, PACE * ti.sqrt(f.spacing[s] / GRAVITY))
+        dt = ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), longest)
         ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)
         f.dt[s] = dt
         f.origin0[s, 0] = f.origin[s, 0]
         f.turn0[s, 0] = f.turn[s, 0]
         f.time[s] += dt
         self.place_pourer(s, f.time[s], poses)
+        # No point within SWING_ARM of the pourer's origin is carried farther than this in the step.
+        turned = f.turn[s, 0] - f.turn0[s, 0]
+        f.swing[s] = (f.origin[s, 0] - f.origin0[s, 0]).norm() + turned.norm() * SWING_ARM
         self.predict(s, dt, grids)
         if f.stale[s] == 1:
             skin = SKIN

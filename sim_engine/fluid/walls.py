@@ -21,10 +21,10 @@ LIP_DROP = 1.5
 """Rims are lower for particles by so many spacings: thrice a half, see above."""
 
 LIP_BLEND = 6.0
-"""… which builds up over so many spacings below the rim; it stretches distances by up to 1 + LIP_DROP / LIP_BLEND."""
+"""… which builds up over so many spacings below the rim."""
 
-STRIDE = 0.8
-"""Sphere tracing takes this part of a distance, for that stretch."""
+STRETCH = 1.0 + LIP_DROP / LIP_BLEND
+"""Largest gradient of the stretched distance: what is nearer than STRETCH times a way may be met on it."""
 
 
 @ti.func
@@ -151,8 +151,8 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
         length = way.norm()
         phi = distance(f, grids, s, b, y)
         if stride == 0:
-            clear = ti.min(clear, 0.9 * STRIDE * ti.max(phi, 0.0))
-        free = STRIDE * phi - clear
+            clear = ti.min(clear, 0.9 / STRETCH * ti.max(phi, 0.0))
+        free = phi / STRETCH - clear
         if length <= free or length < 1e-9:
             y += way
             leg = 2
