@@ -119,7 +119,8 @@ def test_map_of_two_out_of_three_parameters_is_a_cut_with_the_trials_projected_o
     # (0.2, 0.9, 0.3) of the unit cube on a map of the first and third axis, 9 × 9 cells of 16 pixels
     first = contents.values("/maps/calibration/mean/observed", "Points2D:positions")[0][0]  # type: ignore[index]
     assert first == pytest.approx([16 * (0.5 + 0.2 * 8), 16 * 9 - 16 * (0.5 + 0.3 * 8)], abs=1e-3)
-    page = str(contents.values("/state", "TextDocument:text")[-1])
+    page = contents.values("/state", "TextDocument:text")[-1][0]  # type: ignore[index]
+    assert r"| \|measured − simulated\| spillage [%]: mean" in page, "the bars would end the table's cell"
     assert "to the right particles 500 … 4 000, upwards friction 0 … 0.5; others at cohesion 0.04 N/m" in page
 
 
