@@ -1,5 +1,8 @@
 """Taichi's start and end, and the arrays of one process. The only place that calls `ti.init`."""
 
+import contextlib
+import io
+
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
@@ -24,14 +27,16 @@ class FluidEngine:
     """One scene's arrays, loaded and advanced from Python. One per process (`engine()`)."""
 
     def __init__(self) -> None:
-        ti.init(
-            arch=ti.cpu,
-            cpu_max_num_threads=1,
-            offline_cache=True,
-            offline_cache_file_path=str(cache_directory() / "kernels"),
-            log_level=ti.ERROR,
-            enable_fallback=False,
-        )
+        # Taichi says on which architecture it starts, on stdout, which is for results alone.
+        with contextlib.redirect_stdout(io.StringIO()):
+            ti.init(
+                arch=ti.cpu,
+                cpu_max_num_threads=1,
+                offline_cache=True,
+                offline_cache_file_path=str(cache_directory() / "kernels"),
+                log_level=ti.ERROR,
+                enable_fallback=False,
+            )
         self.state = FluidState(1, CAPACITY)
         self.stepper = Stepper(self.state)
         self._grids = np.zeros(0, np.float32)
