@@ -44,7 +44,7 @@ def main(run: Path) -> None:
     for strip in strips:
         canvas.paste(strip, (0, top))
         top += strip.height
-    canvas.quantize(128).save(ROOT / "docs/images/quickstart.png", optimize=True)
+    canvas.save(ROOT / "docs/images/quickstart.png", optimize=True)
 
 
 def _strip(pictures: list[Image.Image]) -> Image.Image:

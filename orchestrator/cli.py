@@ -166,6 +166,10 @@ def simulate(
     parameters: Parameters = None,
     receiver: Receiver = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the initial positions.")] = 0,
+    scene: Annotated[
+        str | None,
+        typer.Option(help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),
+    ] = None,
     as_json: Json = False,
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
     png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
@@ -184,6 +188,7 @@ def simulate(
         parameters=parameters,
         receiver=receiver,
         seed=seed,
+        scene_name=scene,
         as_json=as_json,
         rrd=rrd,
         png=png,

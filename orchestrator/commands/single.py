@@ -32,6 +32,7 @@ def simulate(
     parameters: Path | None,
     receiver: Path | None,
     seed: int,
+    scene_name: str | None,
     as_json: bool,
     rrd: Path | None,
     png: Path | None,
@@ -52,7 +53,7 @@ def simulate(
         vessel = None if receiver is None else load_vessel(receiver)
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
-    scene, space = scene_to_simulate(plan)
+    scene, space = scene_to_simulate(plan, scene_name)
     if vessel is not None:
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     try:
@@ -97,12 +98,27 @@ def simulate(
         raise RefusalError(f"this outcome must not be used: {outcome.invalid}", FAILED)
 
 
-def scene_to_simulate(plan: CampaignPlan) -> tuple[Scene, Space]:
-    """The campaign's scene with its searched actions: deployment's first, else calibration's."""
+def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scene, Space]:
+    """A scene of the campaign with its searched actions: the one named, else deployment's first, else calibration's.
+
+    Args:
+        name: 'calibration', 'transfer', or a receiver's name.
+
+    Raises:
+        RefusalError: the campaign has no such scene.
+    """
+    scenes: dict[str, tuple[Scene, Space]] = {}
     if plan.deployment is not None:
-        return plan.deployment.scenes[0], plan.deployment.actions
-    assert plan.calibration is not None, "a campaign calibrates or deploys"
-    return plan.calibration.scene, plan.calibration.actions
+        scenes |= {scene.receiver.name: (scene, plan.deployment.actions) for scene in plan.deployment.scenes}
+    if plan.calibration is not None:
+        scenes["calibration"] = plan.calibration.scene, plan.calibration.actions
+        if plan.calibration.transfer is not None:
+            scenes["transfer"] = plan.calibration.transfer.scene, plan.calibration.actions
+    if name is None:
+        return next(iter(scenes.values()))
+    if name not in scenes:
+        raise RefusalError(f"--scene {name}: the campaign has no such scene; there are {', '.join(scenes)}", BAD_INPUT)
+    return scenes[name]
 
 
 def _show(task: Any, run: Any, rrd: Path | None, png: Path | None) -> None:
