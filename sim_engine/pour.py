@@ -176,6 +176,7 @@ class PourSimulator:
             viscosity=parameters.viscosity,
             friction=parameters.friction,
             wall_distance=parameters.wall_distance,
+            lip_drop=parameters.lip_drop,
             grids=[pourer.grid, receiver.grid],
             masks=[self._masks[scene.pourer], self._masks[scene.receiver]],
             walls=[pourer.wall_thickness, receiver.wall_thickness],

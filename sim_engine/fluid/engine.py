@@ -52,6 +52,7 @@ class FluidEngine:
         viscosity: float,
         friction: float,
         wall_distance: float,
+        lip_drop: float,
         grids: list[SignedDistanceGrid],
         masks: list[NDArray[np.uint8]],
         walls: list[float],
@@ -70,6 +71,7 @@ class FluidEngine:
             viscosity: XSPH rate [1/s].
             friction: Coulomb coefficient.
             wall_distance: where liquid comes to rest before a wall, in spacings.
+            lip_drop: rims are lower for particles by so many spacings, at most `LARGEST_LIP_DROP`.
             grids, masks, walls, rims: of pourer and receiver; a mask is 1 where a particle counts as inside; thinnest
                 wall [m]; height of the lip in the vessel's frame [m].
             receiver_at: (3,) [m].
@@ -83,6 +85,7 @@ class FluidEngine:
             raise ValueError(f"{count} particles; at most {f.capacity}")
         f.particles[0], f.spacing[0] = count, spacing
         f.attraction[0], f.viscosity[0], f.friction[0] = pair_acceleration, viscosity, friction
+        f.lip_drop[0] = lip_drop
         f.wall_shift[0] = (wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
         offset = 0
         for b in range(VESSELS):

@@ -2,8 +2,8 @@
 
 Particles' centres stand half a spacing off the solid, the liquid's surface stands half a spacing above the topmost
 centres, and of the layer on top half a spacing, in the mean, is too little to flow: a lip would hold back one and a
-half spacings of liquid too much. So for particles every rim is lowered by as much: the grid is looked up a little
-higher, by an offset that grows from nothing to `LIP_DROP` over the uppermost spacings.
+half spacings of liquid too much. So for particles every rim is lowered by as much (θ's `lip_drop`): the grid is looked
+up a little higher, by an offset that grows from nothing to that over the uppermost spacings.
 
 A thin wall can't hold water by its distance alone: a particle that steps over the middle of the wall is pushed out on
 the far side. So every step is also swept: the particle's path in the vessel's own frame (which includes the vessel's
@@ -12,18 +12,17 @@ motion) is traced through the grid, and stops where it meets solid.
 
 import taichi as ti
 
+from sim_engine.liquid import LARGEST_LIP_DROP
+
 FAR = 1.0
 """Distance [m] reported beyond a grid."""
 
 TRACE_STEPS = 24
 
-LIP_DROP = 1.5
-"""Rims are lower for particles by so many spacings: thrice a half, see above."""
-
 LIP_BLEND = 6.0
-"""… which builds up over so many spacings below the rim."""
+"""The lowering of a rim builds up over so many spacings below it."""
 
-STRETCH = 1.0 + LIP_DROP / LIP_BLEND
+STRETCH = 1.0 + LARGEST_LIP_DROP / LIP_BLEND
 """Largest gradient of the stretched distance: what is nearer than STRETCH times a way may be met on it."""
 
 
@@ -31,8 +30,9 @@ STRETCH = 1.0 + LIP_DROP / LIP_BLEND
 def look_up(f: ti.template(), s, b, y):
     """Where the grid is read for a point of the vessel frame."""
     d = f.spacing[s]
-    part = ti.min(ti.max((y[2] - f.rim[s, b]) / (LIP_BLEND * d) + 1.0 + LIP_DROP / LIP_BLEND, 0.0), 1.0)
-    return ti.Vector([y[0], y[1], y[2] + LIP_DROP * d * part])
+    drop = f.lip_drop[s]
+    part = ti.min(ti.max((y[2] - f.rim[s, b]) / (LIP_BLEND * d) + 1.0 + drop / LIP_BLEND, 0.0), 1.0)
+    return ti.Vector([y[0], y[1], y[2] + drop * d * part])
 
 
 @ti.func
