@@ -11,3 +11,7 @@ class RunError(Exception):
     """
 
     exit_code = 1
+
+
+class LearningError(RunError):
+    """What was weighed and simulated is not enough to learn from; the text says what is missing."""

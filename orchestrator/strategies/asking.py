@@ -6,20 +6,18 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from orchestrator.errors import LearningError
 from orchestrator.requests import Failed, Outcome, Suggest, Suggested
 from orchestrator.strategies.seeds import SeedStream
 
-MAX_ATTEMPTS = 3
-
 
 class Questions:
-    """Suggest requests with the continuation of each. One that fails is asked again with another seed, boundedly."""
+    """Suggest requests with the continuation of each."""
 
     def __init__(self, seeds: SeedStream) -> None:
         self._seeds = seeds
         self._unissued: list[Suggest] = []
         self._then: dict[Suggest, Callable[[Suggestion], None]] = {}
-        self._attempts = 0
 
     def put(self, problem: SuggestProblem, purpose: str, then: Callable[[Suggestion], None]) -> None:
         """Queue a question; its seed is drawn here."""
@@ -42,17 +40,12 @@ class Questions:
 
         Raises:
             ValueError: it was not asked for.
-            RuntimeError: the optimiser failed repeatedly: without it there is nothing sensible to try.
+            LearningError: there is no answer: without one there is nothing sensible to try.
         """
         then = self._then.pop(request, None)
         if then is None:
             raise ValueError(f"this question was not asked, or has been answered already (purpose {request.purpose!r})")
-        if isinstance(outcome, Suggested):
-            self._attempts = 0
-            then(outcome.suggestion)
-            return
-        self._attempts += 1
-        reason = outcome.reason if isinstance(outcome, Failed) else f"unexpected outcome {type(outcome).__name__}"
-        if self._attempts >= MAX_ATTEMPTS:
-            raise RuntimeError(f"the optimiser failed {self._attempts} times in a row on {request.purpose!r}: {reason}")
-        self.put(request.problem, request.purpose, then)
+        if not isinstance(outcome, Suggested):
+            reason = outcome.reason if isinstance(outcome, Failed) else f"unexpected outcome {type(outcome).__name__}"
+            raise LearningError(f"the optimiser has no answer to {request.purpose!r}: {reason}")
+        then(outcome.suggestion)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
+from orchestrator.errors import LearningError
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.strategies.asking import Questions
@@ -58,14 +59,15 @@ class ContinuousBayesianCalibration:
         """Plan the campaign; only pours of the split 'train' are used.
 
         Raises:
-            ValueError: fewer than two usable pours, or no budget.
+            LearningError: fewer than two usable pours.
+            ValueError: no budget, or no such averaging.
         """
         train = [pour for pour in measured if pour.split == "train"]
         usable = [pour for pour in train if pour.spillage is not None]
         if len(usable) < 2:
-            raise ValueError(
+            raise LearningError(
                 f"calibration needs at least 2 training pours with ≥ {MINIMUM_POURED:.0%} poured, got {len(usable)} "
-                f"of {len(train)}"
+                f"of {len(train)}; make more pours, or let them tilt farther (max_angle)"
             )
         if plan.simulations < 1:
             raise ValueError(f"calibration needs a budget of simulations, got {plan.simulations}")
@@ -127,7 +129,10 @@ class ContinuousBayesianCalibration:
                 if likely is None or likely.predictions[i] - likely.prediction_deviations[i] >= MINIMUM_POURED
             ][: self._plan.simulations]
             if not keep:
-                raise RuntimeError("at no action of the calibration's space would 5 % of the liquid be poured")
+                raise LearningError(
+                    f"at no action of the calibration's space would {MINIMUM_POURED:.0%} of the liquid be poured, as "
+                    "far as the weighed pours tell; let it tilt farther (max_angle)"
+                )
             # few places may be left where c_r is defined: they are used again
             order = [keep[i % len(keep)] for i in range(self._plan.simulations)]
             self._actions = tuple(sequence[i] for i in order)
@@ -216,7 +221,7 @@ class ContinuousBayesianCalibration:
 
     def _conclude(self, suggestion: Suggestion) -> None:
         if not suggestion.means:
-            raise RuntimeError(
+            raise LearningError(
                 f"calibration learnt nothing: of {self._trials.answered} simulations {self._trials.lost} gave no "
                 "discrepancy (see their reasons in the journal)"
             )

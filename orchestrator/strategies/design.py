@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,12 +196,3 @@ class DesignedPours:
                 }
             )
         return {"pours": rows}
-
-
-def measured_from_result(scene: Scene, result: Mapping[str, Any]) -> tuple[MeasuredPour, ...]:
-    """The weighed pours of a `DesignedPours.result()`, as read back from the journal."""
-    return tuple(
-        MeasuredPour(scene.action(row["action_si"]), row["spillage"], row["poured"], row["split"])
-        for row in result["pours"]
-        if "poured" in row
-    )

@@ -4,16 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from orchestrator.errors import LearningError
 from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
+from orchestrator.stages import POURS, measured_pours
 from orchestrator.strategies.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.design import (
-    DesignedPours,
-    MeasuredPour,
-    choose_holdout,
-    measured_from_result,
-    stratified,
-)
+from orchestrator.strategies.design import DesignedPours, MeasuredPour, choose_holdout, stratified
 from orchestrator.strategies.evaluation import Evaluation, ScoredPour, random_parameters
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
@@ -98,7 +94,8 @@ def test_a_stratum_without_a_possible_action_is_given_up_with_its_reason():
 def test_weighed_pours_survive_the_journal():
     design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 6, 1, 1)
     Play(weighed)(design)
-    assert measured_from_result(SCENE, design.result()) == design.measured
+    read_back = measured_pours(calibration_plan(), {POURS: design.result()})
+    assert tuple(scored.pour for scored in read_back) == design.measured
 
 
 def test_holding_everything_back_is_refused():
@@ -180,7 +177,7 @@ def test_pours_too_small_for_a_spillage_are_left_out_and_their_actions_not_simul
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=30), pours, 1)
     simulations = Play(calibration_spill)(strategy).simulations
     assert np.mean([is_poured(r.action) for r in simulations]) > 0.9
-    with pytest.raises(ValueError, match="at least 2 training pours"):
+    with pytest.raises(LearningError, match="at least 2 training pours"):
         ContinuousBayesianCalibration(calibration_plan(), [MeasuredPour(pours[0].action, None, 0.0)] * 5, 1)
 
 
@@ -252,22 +249,21 @@ def test_those_who_watch_get_a_map_about_every_ten_simulations_and_replay_asks_f
     assert replay(fresh, played) == played.asked
 
 
-def test_an_optimiser_that_keeps_failing_stops_the_calibration_with_its_reason():
+def test_without_an_answer_of_the_optimiser_calibration_stops_with_its_reason():
     def broken(request):
         return Failed("optimizer", "out of memory") if isinstance(request, Suggest) else None
 
-    with pytest.raises(RuntimeError, match="out of memory"):
+    with pytest.raises(LearningError, match="out of memory"):
         Play(calibration_spill, answer=broken)(ContinuousBayesianCalibration(calibration_plan(), measured(), 1))
 
 
-def test_an_optimiser_that_fails_once_is_asked_again():
-    failures = iter([Failed("optimizer", "its process died")])
-
-    def shaky(request):
-        return next(failures, None) if isinstance(request, Suggest) else None
+def test_simulations_that_all_fail_end_the_calibration_with_a_reason_and_not_a_traceback():
+    def hopeless(request):
+        return Failed("simulation", "leaked") if isinstance(request, Simulate) else None
 
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=6), measured(), 1)
-    assert len(Play(calibration_spill, answer=shaky)(strategy).simulations) == 6
+    with pytest.raises(LearningError, match="6 simulations 6 gave no discrepancy"):
+        Play(calibration_spill, answer=hopeless)(strategy)
 
 
 # -- scores --------------------------------------------------------------------------------------------------------
