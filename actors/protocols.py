@@ -5,7 +5,7 @@ All are asynchronous; none of them knows what a strategy is.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -144,6 +144,3 @@ class Laboratory(Protocol):
     async def __aenter__(self) -> Laboratory: ...
 
     async def __aexit__(self, *exc: object) -> None: ...
-
-
-Closer = Callable[[], Awaitable[None]]

@@ -233,7 +233,10 @@ def _start_keeper(session: _Session, spec: LaboratorySpec) -> None:
     session.keeper = threading.Thread(target=_keep, args=(session, spec), name="ray-keeper", daemon=True)
     session.keeper.start()
     if not session.ready.wait(START_DEADLINE):
-        raise LaboratoryError(f"Ray did not start within {START_DEADLINE:.0f} s; its logs are in {session.folder}")
+        raise LaboratoryError(
+            f"Ray did not start within {START_DEADLINE:.0f} s; is this machine busy, or short of memory? Try again, or "
+            "do without Ray (--in-process)"
+        )
     if session.failure is not None:
         raise session.failure
 

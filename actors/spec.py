@@ -14,8 +14,9 @@ class LaboratorySpec:
     Attributes:
         simulators: size of the pool; 0: one per core.
         bench: None where the laboratory can't pour.
-        mode: 'virtual' (this issue's only one), later 'hardware'.
-        object_store_mb, backend: Ray's and Taichi's settings.
+        mode: 'virtual', the only one yet.
+        in_process: everything in threads of one process, without Ray.
+        object_store_mb: Ray's shared memory for results [MiB]; Ray takes no less than 80.
     """
 
     name: str

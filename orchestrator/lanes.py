@@ -35,7 +35,8 @@ class Deadlines:
     Attributes:
         simulate: time in the pool's queue included. A pour of 50 000 particles takes minutes on one core; half an
             hour means that the pool is dead, not slow.
-        suggest: a fit to some hundred points takes seconds.
+        suggest: a fit to some hundred points takes seconds. Longer than the optimiser's own deadline with all retries
+            (`actors.optimizer.actor`), since only those replace a process that hangs.
         pour: 90 s in a laboratory, but an operator may be fetched from another room first. After it the outcome is
             not waited for and the pour counts as failed.
         pour_grace: how long a pause waits for a pour that has begun.
@@ -43,7 +44,7 @@ class Deadlines:
     """
 
     simulate: float = 1800.0
-    suggest: float = 300.0
+    suggest: float = 2000.0
     pour: float = 3600.0
     pour_grace: float = 300.0
     cleanup: float = 20.0

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from actors.spec import LaboratorySpec
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
+from sim_engine.losses import MINIMUM_POURED, Loss
 from sim_engine.space import Space
 from sim_engine.task import Scene
 
@@ -33,10 +33,14 @@ class RecordedPour:
     split: str
 
     @property
+    def poured_fraction(self) -> float:
+        """Poured over loaded."""
+        return self.poured / (self.poured + self.retained)
+
+    @property
     def normalised_spillage(self) -> float | None:
-        """r = spilled / poured, None below 5 % poured."""
-        loaded = self.poured + self.retained
-        return None if self.poured < 0.05 * loaded else self.spilled / self.poured
+        """r = spilled / poured, None where too little was poured for it."""
+        return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,7 @@ class CalibrationPlan:
         simulations: budget of the strategy.
         random_baseline: how many random θ are scored for comparison.
         initial: random θ before the surrogate takes over.
+        kappa: κ of the lower confidence bound.
     """
 
     strategy: CalibrationName
@@ -101,6 +106,8 @@ class DeploymentPlan:
         pours: real pours per scene (D1: 1).
         per_pour: simulations told to the strategy between two pours (D3); None: as many as the wall clock allows.
         mean: prior mean of D2's surrogate: 'constant' or 'zero' (the paper's).
+        kappa: κ of the lower confidence bound.
+        initial: actions drawn evenly before the surrogate takes over.
         on_failed_pour: how a failed pour enters the data.
     """
 
@@ -121,7 +128,14 @@ class DeploymentPlan:
 
 @dataclass(frozen=True)
 class OutputPlan:
-    """What is written beside the journal."""
+    """What is written beside the journal.
+
+    Attributes:
+        directory: in which each run gets a folder.
+        rrd, figures: whether the recording, the figures are made.
+        record_rate: frames of a recorded simulation per simulated second [1/s]; 0 records none.
+        recorded_simulations: how many of a stage keep their frames.
+    """
 
     directory: Path
     rrd: bool = True

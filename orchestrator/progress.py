@@ -6,6 +6,7 @@ at most one every two seconds.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -168,7 +169,7 @@ class ProgressDisplay:
         fraction = 0.0 if progress is None else progress.fraction
         note = [f"{100 * fraction:3.0f} %", f"{max(time.time() - pour.started_at, 0.0):.1f} s"]
         if progress is not None and progress.tilt is not None:
-            note.append(f"tilt {progress.tilt * 57.29577951:.0f} deg")
+            note.append(f"tilt {math.degrees(progress.tilt):.0f} deg")
         if progress is not None and progress.balance is not None:
             note.append(f"balance {progress.balance * 1e3:.1f} g")
         table = Table.grid(padding=(0, 2))

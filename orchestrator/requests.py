@@ -89,7 +89,7 @@ class Failed:
     declared lost by the operator.
 
     Attributes:
-        kind: 'invalid_action', 'simulation', 'pour_unknown', 'pour_failed', 'optimizer'.
+        kind: 'invalid_action', 'simulation', 'pour_unknown' or 'pour_failed'.
         reason: for people.
     """
 

@@ -157,11 +157,8 @@ class Tally:
             case Simulate():
                 self.running.add(event.id)
             case Pour() as pour:
-                space = self.plan.deployment
-                if is_calibration(self.plan, pour) and self.plan.calibration is not None:
-                    names = self.plan.calibration.actions.names
-                else:
-                    names = space.actions.names if space is not None else ("angular_velocity", "x_offset")
+                section = self.plan.calibration if is_calibration(self.plan, pour) else self.plan.deployment
+                names = section.actions.names if section is not None else ("angular_velocity", "x_offset")
                 predicted = ""
                 if pour.predicted is not None:
                     unit = unit_of_pour(self.plan, pour)

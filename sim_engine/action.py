@@ -139,11 +139,15 @@ class Action:
         return replace(self, **changes)  # type: ignore[arg-type]
 
     def display(self, *names: str) -> str:
-        """Named dimensions in the units that people read, e.g. 'angular_velocity 41.2 deg/s  x_offset 104 mm'."""
-        parts = []
-        for name in names or tuple(ACTION_DIMENSIONS):
-            value, dimension = getattr(self, name), ACTION_DIMENSIONS[name]
-            parts.append(
-                f"{name} —" if value is None else f"{name} {value / dimension.factor:.4g} {dimension.display_unit}"
-            )
-        return "  ".join(parts)
+        """Named dimensions, or all of them, in the units that people read; see `described`."""
+        return described({name: getattr(self, name) for name in names or ACTION_DIMENSIONS})
+
+
+def described(values: Mapping[str, float | None]) -> str:
+    """Action dimensions [SI] in the units that people read: 'angular_velocity 41.2 deg/s  x_offset 104 mm'."""
+    parts = []
+    for name, value in values.items():
+        dimension = ACTION_DIMENSIONS[name]
+        shown = "—" if value is None else f"{value / dimension.factor:.4g} {dimension.display_unit}"
+        parts.append(f"{name} {shown}")
+    return "  ".join(parts)

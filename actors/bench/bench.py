@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
@@ -252,6 +253,6 @@ def _measurement(loaded: float, spilled: float, retained: float, executed: Execu
             "mode": "virtual",
             "readings_g": {"loaded": 1e3 * loaded, "spilled": 1e3 * spilled, "retained": 1e3 * retained},
             "executed_s": float(executed.times[-1]),
-            "largest_tilt_deg": float(max(executed.motion.tilt(executed.times)) * 57.29577951308232),
+            "largest_tilt_deg": math.degrees(max(executed.motion.tilt(executed.times))),
         },
     )

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -153,8 +153,6 @@ def run_in_front_of_people(
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.
     """
-    import dataclasses
-
     from actors.laboratory import open_laboratory
     from actors.protocols import LaboratoryError
     from orchestrator.campaign import run_campaign
@@ -165,7 +163,7 @@ def run_in_front_of_people(
     from orchestrator.stages import stages_of
 
     chosen = tuple(stages_of(plan) if stages is None else stages)
-    spec = dataclasses.replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
+    spec = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
     say(f"run {directory}  ({spec.mode} bench)" if any(s.pours for s in chosen) else f"run {directory}")
     monitor: RerunMonitor | None = None
     try:
@@ -210,11 +208,9 @@ def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finishe
         for split, value in evaluation.get(name, {}).items():
             if value is not None:
                 baselines.setdefault(split, {})[name] = value
-    figures = (
-        draw_figures(result.directory / "figures", plan, result.results, baselines=baselines)
-        if (plan.outputs.figures)
-        else {}
-    )
+    figures = {}
+    if plan.outputs.figures:
+        figures = draw_figures(result.directory / "figures", plan, result.results, baselines=baselines)
     recording = monitor.path if monitor is not None else None
     summary = summarise(
         plan,

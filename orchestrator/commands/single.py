@@ -40,7 +40,7 @@ def simulate(
     """One pour in the simulator of this process."""
     from rich.console import Console
 
-    from orchestrator.config.assignments import AssignmentError, assigned_action
+    from orchestrator.config.assignments import assigned_action
     from orchestrator.config.check import check_vessels
     from orchestrator.config.errors import ConfigError, shown_path
     from orchestrator.config.load import load_parameters, load_vessel
@@ -58,8 +58,6 @@ def simulate(
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     try:
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
-    except AssignmentError as error:
-        raise RefusalError(f"--set: {error}", BAD_INPUT) from None
     except ValueError as error:
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
     check_output(rrd, "--rrd", ".rrd")

@@ -21,9 +21,10 @@ from orchestrator.requests import (
 )
 from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.costs import Costing
-from orchestrator.strategies.display import described_action, displayed_action, displayed_map
+from orchestrator.strategies.display import displayed_action, displayed_map
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.trials import Trial, Trials
+from sim_engine.action import described
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
@@ -157,7 +158,7 @@ class Deployment:
         self._pours.append(trial)
         action = self._scene.action(values)
         self._queued_pour = Pour(self._scene.name, action, trial.number, self._seeds.next(), prediction)
-        text = f"pour {trial.number}/{self._plan.pours}  {described_action(dict(values), self._plan.actions.names)}"
+        text = f"pour {trial.number}/{self._plan.pours}  {described(values)}"
         if prediction is None:
             self.decisions.append(Decision(text))
         else:
@@ -194,7 +195,7 @@ class Deployment:
         self._finished = True
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
-        text = f"{what}  {described_action(dict(values), self._plan.actions.names)}"
+        text = f"{what}  {described(values)}"
         if suggestion.means:
             mean, deviation = suggestion.means[index], suggestion.deviations[index]
             self.decisions.append(
@@ -246,7 +247,7 @@ class Deployment:
         values = self.best_values
         if values is not None and self._final is not None:
             result |= {
-                "action": displayed_action(dict(values)),
+                "action": displayed_action(values),
                 "action_si": values,
                 "predicted_loss": self._final.best_mean,
                 "predicted_deviation": self._final.best_deviation,
@@ -260,7 +261,7 @@ class Deployment:
             "number": trial.number,
             "status": trial.status,
             "reason": trial.reason,
-            "action": displayed_action(dict(trial.values)),
+            "action": displayed_action(trial.values),
             "action_si": trial.values,
             "predicted": None if trial.predicted is None else trial.predicted.mean,
             "predicted_deviation": None if trial.predicted is None else trial.predicted.deviation,

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from actors.optimizer.core.problem import Point
 from orchestrator.plan import RecordedPour
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
-from orchestrator.strategies.display import described_action, displayed_action
+from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.seeds import SeedStream
-from sim_engine.action import Action
+from sim_engine.action import Action, described
 from sim_engine.losses import normalised_spillage
 from sim_engine.space import Space
 from sim_engine.task import Scene
@@ -41,9 +41,7 @@ class MeasuredPour:
     @classmethod
     def from_record(cls, record: RecordedPour) -> MeasuredPour:
         """From a row of a file of recorded pours."""
-        return cls(
-            record.action, record.normalised_spillage, record.poured / (record.poured + record.retained), record.split
-        )
+        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split)
 
 
 @dataclass(frozen=True)
@@ -144,8 +142,7 @@ class DesignedPours:
         )
         self.decisions.append(
             Decision(
-                f"calibration pour {self._current + 1}/{len(self._planned)} ({planned.split}): "
-                f"{described_action(values, self._actions.names)}"
+                f"calibration pour {self._current + 1}/{len(self._planned)} ({planned.split}): {described(values)}"
             )
         )
         return [self._pouring]

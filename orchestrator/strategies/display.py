@@ -20,17 +20,6 @@ def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | No
     return shown
 
 
-def described_action(values: Mapping[str, float | None], names: tuple[str, ...]) -> str:
-    """For a log line: 'angular_velocity 41.2 deg/s  x_offset 104 mm'."""
-    parts = []
-    for name in names:
-        value, dimension = values[name], ACTION_DIMENSIONS[name]
-        parts.append(
-            f"{name} —" if value is None else f"{name} {value / dimension.factor:.4g} {dimension.display_unit}"
-        )
-    return "  ".join(parts)
-
-
 def displayed_map(surrogate: SurrogateMap | None, space: Space) -> dict[str, object] | None:
     """A surrogate over two axes, with their values [SI]: row i of mean and deviation is the second axis' i-th value.
 
