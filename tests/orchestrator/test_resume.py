@@ -9,8 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,80 +16,13 @@ from typing import Any
 import pytest
 
 from actors.spec import LaboratorySpec
-from orchestrator.codec import decode_outcome, encode_outcome
-from orchestrator.errors import RunError
 from orchestrator.events import Event, RequestFinished, StageClosed
-from orchestrator.journal import JOURNAL_NAME, Journal, JournalError, JournalLockedError, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, JournalError, JournalLockedError, JournalReader, Kind
 from orchestrator.replay import ReplayError
-from orchestrator.requests import Failed, Poured
-from orchestrator.runs import RunNotFoundError, create_run, find_run
 from orchestrator.stages import StageDefinition
-from orchestrator.unknown import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
 from tests.orchestrator import toy
-from tests.orchestrator.toy import ToyLaboratory, ToyStrategy, answering, logical_record, run_toy, toy_plan, toy_stages
-
-SMALL = toy_stages(simulations=3, pours=2, beside=2)
-
-
-def run(directory: Path, laboratory: ToyLaboratory | None = None, **arguments: Any) -> Any:
-    arguments.setdefault("stages", SMALL)
-    arguments.setdefault("plan", toy_plan(directory, on_unknown="repeat"))
-    return asyncio.run(run_toy(directory, laboratory, **arguments))
-
-
-def killed_at(point: int, *, after_commit: bool, directory: Path, resume: bool = False) -> bool:
-    """Run in a child process that SIGKILLs itself at its `point`-th write; True if it got that far.
-
-    The child is forked, because starting a hundred interpreters would take minutes.
-    """
-    child = os.fork()
-    if child == 0:
-        try:
-            _die_at(point, after_commit)
-            run(directory, resume=resume)
-            os._exit(0)
-        except BaseException:
-            import traceback
-
-            traceback.print_exc()
-            os._exit(1)
-    _, status = os.waitpid(child, 0)
-    assert os.WIFSIGNALED(status) or os.WEXITSTATUS(status) == 0, "the child failed in another way than planned"
-    return os.WIFSIGNALED(status)
-
-
-def _die_at(point: int, after_commit: bool) -> None:
-    write, count = Journal.append_all, 0
-
-    def dying(self: Journal, drafts: Any) -> None:
-        nonlocal count
-        count += 1
-        if count == point and not after_commit:
-            os.kill(os.getpid(), signal.SIGKILL)
-        write(self, drafts)
-        if count == point:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    Journal.append_all = dying  # type: ignore[method-assign]
-
-
-def killed_when_last(kind: Kind, parent: Path, earliest: int = 10) -> Path:
-    """Directory of a run that died right after an entry of that kind was written."""
-    for point in range(earliest, 100):
-        directory = parent / f"point-{point}"
-        assert killed_at(point, after_commit=True, directory=directory)
-        with JournalReader(directory / JOURNAL_NAME) as journal:
-            *_, last = journal.entries()
-        simulated = kind is not Kind.FINISHED or last.body.get("outcome", {}).get("type") == "Simulated"
-        if last.kind == kind and simulated:
-            return directory
-    raise AssertionError(f"no run ended in {kind}")
-
-
-def finished_times(directory: Path) -> Counter[int]:
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        kinds = [Kind.FINISHED, Kind.POUR_FINISHED]
-        return Counter(entry.body["id"] for entry in journal.entries(kinds=kinds))
+from tests.orchestrator.killed import SMALL, finished_times, killed_at, killed_when_last, run
+from tests.orchestrator.toy import ToyLaboratory, ToyStrategy, logical_record, toy_plan, toy_stages
 
 
 @pytest.mark.parametrize("after_commit", [False, True], ids=["before the write", "after the write"])
@@ -236,6 +167,16 @@ def test_completion_order_is_replayed_exactly(tmp_path: Path) -> None:
         assert set(finished_times(directory).values()) == {1}
 
 
+def test_drafts_of_a_dead_process_leave_no_half_answers(tmp_path: Path) -> None:
+    """An ask and the requests it brought are one entry: a replay never meets one without the other."""
+    directory = tmp_path / "run"
+    run(directory)
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        times = {e.body["id"]: e.t for e in journal.entries(kinds=[Kind.REQUESTED])}
+        for entry in journal.entries(kinds=[Kind.ASKED]):
+            assert all(times[key] == entry.t for key in entry.body["ids"])
+
+
 # -- what must not be resumed ------------------------------------------------------------------------------------------
 
 
@@ -274,168 +215,3 @@ def test_a_new_run_never_writes_over_an_old_one(tmp_path: Path) -> None:
     with pytest.raises(JournalError, match="holds a run already"):
         run(tmp_path / "run")
     assert logical_record(tmp_path / "run") == before
-
-
-# -- unknown pours -----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def unknown(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Path]:
-    """Directories of runs that died while a pour was under way."""
-
-    def make() -> Path:
-        return killed_when_last(Kind.POUR_STARTED, tmp_path_factory.mktemp("unknown"))
-
-    return make
-
-
-def asking(directory: Path, **changes: Any) -> Any:
-    return toy_plan(directory, on_unknown="ask", **changes)
-
-
-def test_an_unknown_pour_is_put_to_the_operator(unknown: Callable[[], Path]) -> None:
-    directory = unknown()
-    questions: list[tuple[str, tuple[str, ...]]] = []
-
-    def operator(question: str, options: Any) -> str:
-        questions.append((question, tuple(options)))
-        return ["no idea", "weighed 3.2 g 0.5 g"][len(questions) - 1]
-
-    events: list[Event] = []
-    run(directory, resume=True, plan=asking(directory), ask_operator=operator, watchers=[events.append])
-    assert "pour 1 of stage first (angular_velocity" in questions[0][0]
-    assert "what came of it?" in questions[0][0]
-    assert questions[0][1] == (REPEAT, LOST, WEIGHED)
-    assert "'no idea' is no answer" in questions[1][0]
-    first = next(e.outcome for e in events if isinstance(e, RequestFinished) and hasattr(e.request, "number"))
-    assert isinstance(first, Poured)
-    assert (first.measurement.loaded, first.measurement.spilled) == (0.2, pytest.approx(0.0032))
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        assert [e.body["answer"] for e in journal.entries(kinds=[Kind.OPERATOR_ANSWERED])] == ["weighed 3.2 g 0.5 g"]
-        reached = [e.body["after"] for e in journal.entries(kinds=[Kind.CAMPAIGN_STATE])]
-    assert reached[2:] == ["unknown", "preparing", "waiting for operator", "preparing", "running", "finished"]
-
-
-def test_without_an_operator_it_stops_with_exit_code_3_and_says_how_to_answer(unknown: Callable[[], Path]) -> None:
-    directory, laboratory = unknown(), ToyLaboratory()
-    with pytest.raises(OperatorNeededError, match="Resume with one of these answers: repeat; lost; weighed") as caught:
-        run(directory, laboratory, resume=True, plan=asking(directory))
-    assert caught.value.exit_code == 3
-    assert laboratory.simulators.tasks == []
-    assert run(directory, resume=True, plan=asking(directory), ask_operator=answering("lost")).state == "finished"
-
-
-def test_a_pour_repeated_on_the_virtual_bench_is_the_same_pour(unknown: Callable[[], Path], tmp_path: Path) -> None:
-    directory = unknown()
-    run(directory, resume=True, plan=asking(directory), ask_operator=answering("repeat"))
-    run(tmp_path / "undisturbed")
-    assert logical_record(directory) == logical_record(tmp_path / "undisturbed")
-
-
-def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
-    """Neither by the plan nor by the operator."""
-    hardware = {"laboratory": LaboratorySpec("toy", mode="hardware")}
-
-    def laboratory() -> ToyLaboratory:
-        return ToyLaboratory(bench=toy.ToyBench(lambda: 60.0, mode="hardware"))
-
-    async def abandon(directory: Path) -> None:
-        def watch(event: Event) -> None:
-            if type(event).__name__ == "PourProgressed":
-                loop.call_soon(task.cancel)
-                loop.call_later(0.02, task.cancel)
-
-        loop, plan = asyncio.get_running_loop(), asking(directory, **hardware)
-        task = asyncio.create_task(run_toy(directory, laboratory(), plan=plan, stages=SMALL, watchers=[watch]))
-        with pytest.raises(asyncio.CancelledError):
-            await task
-
-    directory = tmp_path / "run"
-    asyncio.run(abandon(directory))
-    with pytest.raises(RunError, match="'on_unknown: repeat' is for the virtual bench only"):
-        run(directory, resume=True, plan=replace(asking(directory, **hardware), on_unknown="repeat"))
-    offered: list[tuple[str, ...]] = []
-
-    def operator(question: str, options: Any) -> str:
-        offered.append(tuple(options))
-        return "repeat"
-
-    with pytest.raises(OperatorNeededError):
-        run(directory, resume=True, plan=asking(directory, **hardware), ask_operator=operator)
-    assert set(offered) == {(LOST, WEIGHED)}
-
-
-@pytest.mark.parametrize(
-    ("answer", "complaint"),
-    [
-        ("", "is no answer"),
-        ("repeat", "is no answer"),
-        ("weighed", "two masses"),
-        ("weighed 1", "two masses"),
-        ("weighed one two", "numbers in grams"),
-        ("weighed -1 0", "don't fit a load"),
-        ("weighed 150 60", "don't fit a load of 200 g"),
-        ("weighed nan 0", "don't fit a load"),
-    ],
-)
-def test_an_answer_that_makes_no_sense_is_explained(answer: str, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
-        parse_answer(answer, (LOST, WEIGHED), 0.2)
-
-
-def test_sensible_answers_are_understood() -> None:
-    assert parse_answer(" Lost ", (LOST, WEIGHED), 0.2) == Failed("pour_unknown", "declared lost by the operator")
-    assert parse_answer("repeat", (REPEAT, LOST), 0.2) is None
-    outcome = parse_answer("weighed 3.5 1.5 180", (LOST, WEIGHED), 0.2)
-    assert isinstance(outcome, Poured)
-    measurement = outcome.measurement
-    assert (measurement.loaded, measurement.spilled, measurement.retained) == pytest.approx((0.18, 0.0035, 0.0015))
-    assert decode_outcome(encode_outcome(outcome)) == outcome
-
-
-# -- run directories ---------------------------------------------------------------------------------------------------
-
-
-def test_run_directories_count_up_and_the_newest_unfinished_one_is_resumed(tmp_path: Path) -> None:
-    plan = toy_plan(tmp_path / "runs", on_unknown="repeat")
-    with pytest.raises(RunNotFoundError, match="no unfinished run of campaign 'toy'"):
-        find_run(plan)
-    finished, older, newer = (create_run(plan) for _ in range(3))
-    assert [p.name.rsplit("-", 1)[1] for p in (finished, older, newer)] == ["1", "2", "3"]
-    for directory in (older, newer, finished):
-        fork = os.fork()
-        if fork == 0:
-            if directory is not finished:
-                _die_at(20, after_commit=True)
-            asyncio.run(run_toy(directory, plan=plan, stages=SMALL))
-            os._exit(0)
-        os.waitpid(fork, 0)
-    assert find_run(plan) == newer
-    assert find_run(plan, run_id=older.name) == older
-    with pytest.raises(RunNotFoundError, match=r"no such run; known: toy-\d+-1, "):
-        find_run(plan, run_id="nonsense")
-    other = replace(plan, seed=8)
-    assert find_run(other) == newer  # so that resuming it can say what differs
-    asyncio.run(run_toy(newer, plan=plan, stages=SMALL, resume=True))
-    assert find_run(plan) == older
-
-
-def test_what_reproduces_a_run_is_kept_with_it(tmp_path: Path) -> None:
-    import json
-
-    run(tmp_path / "run", plan=toy_plan(tmp_path, resolved={"name": "toy", "seed": 7}))
-    assert json.loads((tmp_path / "run" / "resolved.json").read_text()) == {"name": "toy", "seed": 7}
-    versions = json.loads((tmp_path / "run" / "versions.json").read_text())
-    assert versions["seed"] == 7
-    assert versions["python"] == sys.version.split()[0]
-    assert {"numpy", "taichi", "ray", "decant"} <= set(versions["packages"])
-
-
-def test_drafts_of_a_dead_process_leave_no_half_answers(tmp_path: Path) -> None:
-    """An ask and the requests it brought are one entry: a replay never meets one without the other."""
-    directory = tmp_path / "run"
-    run(directory)
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        times = {e.body["id"]: e.t for e in journal.entries(kinds=[Kind.REQUESTED])}
-        for entry in journal.entries(kinds=[Kind.ASKED]):
-            assert all(times[key] == entry.t for key in entry.body["ids"])

@@ -11,30 +11,14 @@ from typing import Any
 
 import pytest
 
-from actors.protocols import Frames, InvalidActionError, LaboratoryError, SimulationError
-from orchestrator.errors import RunError
-from orchestrator.events import (
-    CampaignClosed,
-    DecisionMade,
-    Event,
-    LogLine,
-    PourProgressed,
-    RequestFinished,
-    RequestStarted,
-    StageClosed,
-)
-from orchestrator.flights import is_recorded
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
+from orchestrator.events import Event, LogLine, PourProgressed, RequestFinished
 from orchestrator.lanes import Deadlines, LaneError
-from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Slots
+from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.scheduler import StrategyError
-from orchestrator.stages import StageDefinition, stage_seed
-from orchestrator.states import RESTING, TRANSITIONS, State, TransitionError, check_transition
 from sim_engine.task import PourTask
+from tests.orchestrator.scripted import Script, one_stage, pour, run, simulate, states
 from tests.orchestrator.toy import (
-    SCENE,
-    SPACE,
-    THETA,
     ToyBench,
     ToyLaboratory,
     ToyOptimizer,
@@ -45,65 +29,7 @@ from tests.orchestrator.toy import (
     run_toy,
     slow_laboratory,
     toy_plan,
-    toy_stages,
 )
-
-
-def run(directory: Path, laboratory: ToyLaboratory | None = None, **arguments: Any) -> Any:
-    return asyncio.run(run_toy(directory, laboratory, **arguments))
-
-
-def states(directory: Path) -> list[str]:
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        entries = [entry.body for entry in journal.entries(kinds=[Kind.CAMPAIGN_STATE])]
-    for body in entries:
-        check_transition(State(body["before"]), State(body["after"]))
-    return [body["after"] for body in entries]
-
-
-def one_stage(strategy: Any, order: Any = "logical") -> tuple[StageDefinition, ...]:
-    return (StageDefinition("only", lambda results, seed: strategy, order=order, pours=True),)
-
-
-class Script:
-    """Asks for fixed requests as far as slots allow and remembers what it was told."""
-
-    def __init__(self, *requests: Request) -> None:
-        self.requests = list(requests)
-        self.told: list[tuple[Request, Outcome]] = []
-        self.count = len(requests)
-        self.decisions: list[Any] = []
-
-    @property
-    def finished(self) -> bool:
-        return len(self.told) == self.count
-
-    def ask(self, slots: Slots) -> list[Request]:
-        left = {Simulate: slots.simulations, Pour: slots.pours}
-        asked = []
-        while self.requests and left.get(type(self.requests[0]), 1) > 0:
-            request = self.requests.pop(0)
-            left[type(request)] = left.get(type(request), 1) - 1
-            asked.append(request)
-        return asked
-
-    def tell(self, request: Request, outcome: Outcome) -> None:
-        self.told.append((request, outcome))
-
-    def progress(self) -> tuple[int, int]:
-        return len(self.told), self.count
-
-    def result(self) -> dict[str, object]:
-        return {"told": [type(outcome).__name__ for _, outcome in self.told]}
-
-
-def simulate(seed: int) -> Simulate:
-    return Simulate("cup", SCENE.action(SPACE.decode([0.5, 0.5])), THETA, seed)
-
-
-def pour(number: int = 1, scene: str = "cup") -> Pour:
-    return Pour(scene, SCENE.action(SPACE.decode([0.5, 0.5])), number, seed=100 + number)
-
 
 # -- order -------------------------------------------------------------------------------------------------------------
 
@@ -162,6 +88,15 @@ def test_strategies_are_told_what_the_journal_holds(tmp_path: Path) -> None:
     outcome = strategy.told[0][1]
     assert isinstance(outcome, Poured)
     assert outcome.measurement.notes == {"readings": [1.0, 2.0]}
+
+
+def test_a_strategy_free_of_the_clock_is_shown_the_same_slots(tmp_path: Path) -> None:
+    seen: list[list[Slots]] = []
+    for shuffle in (1, 2, 3):
+        strategy = ToyStrategy(3)
+        run(tmp_path / str(shuffle), slow_laboratory(0.005, random.Random(shuffle)), stages=one_stage(strategy))
+        seen.append(strategy.asks)
+    assert seen[0] == seen[1] == seen[2]
 
 
 # -- bad luck ----------------------------------------------------------------------------------------------------------
@@ -375,110 +310,3 @@ def test_a_pour_that_does_not_end_in_its_grace_is_unknown(tmp_path: Path) -> Non
             deadlines=Deadlines(pour_grace=0.05),
         )
     assert states(tmp_path / "run")[-1] == "unknown"
-
-
-# -- watchers ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_watcher_that_raises_is_reported_once_and_changes_nothing(tmp_path: Path) -> None:
-    run(tmp_path / "undisturbed")
-    events: list[Event] = []
-    calls: list[Event] = []
-
-    def broken(event: Event) -> None:
-        calls.append(event)
-        raise OSError("disk full")
-
-    run(tmp_path / "run", watchers=[broken, events.append])
-    assert len(calls) == 1
-    complaints = [e for e in events if isinstance(e, LogLine) and "broken can't watch any longer: OSError" in e.text]
-    assert len(complaints) == 1
-    assert logical_record(tmp_path / "run") == logical_record(tmp_path / "undisturbed")
-
-
-def test_watchers_see_the_whole_run(tmp_path: Path) -> None:
-    events: list[Event] = []
-    result = run(tmp_path / "run", watchers=[events.append])
-    started = {e.id: e.request for e in events if isinstance(e, RequestStarted)}
-    finished = {e.id: e.request for e in events if isinstance(e, RequestFinished)}
-    assert started == finished
-    assert len([r for r in finished.values() if isinstance(r, Pour)]) == result.pours == 6
-    assert len([r for r in finished.values() if isinstance(r, Simulate)]) == result.simulations
-    assert {e.stage: e.result for e in events if isinstance(e, StageClosed)} == result.results
-    assert any(isinstance(e, DecisionMade) for e in events)
-    assert isinstance(events[-1], CampaignClosed)
-    assert events[-1].state == "finished"
-
-
-def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path) -> None:
-    def recording(laboratory: ToyLaboratory) -> ToyLaboratory:
-        plain = laboratory.simulators.simulate
-
-        async def with_frames(task: PourTask) -> Any:
-            result = await plain(task)
-            return replace(result, frames=Frames([0.0], [], [], []) if task.record_rate > 0 else None)
-
-        laboratory.simulators.simulate = with_frames  # type: ignore[method-assign]
-        return laboratory
-
-    events: list[Event] = []
-    run(tmp_path / "run", recording(ToyLaboratory()), watchers=[events.append])
-    for stage in ("first", "second"):
-        done = [e for e in events if isinstance(e, RequestFinished) and e.stage == stage]
-        simulated = sorted((e.id, e.frames is not None) for e in done if isinstance(e.request, Simulate))
-        assert [number for number, (_, framed) in enumerate(simulated, start=1) if framed] == [1, 2]
-    plan = toy_plan(tmp_path)
-    silent = replace(plan, outputs=replace(plan.outputs, record_rate=0.0))
-    laboratory = ToyLaboratory()
-    run(tmp_path / "silent", laboratory, plan=silent)
-    assert all(task.record_rate == 0.0 for task in laboratory.simulators.tasks)
-    assert logical_record(tmp_path / "silent") == logical_record(tmp_path / "run")
-
-
-def test_recordings_spread_over_a_stage() -> None:
-    assert [n for n in range(1, 200) if is_recorded(n, 6)] == [1, 2, 4, 8, 16, 32]
-    assert not any(is_recorded(n, 0) for n in range(200))
-
-
-# -- states and seeds --------------------------------------------------------------------------------------------------
-
-
-def test_an_undisturbed_run_goes_the_straight_way(tmp_path: Path) -> None:
-    run(tmp_path / "run")
-    assert states(tmp_path / "run") == ["preparing", "running", "finished"]
-
-
-def test_the_state_table_has_no_dead_ends_but_the_end() -> None:
-    assert set(TRANSITIONS) == set(State)
-    assert {state for state, ways in TRANSITIONS.items() if not ways} == {State.FINISHED}
-    for state in RESTING - {State.FINISHED}:
-        assert TRANSITIONS[state] == {State.PREPARING}
-    with pytest.raises(TransitionError, match="can't go from finished to running"):
-        check_transition(State.FINISHED, State.RUNNING)
-
-
-def test_a_finished_run_is_not_run_again(tmp_path: Path) -> None:
-    first = run(tmp_path / "run")
-    laboratory = ToyLaboratory()
-    again = run(tmp_path / "run", laboratory, resume=True)
-    assert again.results == first.results
-    assert laboratory.simulators.tasks == []
-
-
-def test_stage_seeds_are_the_same_on_every_machine_and_differ_between_stages() -> None:
-    assert stage_seed(7, "calibration") == 38555389313445059
-    assert len({stage_seed(seed, name) for seed in range(20) for name in ("pours", "calibration", "evaluation")}) == 60
-
-
-def test_two_stages_of_one_name_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="stages with different names"):
-        run(tmp_path / "run", stages=[toy_stages()[0]] * 2)
-
-
-def test_a_strategy_free_of_the_clock_is_shown_the_same_slots(tmp_path: Path) -> None:
-    seen: list[list[Slots]] = []
-    for shuffle in (1, 2, 3):
-        strategy = ToyStrategy(3)
-        run(tmp_path / str(shuffle), slow_laboratory(0.005, random.Random(shuffle)), stages=one_stage(strategy))
-        seen.append(strategy.asks)
-    assert seen[0] == seen[1] == seen[2]

@@ -1,0 +1,69 @@
+"""A strategy that asks for what a test tells it to, and short ways to run it."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.requests import Outcome, Pour, Request, Simulate, Slots
+from orchestrator.stages import StageDefinition
+from orchestrator.states import State, check_transition
+from tests.orchestrator.toy import SCENE, SPACE, THETA, ToyLaboratory, run_toy
+
+
+def run(directory: Path, laboratory: ToyLaboratory | None = None, **arguments: Any) -> Any:
+    return asyncio.run(run_toy(directory, laboratory, **arguments))
+
+
+def states(directory: Path) -> list[str]:
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        entries = [entry.body for entry in journal.entries(kinds=[Kind.CAMPAIGN_STATE])]
+    for body in entries:
+        check_transition(State(body["before"]), State(body["after"]))
+    return [body["after"] for body in entries]
+
+
+def one_stage(strategy: Any, order: Any = "logical") -> tuple[StageDefinition, ...]:
+    return (StageDefinition("only", lambda results, seed: strategy, order=order, pours=True),)
+
+
+class Script:
+    """Asks for fixed requests as far as slots allow and remembers what it was told."""
+
+    def __init__(self, *requests: Request) -> None:
+        self.requests = list(requests)
+        self.told: list[tuple[Request, Outcome]] = []
+        self.count = len(requests)
+        self.decisions: list[Any] = []
+
+    @property
+    def finished(self) -> bool:
+        return len(self.told) == self.count
+
+    def ask(self, slots: Slots) -> list[Request]:
+        left = {Simulate: slots.simulations, Pour: slots.pours}
+        asked = []
+        while self.requests and left.get(type(self.requests[0]), 1) > 0:
+            request = self.requests.pop(0)
+            left[type(request)] = left.get(type(request), 1) - 1
+            asked.append(request)
+        return asked
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        self.told.append((request, outcome))
+
+    def progress(self) -> tuple[int, int]:
+        return len(self.told), self.count
+
+    def result(self) -> dict[str, object]:
+        return {"told": [type(outcome).__name__ for _, outcome in self.told]}
+
+
+def simulate(seed: int) -> Simulate:
+    return Simulate("cup", SCENE.action(SPACE.decode([0.5, 0.5])), THETA, seed)
+
+
+def pour(number: int = 1, scene: str = "cup") -> Pour:
+    return Pour(scene, SCENE.action(SPACE.decode([0.5, 0.5])), number, seed=100 + number)
