@@ -8,6 +8,7 @@ survives the death of the process, and a power cut but for its last moments.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -125,7 +126,11 @@ class JournalReader:
         if not path.is_file():
             raise JournalError(f"{path}: there is no journal here; has the run been started?")
         self._connection = _connect(f"{path.absolute().as_uri()}?mode=ro")
-        self.header = self._read_header()
+        try:
+            self.header = self._read_header()
+        except BaseException:
+            self._connection.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -211,17 +216,15 @@ class Journal(JournalReader):
             JournalError: it holds a run already.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = _take_lock(path)
-        try:
-            connection = _connect_writer(path)
+        with contextlib.ExitStack() as opened:
+            lock = opened.enter_context(_take_lock(path))
+            connection = opened.enter_context(closing(_connect_writer(path)))
             if _has_tables(connection, path):
-                connection.close()
                 raise JournalError(f"{path}: holds a run already; resume that one, or begin in another directory")
             _lay_out(connection, header)
-            return cls(path, lock, connection)
-        except BaseException:
-            lock.close()
-            raise
+            journal = cls(path, lock, connection)
+            opened.pop_all()
+            return journal
 
     @classmethod
     def resume(cls, path: Path, header: Header) -> Journal:
@@ -233,17 +236,15 @@ class Journal(JournalReader):
         """
         if not path.is_file():
             raise JournalError(f"{path}: there is no journal to resume; begin the campaign without --resume")
-        lock = _take_lock(path)
-        try:
-            connection = _connect_writer(path)
+        with contextlib.ExitStack() as opened:
+            lock = opened.enter_context(_take_lock(path))
+            connection = opened.enter_context(closing(_connect_writer(path)))
             if not _has_tables(connection, path):
                 _lay_out(connection, header)
             journal = cls(path, lock, connection)
             journal._check_same_campaign(header)
+            opened.pop_all()
             return journal
-        except BaseException:
-            lock.close()
-            raise
 
     def append(self, kind: Kind, body: dict[str, Any], *, stage: str = "") -> None:
         """Write one entry; it is in the file when this returns."""

@@ -200,3 +200,14 @@ def test_a_run_that_died_before_its_first_word_can_be_resumed(path: Path) -> Non
     assert list(journal.entries()) == []
     assert journal.state() is State.QUEUED
     journal.close()
+
+
+def test_a_refused_journal_is_not_kept_open(path: Path) -> None:
+    Journal.create(path, HEADER).close()
+    with pytest.raises(JournalError):
+        Journal.create(path, HEADER)
+    with pytest.raises(JournalError) as refused:
+        Journal.resume(path, Header("toy", {"seed": 8}))
+    # the error still holds the frames that it passed through, and with them whatever they had left open
+    held = [target for fd in Path("/proc/self/fd").iterdir() if (target := os.path.realpath(fd)).startswith(str(path))]
+    assert (held, refused.type) == ([], JournalError)
