@@ -1,7 +1,7 @@
 """Starts and ends Ray: private, on this machine only, and with nothing left behind.
 
 Ray runs with stated memory, without dashboard or usage statistics, on the loopback interface, with a token of its own,
-in a short private folder that is removed at the end. Folders of sessions whose program is gone are removed at the next
+in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed at the next
 start. `actors.ray_warden` cleans up behind a program that was killed.
 
 `start_ray` and `stop_ray` count: Ray ends with the last `stop_ray`.
@@ -28,7 +28,7 @@ from pathlib import Path
 from types import FrameType
 
 from actors.protocols import LaboratoryError
-from actors.ray_warden import MARK, end_session
+from actors.ray_warden import MARK, end_cluster
 from actors.spec import LaboratorySpec
 
 START_DEADLINE = 120.0
@@ -49,7 +49,7 @@ def simulator_count(spec: LaboratorySpec) -> int:
 
 
 @dataclass
-class _Session:
+class _Cluster:
     """A running Ray and what holds it."""
 
     folder: Path
@@ -62,7 +62,7 @@ class _Session:
     keeper: threading.Thread | None = None
 
 
-_session: _Session | None = None
+_cluster: _Cluster | None = None
 _guard = threading.RLock()
 
 
@@ -75,40 +75,40 @@ def start_ray(spec: LaboratorySpec) -> None:
     Raises:
         LaboratoryError: Ray doesn't start, or this process has a Ray that isn't Decant's.
     """
-    global _session
+    global _cluster
     with _guard:
-        if _session is not None:
-            _session.uses += 1
+        if _cluster is not None:
+            _cluster.uses += 1
             return
         _refuse_foreign_ray()
-        session = _open_session()
+        cluster = _open_cluster()
         try:
-            _start_keeper(session, spec)
+            _start_keeper(cluster, spec)
         except BaseException:
-            _close_session(session)
+            _close_cluster(cluster)
             raise
-        _session = session
+        _cluster = cluster
         atexit.register(_stop_at_exit)
     keep_signals()
 
 
 def stop_ray() -> None:
     """Undo one `start_ray`; the last one ends Ray with all its processes and removes its folder."""
-    global _session
+    global _cluster
     with _guard:
-        if _session is None:
+        if _cluster is None:
             return
-        _session.uses -= 1
-        if _session.uses > 0:
+        _cluster.uses -= 1
+        if _cluster.uses > 0:
             return
-        session, _session = _session, None
+        cluster, _cluster = _cluster, None
         atexit.unregister(_stop_at_exit)
-        _close_session(session)
+        _close_cluster(cluster)
 
 
 def ray_folder() -> Path | None:
-    """Folder of the running session; None while Ray is not running."""
-    return None if _session is None else _session.folder
+    """Folder of the running cluster; None while Ray is not running."""
+    return None if _cluster is None else _cluster.folder
 
 
 def keep_signals() -> None:
@@ -137,13 +137,13 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 def _stop_at_exit() -> None:
     with _guard:
-        if _session is not None:
-            _session.uses = 1
+        if _cluster is not None:
+            _cluster.uses = 1
     stop_ray()
 
 
 def _root() -> Path:
-    """Private folder for the sessions of this user."""
+    """Private folder for the clusters of this user."""
     base = Path(tempfile.gettempdir())
     name = f"decant-{os.getuid()}"
     if len(str(base / name)) > _LONGEST_FOLDER - 10:
@@ -159,16 +159,16 @@ def _root() -> Path:
 
 @contextlib.contextmanager
 def _only_one(root: Path) -> Iterator[None]:
-    """One process at a time makes or removes session folders."""
+    """One process at a time makes or removes cluster folders."""
     with (root / "lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
-def prune_sessions(root: Path | None = None) -> list[Path]:
-    """Remove the sessions of programs that are gone, with processes that are left of them.
+def prune_clusters(root: Path | None = None) -> list[Path]:
+    """Remove the clusters of programs that are gone, with processes that are left of them.
 
-    A living program holds a lock on its session's `alive` file; the system drops it whatever way the program ends.
+    A living program holds a lock on its cluster's `alive` file; the system drops it whatever way the program ends.
 
     Returns:
         The folders removed.
@@ -178,7 +178,7 @@ def prune_sessions(root: Path | None = None) -> list[Path]:
     for folder in sorted(p for p in root.iterdir() if p.is_dir()):
         with contextlib.suppress(OSError), (folder / "alive").open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            end_session(folder)
+            end_cluster(folder)
             removed.append(folder)
     return removed
 
@@ -189,10 +189,10 @@ def _refuse_foreign_ray() -> None:
         raise LaboratoryError("this process has already started a Ray of its own; end it before opening a laboratory")
 
 
-def _open_session() -> _Session:
+def _open_cluster() -> _Cluster:
     root = _root()
     with _only_one(root):
-        prune_sessions(root)
+        prune_clusters(root)
         folder = Path(tempfile.mkdtemp(prefix="", dir=root))
         lock = (folder / "alive").open("w")
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -206,59 +206,59 @@ def _open_session() -> _Session:
         stderr=subprocess.DEVNULL,
         start_new_session=True,  # Ctrl-C in the terminal is not meant for it
     )
-    return _Session(folder, lock, warden)
+    return _Cluster(folder, lock, warden)
 
 
-def _close_session(session: _Session) -> None:
-    session.stop.set()
-    if session.keeper is not None:
-        session.keeper.join(timeout=30.0)
-    end_session(session.folder, patience=15.0)
-    session.lock.close()
-    if session.warden.stdin is not None:
-        session.warden.stdin.close()
+def _close_cluster(cluster: _Cluster) -> None:
+    cluster.stop.set()
+    if cluster.keeper is not None:
+        cluster.keeper.join(timeout=30.0)
+    end_cluster(cluster.folder, patience=15.0)
+    cluster.lock.close()
+    if cluster.warden.stdin is not None:
+        cluster.warden.stdin.close()
     try:
-        session.warden.wait(timeout=15.0)
+        cluster.warden.wait(timeout=15.0)
     except subprocess.TimeoutExpired:
-        session.warden.kill()
-        session.warden.wait()
+        cluster.warden.kill()
+        cluster.warden.wait()
 
 
-def _start_keeper(session: _Session, spec: LaboratorySpec) -> None:
+def _start_keeper(cluster: _Cluster, spec: LaboratorySpec) -> None:
     """Start Ray in a thread that lives as long as Ray does.
 
     Linux ends Ray's processes when the *thread* that started them ends. A thread of an executor, or a main thread that
     hands over, would take Ray with it.
     """
-    session.keeper = threading.Thread(target=_keep, args=(session, spec), name="ray-keeper", daemon=True)
-    session.keeper.start()
-    if not session.ready.wait(START_DEADLINE):
+    cluster.keeper = threading.Thread(target=_keep, args=(cluster, spec), name="ray-keeper", daemon=True)
+    cluster.keeper.start()
+    if not cluster.ready.wait(START_DEADLINE):
         raise LaboratoryError(
             f"Ray did not start within {START_DEADLINE:.0f} s; is this machine busy, or short of memory? Try again, or "
             "do without Ray (--in-process)"
         )
-    if session.failure is not None:
-        raise session.failure
+    if cluster.failure is not None:
+        raise cluster.failure
 
 
-def _keep(session: _Session, spec: LaboratorySpec) -> None:
+def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
     try:
-        _init(session, spec)
+        _init(cluster, spec)
     except Exception as error:
-        session.failure = LaboratoryError(f"Ray does not start: {error}")
-        session.failure.__cause__ = error
-    session.ready.set()
-    if session.failure is None:
-        session.stop.wait()
+        cluster.failure = LaboratoryError(f"Ray does not start: {error}")
+        cluster.failure.__cause__ = error
+    cluster.ready.set()
+    if cluster.failure is None:
+        cluster.stop.wait()
     import ray
 
     ray.shutdown()
 
 
-def _init(session: _Session, spec: LaboratorySpec) -> None:
+def _init(cluster: _Cluster, spec: LaboratorySpec) -> None:
     os.environ.update(
         RAY_AUTH_MODE="token",
-        RAY_AUTH_TOKEN_PATH=str(session.folder / "token"),
+        RAY_AUTH_TOKEN_PATH=str(cluster.folder / "token"),
         RAY_USAGE_STATS_ENABLED="0",
         RAY_ENABLE_UV_RUN_RUNTIME_ENV="0",
         # Makes Ray take 127.0.0.1 for the node's address and listen there only. On Windows and macOS that is its
@@ -267,7 +267,7 @@ def _init(session: _Session, spec: LaboratorySpec) -> None:
     )
     import ray
 
-    os.environ[MARK] = str(session.folder)
+    os.environ[MARK] = str(cluster.folder)
     try:
         for attempt in range(3):
             try:
@@ -279,7 +279,7 @@ def _init(session: _Session, spec: LaboratorySpec) -> None:
                     include_dashboard=False,
                     logging_level=logging.ERROR,
                     log_to_driver=False,
-                    _temp_dir=str(session.folder),
+                    _temp_dir=str(cluster.folder),
                     _node_ip_address="127.0.0.1",
                 )
                 break

@@ -2,7 +2,7 @@
 
 Ray's own processes notice the death of the program that started them, but some take half a minute. The warden holds
 the reading end of a pipe whose writing end only the parent has: when the parent is gone, for whatever reason, the pipe
-ends, and the warden ends every process that carries the session's mark and removes the session's folder.
+ends, and the warden ends every process that carries the cluster's mark and removes the cluster's folder.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from pathlib import Path
 
 import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
 
-MARK = "DECANT_RAY_SESSION"
-"""Environment variable that all processes of one Ray session carry; its value is the session's folder."""
+MARK = "DECANT_RAY_CLUSTER"
+"""Environment variable that all processes of one Ray cluster carry; its value is the cluster's folder."""
 
 
-def session_processes(folder: Path) -> list[int]:
-    """Process ids of this user that belong to a session, the asking process excepted.
+def cluster_processes(folder: Path) -> list[int]:
+    """Process ids of this user that belong to a cluster, the asking process excepted.
 
-    Most carry the mark in their environment. Ray's agents write their titles over it, but they hold log files open.
+    Most carry the mark in their environment. Ray's helpers write their titles over it, but they hold log files open.
 
     Args:
-        folder: the session's folder, as in `MARK`.
+        folder: the cluster's folder, as in `MARK`.
     """
     return [p.pid for p in psutil.process_iter() if p.pid != os.getpid() and _belongs(p, folder)]
 
@@ -41,16 +41,16 @@ def _belongs(process: psutil.Process, folder: Path) -> bool:
     return False
 
 
-def end_session(folder: Path, *, patience: float = 10.0) -> None:
-    """Kill what is left of a session and remove its folder.
+def end_cluster(folder: Path, *, patience: float = 10.0) -> None:
+    """Kill what is left of a cluster and remove its folder.
 
     Args:
-        folder: the session's folder.
+        folder: the cluster's folder.
         patience: how long to go on while processes still appear or linger [s].
     """
     end = time.monotonic() + patience
     while time.monotonic() < end:
-        processes = session_processes(folder)
+        processes = cluster_processes(folder)
         if not processes:
             break
         for pid in processes:
@@ -67,7 +67,7 @@ def main() -> None:
     with contextlib.suppress(OSError):
         while os.read(0, 4096):
             pass
-    end_session(Path(sys.argv[1]))
+    end_cluster(Path(sys.argv[1]))
 
 
 if __name__ == "__main__":

@@ -127,7 +127,7 @@ def test_a_normal_end_leaves_nothing_was_closed_to_the_network_and_kept_the_loop
     assert_clean(facts, tmp_path)
 
 
-def test_sessions_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp_path):
+def test_clusters_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp_path):
     dead, alive = tmp_path / "dead", tmp_path / "alive"
     for folder in (dead, alive):
         folder.mkdir()
@@ -145,19 +145,19 @@ def test_sessions_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp
     )
     try:
         holder.stdout.readline()
-        assert ray_runtime.prune_sessions(tmp_path) == [dead]
+        assert ray_runtime.prune_clusters(tmp_path) == [dead]
         assert not dead.exists()
         assert alive.exists()
     finally:
         holder.kill()
         holder.communicate()
-    assert ray_runtime.prune_sessions(tmp_path) == [alive]
+    assert ray_runtime.prune_clusters(tmp_path) == [alive]
 
 
 def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(ray_running, monkeypatch):
     import ray
 
-    monkeypatch.setattr(ray_runtime, "_session", None)
+    monkeypatch.setattr(ray_runtime, "_cluster", None)
     with pytest.raises(LaboratoryError, match="Ray of its own"):
         ray_runtime.start_ray(LaboratorySpec("late"))
     assert ray.is_initialized()

@@ -39,7 +39,7 @@ class Workplace:
         self.temporary = Path(tempfile.mkdtemp(prefix="e", dir="/tmp"))
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
-        """`decant ARGUMENTS`, in a session of its own, as from another terminal."""
+        """`decant ARGUMENTS` as from another terminal."""
         return subprocess.Popen(
             [sys.executable, "-c", "from orchestrator.cli import main; main()", *arguments],
             cwd=self.folder,
@@ -102,7 +102,7 @@ class Workplace:
             return []
 
     def leftovers(self) -> list[str]:
-        """Processes and session folders that Ray has left."""
+        """Processes and folders that Ray has left."""
         found = []
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error, OSError):
