@@ -15,7 +15,7 @@ import typer.main
 
 from orchestrator.cli import app
 from orchestrator.commands import common
-from orchestrator.config.load import load_vessel
+from orchestrator.config.load import load_campaign, load_vessel
 from orchestrator.journal import Kind
 from orchestrator.unknown import OperatorNeededError
 
@@ -137,6 +137,33 @@ def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:
     path = tmp_path / "vessel.yaml"
     path.write_text(shown[0], encoding="utf-8")
     assert load_vessel(path) == load_vessel(ROOT / "configs" / "vessels" / "narrow.yaml")
+
+
+def test_numbers_of_the_solver_are_the_code_s() -> None:
+    sources = "".join(text_of(ROOT / "sim_engine" / "fluid" / f"{name}.py") for name in ("step", "forces"))
+    names = ("CFL", "PACE", "SHORTEST_STEP", "LONGEST_STEP", "SKIN", "SHORT_SKIN", "WARM", "LARGEST_PULL")
+    cfl, pace, shortest, longest, skin, short_skin, warm, pull = (
+        float(re.findall(rf"^{name} = (\S+)$", sources, re.MULTILINE)[0]) for name in names
+    )
+    page = " ".join(prose_of(ROOT / "docs" / "how-it-works.md").split())
+    assert f"at most {cfl:g} spacings for the fastest particle, at most {pace:g} √(d/g)" in page
+    assert f"always {1e3 * shortest:g} to {1e3 * longest:g} ms" in page
+    assert f"{skin:g} spacings, or {short_skin:g} where" in page
+    assert (warm, "six tenths of them are kept" in page) == (0.6, True)
+    assert (pull, "more than a tenth of a spacing in a step" in page) == (0.1, True)
+
+
+def test_quickstart_is_what_the_guide_says() -> None:
+    plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml")
+    calibration, deployment = plan.calibration, plan.deployment
+    assert calibration is not None
+    assert deployment is not None
+    said = (
+        f"{calibration.pour_count} pours to calibrate on, {calibration.simulations} simulations to calibrate with, "
+        f"then {deployment.pours} pours into a {deployment.scenes[0].receiver.name} cup on a prior of "
+        f"{deployment.prior_simulations} simulations"
+    )
+    assert said in " ".join(text_of(ROOT / "docs" / "user-guide.md").split())
 
 
 def test_changelog_has_this_version() -> None:
