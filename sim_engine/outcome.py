@@ -92,29 +92,6 @@ class PourOutcome:
             "invalid": self.invalid,
         }
 
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> PourOutcome:
-        """Inverse of `as_json`."""
-        curve = data["curve"]
-        return cls(
-            received=data["received"],
-            spilled=data["spilled"],
-            retained=data["retained"],
-            in_flight=data["in_flight"],
-            escaped=data["escaped"],
-            particles=data["particles"],
-            spacing=data["spacing_mm"] * 1e-3,
-            density_error=data["density_error"],
-            simulated_time=data["simulated_time_s"],
-            steps=data["steps"],
-            cpu_s=data["cpu_s"],
-            seed=data["seed"],
-            curve_times=tuple(curve["time_s"]),
-            curve_poured=tuple(curve["poured"]),
-            curve_spilled=tuple(curve["spilled"]),
-            invalid=data["invalid"],
-        )
-
 
 @dataclass(frozen=True)
 class PourMeasurement:
@@ -136,17 +113,3 @@ class PourMeasurement:
     def fractions(self) -> Fractions:
         """Poured, spilled, retained as fractions of the load."""
         return Fractions(1.0 - self.retained / self.loaded, self.spilled / self.loaded, self.retained / self.loaded)
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping; masses in grams as people read them."""
-        return {
-            "loaded_g": self.loaded * 1e3,
-            "spilled_g": self.spilled * 1e3,
-            "retained_g": self.retained * 1e3,
-            "notes": self.notes,
-        }
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> PourMeasurement:
-        """Inverse of `as_json`."""
-        return cls(data["loaded_g"] * 1e-3, data["spilled_g"] * 1e-3, data["retained_g"] * 1e-3, data["notes"])

@@ -28,7 +28,6 @@ class ScoredPour:
 @dataclass
 class _Case:
     theta: str
-    number: int
     scored: ScoredPour
     request: Simulate
     simulated: float | None = None
@@ -45,28 +44,22 @@ class Evaluation:
     Source: Lopez-Guevara et al., CoRL 2017, section 4.1 (test discrepancy).
     """
 
-    def __init__(
-        self, thetas: Mapping[str, SimulationParameters], pours: Sequence[ScoredPour], seed: int, *, repeats: int = 1
-    ) -> None:
+    def __init__(self, thetas: Mapping[str, SimulationParameters], pours: Sequence[ScoredPour], seed: int) -> None:
         """Plan.
 
         Args:
             thetas: by label; 'random 1', 'random 2' … are the baseline whose median is reported.
-            repeats: simulations for each θ and pour, averaged over.
         """
-        if repeats < 1:
-            raise ValueError(f"repeats must be at least 1, got {repeats}")
         seeds = SeedStream(seed, "evaluation")
         self._cases: list[_Case] = []
         self._thetas = dict(thetas)
-        for number, scored in enumerate(pours):
+        for scored in pours:
             if scored.pour.spillage is None:
                 continue
-            for _ in range(repeats):
-                seed_of_case = seeds.next()
-                for label, theta in thetas.items():
-                    request = Simulate(scored.scene, scored.pour.action, theta, seed_of_case, "evaluate")
-                    self._cases.append(_Case(label, number, scored, request))
+            seed_of_pour = seeds.next()
+            for label, theta in thetas.items():
+                request = Simulate(scored.scene, scored.pour.action, theta, seed_of_pour, "evaluate")
+                self._cases.append(_Case(label, scored, request))
         self._unissued = deque(range(len(self._cases)))
         self._open: dict[Simulate, deque[int]] = {}
         self.decisions: list[Decision] = [
@@ -108,17 +101,14 @@ class Evaluation:
         return sum(case.answered for case in self._cases), len(self._cases)
 
     def discrepancy(self, theta: str, split: str) -> float | None:
-        """Mean |r − c_s| of a θ over a split's pours (repeats averaged first); None where nothing is defined."""
-        by_pour: dict[int, list[float]] = {}
-        measured: dict[int, float] = {}
-        for case in self._cases:
-            r = case.scored.pour.spillage
-            if case.theta == theta and case.scored.pour.split == split and case.simulated is not None and r is not None:
-                by_pour.setdefault(case.number, []).append(case.simulated)
-                measured[case.number] = r
-        if not by_pour:
-            return None
-        return float(np.mean([abs(measured[key] - float(np.mean(values))) for key, values in by_pour.items()]))
+        """Mean |r − c_s| of a θ over a split's pours; None where nothing is defined."""
+        differences = [
+            abs(r - case.simulated)
+            for case in self._cases
+            if case.theta == theta and case.scored.pour.split == split
+            if case.simulated is not None and (r := case.scored.pour.spillage) is not None
+        ]
+        return float(np.mean(differences)) if differences else None
 
     def random_median(self, split: str) -> float | None:
         """Median over the θ labelled 'random …' of the mean discrepancy in a split."""

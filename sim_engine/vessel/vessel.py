@@ -196,5 +196,5 @@ def check_holds(vessel: Vessel, volume: float) -> None:
     """
     if volume > vessel.capacity:
         raise VesselError(
-            f"{vessel.name} holds {1e6 * vessel.capacity:.3g} mL to the brim, {1e6 * volume:.3g} mL asked for"
+            f"{vessel.name} holds {1e6 * vessel.capacity:.4g} mL to the brim, {1e6 * volume:.4g} mL asked for"
         )
