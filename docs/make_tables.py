@@ -18,7 +18,6 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from orchestrator.config import campaign, laboratory, vessel
-from orchestrator.config.motion import SWITCHED_OFF
 from orchestrator.config.quantities import Quantity
 from orchestrator.config.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.scenes import DEFAULTS, NEEDED
@@ -88,7 +87,7 @@ def actions() -> str:
         if name in NEEDED:
             given = "none: fix it or search it"
         elif default is None:
-            given = f"`{SWITCHED_OFF[name]}`"
+            given = f"`{d.switched_off}`"
         else:
             given = f"{default / d.factor:g} {d.display_unit}"
         bounds = f"{d.lower / d.factor:g} … {d.upper / d.factor:g} {d.display_unit}"

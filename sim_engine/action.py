@@ -25,7 +25,7 @@ class Dimension:
         lower: smallest sensible value [unit].
         upper: largest sensible value [unit].
         meaning: one line for people.
-        optional: may be switched off (None): see `meaning`.
+        switched_off: word for the choice to do without it (None in an `Action`), see `meaning`; empty: there is none.
     """
 
     name: str
@@ -34,7 +34,12 @@ class Dimension:
     lower: float
     upper: float
     meaning: str
-    optional: bool = False
+    switched_off: str = ""
+
+    @property
+    def optional(self) -> bool:
+        """It may be switched off."""
+        return bool(self.switched_off)
 
     @property
     def factor(self) -> float:
@@ -54,7 +59,7 @@ ACTION_DIMENSIONS: dict[str, Dimension] = {
             10 * DEG,
             20_000 * DEG,
             "acceleration into and out of every turn; 'step' starts and stops at once, to replay recorded data only",
-            optional=True,
+            switched_off="step",
         ),
         Dimension(
             "hold_time",
@@ -63,7 +68,7 @@ ACTION_DIMENSIONS: dict[str, Dimension] = {
             0.0,
             60.0,
             "time at the largest tilt; 'until_flow_ends' holds until the predicted end of flow (capped)",
-            optional=True,
+            switched_off="until_flow_ends",
         ),
         Dimension(
             "return_velocity",
@@ -72,7 +77,7 @@ ACTION_DIMENSIONS: dict[str, Dimension] = {
             1 * DEG,
             360 * DEG,
             "speed of the return to upright; 'none' ends the pour at the largest tilt, for recorded data only",
-            optional=True,
+            switched_off="none",
         ),
         Dimension("x_offset", "m", "mm", -0.5, 0.5, "distance of the vessel axes along x while the pourer is upright"),
         Dimension("y_offset", "m", "mm", -0.3, 0.3, "sideways distance of the vessel axes"),
@@ -148,6 +153,6 @@ def described(values: Mapping[str, float | None]) -> str:
     parts = []
     for name, value in values.items():
         dimension = ACTION_DIMENSIONS[name]
-        shown = "—" if value is None else f"{value / dimension.factor:.4g} {dimension.display_unit}"
+        shown = dimension.switched_off if value is None else f"{value / dimension.factor:.4g} {dimension.display_unit}"
         parts.append(f"{name} {shown}")
     return "  ".join(parts)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from orchestrator.config.errors import did_you_mean
-from orchestrator.config.motion import SWITCHED_OFF, dimension_quantity
+from orchestrator.config.motion import dimension_quantity
 from orchestrator.config.quantities import QuantityError
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.space import Space
@@ -86,7 +86,7 @@ def _parse(name: str, value: str) -> float | None:
     else:
         text = f"{value} {dimension.display_unit}"
     parsed = quantity.parse(text)
-    return None if isinstance(parsed, str) and parsed == SWITCHED_OFF.get(name) else float(parsed)
+    return None if isinstance(parsed, str) and parsed == dimension.switched_off else float(parsed)
 
 
 def _example(name: str, space: Space | None) -> str:

@@ -16,9 +16,6 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Scale, Space
 from sim_engine.task import Pivot
 
-SWITCHED_OFF = {"angular_acceleration": "step", "hold_time": "until_flow_ends", "return_velocity": "none"}
-"""The words that switch an optional dimension off (None in an `Action`)."""
-
 EXAMPLES = {
     "angular_velocity": "40 deg/s",
     "max_angle": "110 deg",
@@ -45,7 +42,7 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
         EXAMPLES[dimension.name],
         dimension.lower,
         dimension.upper,
-        words=(SWITCHED_OFF[dimension.name],) if words and dimension.optional else (),
+        words=(dimension.switched_off,) if words and dimension.optional else (),
     )
 
 
@@ -245,7 +242,7 @@ def fixed_as_file(fixed: Mapping[str, float | None], pivot: Pivot, hold_cap: flo
     for name, value in fixed.items():
         dimension = ACTION_DIMENSIONS[name]
         section[name] = (
-            SWITCHED_OFF[name] if value is None else format_quantity(value, dimension.unit, dimension.display_unit)
+            dimension.switched_off if value is None else format_quantity(value, dimension.unit, dimension.display_unit)
         )
     return section
 

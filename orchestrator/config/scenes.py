@@ -8,7 +8,7 @@ from typing import Any
 
 from orchestrator.config.campaign import CampaignFile
 from orchestrator.config.errors import dotted
-from orchestrator.config.motion import EXAMPLES, SWITCHED_OFF, ActionsBase, MotionBase
+from orchestrator.config.motion import EXAMPLES, ActionsBase, MotionBase
 from orchestrator.config.references import References
 from orchestrator.config.yaml_source import Place, Report
 from sim_engine.action import ACTION_DIMENSIONS, Action
@@ -121,7 +121,7 @@ class SceneBuilder:
         for dimension in ("angular_acceleration", "return_velocity"):
             if not recorded and dimension in fixed and fixed[dimension] is None:
                 ok = False
-                word, example = SWITCHED_OFF[dimension], EXAMPLES[dimension]
+                word, example = ACTION_DIMENSIONS[dimension].switched_off, EXAMPLES[dimension]
                 self.report.add(
                     origin[dimension],
                     f"'{word}' only replays recorded pours, no arm can do it; write for example '{example}' "

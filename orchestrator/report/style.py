@@ -61,9 +61,12 @@ def display_factor(name: str) -> float:
 
 
 def display_value(name: str, value: float | None) -> str:
-    """One quantity as people read it, from its SI value: '41.2 deg/s', '1 840', '0.032 N/m'; '—' for None."""
+    """One quantity as people read it, from its SI value: '41.2 deg/s', '1 840', '0.032 N/m'.
+
+    None is shown as the word that switches the dimension off ('until_flow_ends'), '—' where there is none.
+    """
     if value is None:
-        return "—"
+        return (ACTION_DIMENSIONS[name].switched_off if name in ACTION_DIMENSIONS else "") or "—"
     if name == "particles":
         return f"{round(value):,}".replace(",", " ")
     return f"{value / display_factor(name):.3g} {display_unit(name)}".rstrip()

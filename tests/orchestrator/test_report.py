@@ -284,7 +284,9 @@ def test_quantities_are_shown_in_the_units_that_people_type() -> None:
     assert display_value("x_offset", 0.104) == "104 mm"
     assert display_value("cohesion", 0.032) == "0.032 N/m"
     assert display_value("particles", 1840.0) == "1 840"
-    assert display_value("hold_time", None) == "—"
+    assert display_value("hold_time", None) == "until_flow_ends"
+    assert display_value("cohesion", None) == "—"
+    assert Action(1.0, 0.1, 0.1).display("x_offset", "hold_time") == "x_offset 100 mm  hold_time until_flow_ends"
     assert display_values({"x_offset": 0.104, "friction": 0.1}) == "x offset 104 mm, friction 0.1"
 
 
