@@ -219,6 +219,37 @@ def schema(
     _call(single.schema, which)
 
 
+@app.command(
+    epilog=examples("decant physics", "decant physics outflow walls --full", "decant physics --full --write docs"),
+)
+def physics(
+    cases: Annotated[
+        list[str] | None, typer.Argument(help="Cases by name; all if none is given.", show_default=False)
+    ] = None,
+    full: Annotated[bool, typer.Option("--full", help="All resolutions and seeds: minutes instead of one.")] = False,
+    pours: Annotated[
+        int | None, typer.Option(min=1, help="Random pours of the case 'walls'.", show_default=False)
+    ] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the page validation.md, its data and figures; cases not run now keep what the same "
+            "solver wrote there before.",
+            show_default=False,
+        ),
+    ] = None,
+    list_cases: Annotated[bool, typer.Option("--list", help="Name the cases and end.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Hold the solver against physics: theory, experiments and other solvers, each case with its criterion.
+
+    Exit code 1 if a criterion is not met.
+    """
+    from orchestrator.commands import physics as verb
+
+    _call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
+
+
 def main() -> None:
     """Entry point."""
     app()

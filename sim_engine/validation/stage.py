@@ -1,0 +1,125 @@
+"""The solver without a pour around it: one vessel, still or on a given path, and nothing else in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.liquid import SimulationParameters
+from sim_engine.pour import inside_mask
+from sim_engine.vessel.sdf import SignedDistanceGrid
+from sim_engine.vessel.vessel import Vessel
+
+Floats = NDArray[np.float64]
+
+DENSITY = 998.0
+"""Of water [kg/m³]."""
+
+NO_RIM = 1e3
+"""Height of a rim that nothing ever reaches [m]."""
+
+NOTHING = SignedDistanceGrid(
+    origin=np.zeros(3),
+    spacing=1e-3,
+    values=np.ones((2, 2, 2), dtype=np.float32),
+    cavity=np.zeros((2, 2, 2), dtype=np.uint8),
+)
+"""The solver knows two vessels; where a case needs fewer, this is the other."""
+
+FAR_AWAY = np.array([0.0, 0.0, -1e3])
+
+
+@dataclass(frozen=True)
+class Container:
+    """A vessel as the solver sees it.
+
+    Attributes:
+        grid: signed distance and cavity.
+        inside: 1 at the grid's nodes where a particle counts as inside.
+        wall: smallest thickness [m].
+        rim: height of the lip; `NO_RIM` for a tank that nothing is poured from [m].
+    """
+
+    grid: SignedDistanceGrid
+    inside: NDArray[np.uint8]
+    wall: float
+    rim: float = NO_RIM
+
+    @classmethod
+    def of(cls, vessel: Vessel) -> Container:
+        """A vessel's."""
+        return cls(vessel.grid, inside_mask(vessel), vessel.wall_thickness, vessel.rim_height)
+
+
+EMPTY_SPACE = Container(NOTHING, NOTHING.cavity, 1e-3)
+
+
+def still_pose(duration: float) -> Floats:
+    """Poses of a vessel that stands at the world's origin, for `run`'s pose table."""
+    from sim_engine.fluid.engine import POSE_STEP
+
+    poses = np.zeros((int(duration / POSE_STEP) + 3, 7))
+    poses[:, 3] = 1.0
+    return poses
+
+
+def run(
+    positions: Floats,
+    spacing: float,
+    container: Container,
+    parameters: SimulationParameters,
+    times: Floats,
+    *,
+    poses: Floats | None = None,
+    settling: float = 0.0,
+    spill_level: float = -1e2,
+) -> Iterator[int]:
+    """Load a scene and run it to each of some times.
+
+    Args:
+        positions: (N, 3) in the world [m].
+        spacing: d [m].
+        container: the one vessel.
+        parameters: θ; its number of particles is not looked at.
+        times: increasing [s].
+        poses: the vessel's, one per `POSE_STEP` from time 0 on; None: it stands at the origin.
+        settling: time before 0 in which the first pose holds [s].
+        spill_level: below it and outside the vessel a particle leaves the solver [m].
+
+    Yields:
+        The index of each time when it has been reached: then the engine may be looked at.
+
+    Raises:
+        ArithmeticError: the solver stopped with a fault.
+    """
+    from sim_engine.fluid.engine import engine
+    from sim_engine.fluid.kernels import cohesion_strength
+    from sim_engine.fluid.state import SUPPORT
+
+    fluid = engine()
+    attraction = cohesion_strength(parameters.cohesion, spacing, SUPPORT * spacing) / (DENSITY * spacing**3)
+    fluid.load(
+        np.ascontiguousarray(positions, dtype=np.float32),
+        spacing=spacing,
+        pair_acceleration=attraction,
+        viscosity=parameters.viscosity,
+        friction=parameters.friction,
+        wall_distance=parameters.wall_distance,
+        lip_drop=parameters.lip_drop,
+        grids=[container.grid, NOTHING],
+        masks=[container.inside, NOTHING.cavity],
+        walls=[container.wall, 1e-3],
+        rims=[container.rim, NO_RIM],
+        receiver_at=FAR_AWAY,
+        spill_level=spill_level,
+        poses=still_pose(float(times[-1])) if poses is None else poses,
+        start_time=-settling,
+    )
+    for k, time in enumerate(times):
+        fluid.advance(float(time))
+        if fluid.fault is not None:
+            raise ArithmeticError(f"at {fluid.time:.3f} s: {fluid.fault}")
+        yield k

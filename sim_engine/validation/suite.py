@@ -1,0 +1,203 @@
+"""The cases by name: what each is about, and at which resolutions it runs in short and in full."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sim_engine.liquid import SimulationParameters
+from sim_engine.pour import PourSimulator
+from sim_engine.validation import at_rest, pours, tilting, walls
+from sim_engine.validation.result import CaseResult, Figure, Measurement, Series
+
+PLAIN = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.0)
+"""θ of the cases: what their references assume. Water's own viscosity is not felt in a cup, a liquid has no dry
+friction, and tension acts on drips only; a little XSPH viscosity stands for what a finer solver would resolve."""
+
+LOAD = 200e-6
+"""What the cups hold [m³]."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much to spend.
+
+    Attributes:
+        full: all resolutions and seeds; else the quick subset.
+        pours: random pours against walls; None: what the effort implies.
+    """
+
+    full: bool = False
+    pours: int | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case.
+
+    Attributes:
+        name: for the command line.
+        title: for tables and pages.
+        about: setup, reference and source, in a sentence or two.
+        work: runs it.
+    """
+
+    name: str
+    title: str
+    about: str
+    work: Callable[[PourSimulator, Effort], tuple[list[Measurement], Figure | None]]
+
+    def run(self, simulator: PourSimulator, effort: Effort) -> CaseResult:
+        """Run it and take the CPU time.
+
+        Raises:
+            ArithmeticError: the solver stopped with a fault.
+        """
+        begun = time.process_time()
+        measurements, figure = self.work(simulator, effort)
+        return CaseResult(tuple(measurements), figure, time.process_time() - begun)
+
+
+def solver_fingerprint() -> str:
+    """Hash of the sources of the solver and its vessels: results with the same one belong together."""
+    root = Path(__file__).parent.parent
+    digest = hashlib.sha256()
+    for file in sorted([*root.glob("*.py"), *root.glob("fluid/*.py"), *root.glob("vessel/*.py")]):
+        digest.update(file.name.encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def describe(parameters: SimulationParameters) -> str:
+    """θ but for its number of particles, as people read it."""
+    units = {name: info.unit for name, info in SimulationParameters.info().items()}
+    shown = [
+        f"{name.replace('_', ' ')} {value:g} {units[name]}".removesuffix(" 1")
+        for name, value in parameters.model_dump().items()
+        if name != "particles"
+    ]
+    return ", ".join(shown)
+
+
+def _at_rest(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    for n in (2_000, 5_000) if effort.full else (2_000,):
+        measurements, figure = at_rest.at_rest(n, PLAIN)
+        found += measurements
+        curves += figure.series
+    # the limit is drawn once
+    unique = {(s.name, s.kind): s for s in curves}
+    return found, replace(figure, series=tuple(unique.values()))
+
+
+def _retention(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    if effort.full:
+        runs = [
+            (tilting.straight_cup(), 2_000, tilting.ANGLES),
+            (tilting.straight_cup(), 5_000, tilting.ANGLES),
+            (tilting.conical_cup(), 2_000, tilting.ANGLES),
+            (tilting.mesh_jug(), 2_000, tilting.ANGLES),
+        ]
+    else:
+        runs = [(tilting.straight_cup(), 2_000, tilting.ANGLES[-1:])]
+    for vessel, particles, angles in runs:
+        measurements, series = tilting.slow_tilt(vessel, LOAD, particles, PLAIN, angles)
+        found += measurements
+        curves += [s for s in series if s not in curves]
+    return found, tilting.retention_figure(curves)
+
+
+def _outflow(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    for n in (2_000, 5_000, 10_000) if effort.full else (2_000,):
+        measurements, series = pours.outflow(simulator, n, PLAIN)
+        found += measurements
+        curves += series
+    return found, pours.outflow_figure(curves)
+
+
+def _delivered(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], None]:
+    return pours.delivered(simulator, 2_000, PLAIN, seeds=10 if effort.full else 3), None
+
+
+def _jet(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], Figure]:
+    return pours.free_jet(simulator, 5_000 if effort.full else 1_000, PLAIN)
+
+
+def _walls(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], None]:
+    many = effort.pours if effort.pours is not None else 40 if effort.full else 5
+    return walls.walls(many, 10_000 if effort.full else 1_500), None
+
+
+def _repeatability(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], None]:
+    return pours.repeatability(simulator, 2_000 if effort.full else 500, PLAIN), None
+
+
+CASES: tuple[Case, ...] = (
+    Case(
+        "rest",
+        "Liquid at rest",
+        "200 mL in a cup of radius 40 mm stand 39.8 mm high (hydrostatics). Means over 0.2 s after the first second; "
+        "the height is twice that of the mass centre, the density inside is that of Voronoi cells.",
+        _at_rest,
+    ),
+    Case(
+        "retention",
+        "Slow-tilt retention",
+        "A cup tilted at 3 °/s or slower, and held at each angle until it has stopped to drain, keeps what lies below "
+        "the horizontal plane through its lip (numerical integration over the true geometry). Cylinder, cone and a "
+        "jug with a spout from a mesh.",
+        _retention,
+    ),
+    Case(
+        "outflow",
+        "Outflow of the standard pour",
+        "200 mL, 30 °/s to 120° about the inner lip. Reference: two solvers of SPlisHSPlasH (DFSPH, PBF), which agree "
+        "within 0.016.",
+        _outflow,
+    ),
+    Case(
+        "delivered",
+        "Delivery of the standard pour",
+        "The same pour into a cup that it can't miss, over seeds.",
+        _delivered,
+    ),
+    Case(
+        "jet",
+        "Free jet",
+        "Below the lip and above the receiver nothing acts on a parcel of liquid but gravity.",
+        _jet,
+    ),
+    Case(
+        "walls",
+        "Walls",
+        "Random pours: walls from 1 mm, up to 180 °/s, 500 particles and more. Every particle that crosses a wall is "
+        "counted, never called spilled.",
+        _walls,
+    ),
+    Case(
+        "repeatability",
+        "Repeatability",
+        "The standard pour, twice with one seed and once with another.",
+        _repeatability,
+    ),
+)
+
+
+def case(name: str) -> Case:
+    """A case by its name.
+
+    Raises:
+        KeyError: there is none; the message names those there are.
+    """
+    for candidate in CASES:
+        if candidate.name == name:
+            return candidate
+    raise KeyError(f"no case '{name}'; there are {', '.join(c.name for c in CASES)}")
