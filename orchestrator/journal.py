@@ -251,19 +251,29 @@ class Journal(JournalReader):
         self.append_all([Draft(kind, body, stage)])
 
     def append_all(self, drafts: Sequence[Draft]) -> None:
-        """Write several entries in one transaction: all or none."""
+        """Write several entries in one transaction: all or none.
+
+        Raises:
+            JournalError: the file can't be written.
+        """
         durable = any(draft.kind in _DURABLE for draft in drafts)
         if durable != self._durable:
             self._connection.execute(f"pragma synchronous = {'full' if durable else 'normal'}")
             self._durable = durable
         now = time.time()
         rows = [(draft.stage, now, str(draft.kind), canonical(draft.body)) for draft in drafts]
-        self._connection.execute("begin immediate")
         try:
+            self._connection.execute("begin immediate")
             self._connection.executemany("insert into event (stage, t, kind, body) values (?, ?, ?, ?)", rows)
             self._connection.execute("commit")
-        except BaseException:
-            self._connection.execute("rollback")
+        except BaseException as error:
+            if self._connection.in_transaction:  # SQLite itself rolls back where the disk is full
+                self._connection.execute("rollback")
+            if isinstance(error, sqlite3.OperationalError):
+                raise JournalError(
+                    f"{self.path}: can't be written ({error}); what is in it is safe. Is the disk full? "
+                    "Mend that and resume the run"
+                ) from error
             raise
 
     def close(self) -> None:

@@ -187,15 +187,24 @@ def run_in_front_of_people(
             with stdout_for_results():
                 result = asyncio.run(_until_signalled(lambda: work(laboratory), again))
     except (RunError, LaboratoryError) as error:
-        raise RefusalError(
-            f"{error}\nwhat is done so far is kept: {again}", getattr(error, "exit_code", FAILED)
-        ) from None
+        raise RefusalError(f"{error}{_way_on(directory, again)}", getattr(error, "exit_code", FAILED)) from None
+    except OSError as error:
+        if error.errno is None:
+            raise  # not a file's: a defect, which wants its traceback
+        raise RefusalError(f"{error}{_way_on(directory, again)}") from None
     except (asyncio.CancelledError, KeyboardInterrupt):
         raise RefusalError(f"interrupted; nothing is lost. Go on with: {again}", INTERRUPTED) from None
     finally:
         if monitor is not None:
             monitor.close()
     return _report(plan, result, monitor)
+
+
+def _way_on(directory: Path, again: str) -> str:
+    from orchestrator.journal import JOURNAL_NAME
+
+    begun = (directory / JOURNAL_NAME).is_file()
+    return f"\nwhat is done so far is kept: {again}" if begun else "\nnothing had begun"
 
 
 def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finished:

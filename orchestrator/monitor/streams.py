@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -250,7 +249,7 @@ class Streams:
             RuntimeError: it couldn't be written out in time.
         """
         # The file's footer, which viewers need to seek, is written when the sink goes.
-        self._recording.flush(timeout_sec=timedelta(seconds=timeout).total_seconds())
+        self._recording.flush(timeout_sec=timeout)
         self._recording.disconnect()
 
 

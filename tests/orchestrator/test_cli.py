@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -325,6 +326,25 @@ def test_simulate_takes_units_parameters_and_another_receiver(
     assert outcome["particles"] == 350
     assert (outcome["action"]["angular_velocity"], outcome["action"]["x_offset"]) == pytest.approx((1.5, 0.08))
     assert outcome["scene"] == "beaker into tumbler"
+
+
+def test_a_full_disk_ends_a_run_with_its_name_and_advises_no_resuming_of_what_had_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from actors import laboratory
+
+    def full(*args: object, **kwargs: object) -> NoReturn:
+        raise OSError(errno.ENOSPC, "No space left on device", "campaign.rrd")
+
+    write_inputs(tmp_path)
+    monkeypatch.setattr(laboratory, "open_laboratory", full)
+    monkeypatch.chdir(tmp_path)
+    result = invoke("run small.yaml")
+    assert isinstance(result.exception, SystemExit), result.exception
+    assert result.exit_code == 1
+    assert "No space left on device: 'campaign.rrd'" in result.stderr
+    assert "nothing had begun" in result.stderr
+    assert "--resume" not in result.stderr
 
 
 # -- help --------------------------------------------------------------------------------------------------------------
