@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from actors.optimizer import actor as optimizer
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from orchestrator.events import Event, LogLine, PourProgressed, RequestFinished
 from orchestrator.lanes import Deadlines, LaneError
@@ -163,6 +164,10 @@ def test_the_optimiser_may_die_once(tmp_path: Path) -> None:
     run(tmp_path / "run", ToyLaboratory(optimizer=ToyOptimizer(fails=failing(1))), watchers=[events.append])
     assert logical_record(tmp_path / "run") == logical_record(tmp_path / "undisturbed")
     assert any(isinstance(e, LogLine) and "asked once more" in e.text for e in events)
+
+
+def test_an_optimiser_that_hangs_is_replaced_before_the_run_gives_it_up() -> None:
+    assert Deadlines().suggest > (1 + optimizer.RETRIES) * optimizer.DEADLINE
 
 
 def test_an_optimiser_that_dies_twice_fails_the_run_which_can_be_resumed(tmp_path: Path) -> None:

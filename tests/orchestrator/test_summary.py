@@ -1,0 +1,102 @@
+"""The summary of a run: its table for people, its file for programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.report.style import display_value, display_values
+from orchestrator.report.summary import print_summary, summarise, summary_table, write_summary
+from tests.orchestrator import watched
+from tests.orchestrator.reported import shown
+
+
+def test_summary_tells_theta_discrepancies_losses_actions_and_files(
+    results: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    plan = watched.campaign()
+    baselines = {"test": {"mean_predictor": 0.1234, "regression": None}}
+    figures = {"spillage against pours": tmp_path / "spillage.png"}
+    summary = summarise(
+        plan,
+        results,
+        figures=figures,
+        recording=tmp_path / "campaign.rrd",
+        baselines=baselines,
+        totals={"simulations": 60},
+    )
+    deployed = results["narrow cup"]
+    losses = [pour["loss"] for pour in deployed["pours"]]
+    receiver = summary["receivers"]["narrow cup"]
+    assert summary["theta"] == results["calibration"]["theta"]
+    assert summary["simulations"] == 60
+    assert summary["discrepancy"]["test"]["calibrated"] == results["evaluation"]["discrepancy"]["calibrated"]["test"]
+    assert summary["discrepancy"]["test"]["random_theta"] == results["evaluation"]["random_median"]["test"]
+    assert (receiver["first_loss"], receiver["best_loss"]) == (losses[0], min(losses))
+    assert receiver["best_pour"] == 1 + losses.index(min(losses))
+    assert receiver["best_action"] == deployed["action"]
+
+    text = shown(summary_table(plan, summary))
+    assert display_value("particles", summary["theta"]["particles"]) in text
+    assert "12.34" in text
+    assert f"{100 * min(losses):.2f} % (pour {receiver['best_pour']})" in text
+    assert display_values(deployed["action_si"]) in text
+    assert "campaign.rrd" in text
+
+
+def test_summary_file_reads_back_as_what_was_summarised(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
+    summary = summarise(watched.campaign(), results)
+    path = write_summary(tmp_path / "run", summary)
+    assert path.name == "summary.json"
+    assert json.loads(path.read_text(encoding="utf-8")) == summary
+    assert [p.name for p in path.parent.iterdir()] == ["summary.json"]
+
+
+def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_events(
+    results: dict[str, dict[str, Any]],
+) -> None:
+    poured = {**results["narrow cup"], "failed_pours": 2, "trust": {"z_scores": [9.0, 9.0, 9.0], "alarm": True}}
+    plan = watched.campaign()
+    text = shown(summary_table(plan, summarise(plan, {"narrow cup": poured}, dropped_events=12)))
+    assert "the simulator may not fit this vessel" in text
+    assert "2 pour(s) failed" in text
+    assert "lacks 12 events" in text
+
+
+def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results: dict[str, dict[str, Any]]) -> None:
+    plan = watched.campaign()
+    planned = {**results["narrow cup"], "strategy": "D1", "pours": []}
+    nothing = {split: {"mean_predictor": None, "regression": None} for split in ("train", "test", "transfer")}
+    text = shown(summary_table(plan, summarise(plan, {"narrow cup": planned}, baselines=nothing)))
+    assert "best expected" in text
+    assert display_values(planned["action_si"]) in text
+    for absent in ("pours", "first", "best measured", "mean |measured", "—"):
+        assert absent not in text
+    fruitless = {**planned, "predicted_loss": None, "action_si": None}
+    text = shown(summary_table(plan, summarise(plan, {"narrow cup": fruitless})))
+    assert "best expected" not in text
+    assert "narrow: nothing was learnt" in text
+
+
+def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
+    results: dict[str, dict[str, Any]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    plan = watched.campaign()
+    recording = Path("/laboratory") / "a-folder-with-a-rather-long-name" / ("x" * 120) / "campaign.rrd"
+    summary = summarise(plan, {"narrow cup": results["narrow cup"]}, recording=recording)
+    print_summary(plan, summary)
+    lines = capsys.readouterr().err.splitlines()
+    assert any(line.endswith(str(recording)) for line in lines)
+    action = display_values(results["narrow cup"]["action_si"])
+    assert any("narrow" in line and "D3" in line and action in line for line in lines)
+
+
+def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:
+    plan = watched.campaign()
+    summary = summarise(plan, {})
+    assert (summary["theta"], summary["receivers"]) == (None, {})
+    assert "narrow-cup" in shown(summary_table(plan, summary))
