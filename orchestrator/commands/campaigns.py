@@ -112,7 +112,7 @@ def plan_pour(
                 "action": result["action"],
                 "action_si": result["action_si"],
                 "predicted_loss": result["predicted_loss"],
-                "predicted_spillage": result.get("predicted_spillage", result["predicted_loss"]),
+                "predicted_spillage": result["predicted_spillage"],
                 "predicted_deviation": result["predicted_deviation"],
                 "loss": plan.deployment.loss.name,
             }

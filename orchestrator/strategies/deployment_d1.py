@@ -5,8 +5,12 @@ from __future__ import annotations
 import math
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
-from orchestrator.requests import Prediction
+from orchestrator.plan import DeploymentPlan
+from orchestrator.requests import Outcome, Prediction, Request, Simulate, Simulated
 from orchestrator.strategies.deployment import MAP_RESOLUTION, Deployment
+from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import normalised_spillage
+from sim_engine.task import Scene
 
 
 class OneShotPlanning(Deployment):
@@ -22,6 +26,16 @@ class OneShotPlanning(Deployment):
     """
 
     NAME = "D1"
+
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        super().__init__(plan, scene, parameters, seed)
+        self._spillages: dict[Simulate, float | None] = {}
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """As every deployment; and how much each simulation spilled, whatever the loss is."""
+        super().tell(request, outcome)
+        if isinstance(request, Simulate) and isinstance(outcome, Simulated):
+            self._spillages[request] = normalised_spillage(outcome.outcome.fractions)
 
     def _next(self, free_simulations: int) -> None:
         done, wanted = len(self._trials), max(self._plan.iterations, 1)
@@ -66,3 +80,12 @@ class OneShotPlanning(Deployment):
         repeats = max(self._plan.simulations_per_iteration, 1)
         pours = 1 if self._plan.pours else 0
         return self._trials.answered + self._counted, max(self._plan.iterations, 1) * repeats + pours
+
+    def result(self) -> dict[str, object]:
+        """As every deployment; with the mean r = spilled / poured of the simulations of the recommended action."""
+        result = super().result()
+        if self._final is not None and self._final.best_point is not None:
+            tried = [trial for trial in self._trials.all if trial.point == self._final.best_point]
+            known = [r for trial in tried for q in trial.requests if (r := self._spillages.get(q)) is not None]
+            result["predicted_spillage"] = sum(known) / len(known) if known else None
+        return result

@@ -102,6 +102,17 @@ def test_d1_averages_its_simulations_of_an_action():
     assert len({r.seed for r in played.simulations}) == 18
 
 
+def test_d1_predicts_the_spillage_of_its_action_whatever_it_minimised():
+    strategy = make("D1", pours=0, loss=Loss("grams"))
+    told = Play(lambda *pour: 0.1 + 0.5 * narrow_cup(*pour))(strategy).told
+    result = strategy.result()
+    chosen = SCENE.action(result["action_si"])
+    simulated = [o.outcome.fractions for r, o in told if isinstance(r, Simulate) and r.action == chosen]
+    assert len(simulated) == 2
+    assert result["predicted_spillage"] == pytest.approx(np.mean([f.spilled / f.poured for f in simulated]))
+    assert result["predicted_loss"] > 10 * result["predicted_spillage"]  # in grams of 200
+
+
 def test_a_zero_mean_pours_worse_than_a_constant_one():
     # to a zero mean everything unexplored is perfect, so that it tries the corners of the plateau one by one
     spills = {
