@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim_engine.cache import cache_directory
 from sim_engine.fluid.state import SUPPORT, VESSELS, FluidState, ParticleState
-from sim_engine.fluid.step import Stepper
+from sim_engine.fluid.step import GRAVITY, LONGEST_STEP, Stepper
 from sim_engine.vessel.sdf import SignedDistanceGrid
 
 CAPACITY = 50_000
@@ -61,6 +61,8 @@ class FluidEngine:
         spill_level: float,
         poses: NDArray[np.float64],
         start_time: float,
+        gravity: float = GRAVITY,
+        longest_step: float = LONGEST_STEP,
     ) -> None:
         """Set up a scene.
 
@@ -78,6 +80,8 @@ class FluidEngine:
             spill_level: below it and in no vessel a particle is spilled [m].
             poses: (T, 7) of the pourer, `POSE_STEP` apart, from time 0 on; before it the first pose holds.
             start_time: ≤ 0; the time up to 0 lets the lattice settle [s].
+            gravity: downwards [m/s²].
+            longest_step: [s]; gravity, spacing and speeds may shorten it further.
         """
         f = self.state
         count = len(positions)
@@ -86,6 +90,7 @@ class FluidEngine:
         f.particles[0], f.spacing[0] = count, spacing
         f.attraction[0], f.viscosity[0], f.friction[0] = pair_acceleration, viscosity, friction
         f.lip_drop[0] = lip_drop
+        f.gravity[0], f.longest_step[0] = gravity, longest_step
         f.wall_shift[0] = (wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
         offset = 0
         for b in range(VESSELS):

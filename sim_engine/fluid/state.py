@@ -65,6 +65,8 @@ class FluidState:
         self.attraction = ti.field(ti.f32, shape=scenes)  # peak cohesive acceleration of one pair [m/s²]
         self.viscosity = ti.field(ti.f32, shape=scenes)
         self.friction = ti.field(ti.f32, shape=scenes)
+        self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
+        self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
         self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles by so many spacings
         self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if that much nearer, in supports h
         self.table_step = ti.field(ti.f32, shape=scenes)  # of the pose table [s]

@@ -90,7 +90,7 @@ class Stepper:
             x0 = f.x[s, i]
             f.x0[s, i] = x0
             v = f.v[s, i]
-            v[2] -= GRAVITY * dt
+            v[2] -= f.gravity[s] * dt
             x = x0 + dt * v
             # φ is that of the end of the last step: solid farther off than the way can't be met.
             reach = STRETCH * (dt * v.norm() + f.swing[s]) + 2.0 * clear
@@ -237,7 +237,7 @@ class Stepper:
         f = self.state
         for i in range(f.moving[s], f.particles[s]):
             if f.x[s, i][2] > 0.0:
-                f.v[s, i][2] = f.v[s, i][2] - GRAVITY * dt
+                f.v[s, i][2] = f.v[s, i][2] - f.gravity[s] * dt
                 x = f.x[s, i] + dt * f.v[s, i]
                 x[2] = ti.max(x[2], 0.0)
                 f.x[s, i] = x
@@ -247,7 +247,7 @@ class Stepper:
         """One time step of one scene."""
         f = self.state
         fastest = self.top_speed(s)
-        longest = ti.min(LONGEST_STEP, PACE * ti.sqrt(f.spacing[s] / GRAVITY))
+        longest = ti.min(f.longest_step[s], PACE * ti.sqrt(f.spacing[s] / ti.max(f.gravity[s], 1e-3)))
         dt = ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), longest)
         ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)
         f.dt[s] = dt
