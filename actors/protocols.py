@@ -33,7 +33,7 @@ class Frames:
     Attributes:
         times: (F,) [s].
         positions: F arrays of shape (N, 3), world frame [m], float32.
-        states: F arrays of shape (N,), uint8: see `sim_engine.fluid.state.ParticleState`.
+        states: F arrays of shape (N,), uint8: see `sim_engine.outcome.ParticleState`.
         pourer_poses: (F, 7) float: x y z qw qx qy qz of the pourer's frame.
     """
 

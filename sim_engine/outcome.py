@@ -3,7 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import Any
+
+
+class ParticleState(IntEnum):
+    """Where a particle is. Those from SPILLED on have left the solver for good."""
+
+    IN_POURER = 0
+    IN_FLIGHT = 1
+    RECEIVED = 2
+    SPILLED = 3
+    ESCAPED = 4
+
 
 ESCAPED_LIMIT = 0.002
 """Largest escaped fraction of a valid simulation: above it the solver has leaked, and nothing it says counts."""

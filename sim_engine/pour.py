@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sim_engine.contact import describe_contact, first_contact
+from sim_engine.contact import describe_contact, first_contact, rotations
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fill import fill, spacing
 from sim_engine.motion import Motion, plan_motion
-from sim_engine.outcome import ESCAPED_LIMIT, PourOutcome
+from sim_engine.outcome import ESCAPED_LIMIT, ParticleState, PourOutcome
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.errors import VesselError
@@ -27,6 +27,7 @@ from sim_engine.vessel.vessel import Vessel, check_holds
 
 if TYPE_CHECKING:
     from sim_engine.action import Action
+    from sim_engine.fluid.engine import FluidEngine
 
 __all__ = [
     "InvalidSceneError",
@@ -59,7 +60,7 @@ class RecordedFrames:
     Attributes:
         times: (F,) [s].
         positions: F arrays (N, 3) float32, world [m].
-        states: F arrays (N,) uint8, `sim_engine.fluid.state.ParticleState`.
+        states: F arrays (N,) uint8, `sim_engine.outcome.ParticleState`.
         pourer_poses: (F, 7): x y z qw qx qy qz.
     """
 
@@ -155,22 +156,32 @@ class PourSimulator:
             InvalidSceneError: the pour can't be made.
             SimulationCancelled: `cancelled` said so.
         """
-        from sim_engine.fluid.engine import POSE_STEP, engine
-        from sim_engine.fluid.kernels import cohesion_strength
-        from sim_engine.fluid.state import SUPPORT, ParticleState
+        from sim_engine.fluid.engine import engine
 
         motion = self.prepare(task)
+        fluid = engine()
+        self._load(fluid, task, motion)
+        begun = time.process_time()
+        fluid.advance(0.0)
+        course = _run(fluid, task, motion, cancelled)
+        outcome = _outcome(fluid, task, course, time.process_time() - begun)
+        return SimulationRun(outcome, course.recorded(motion))
+
+    def _load(self, fluid: FluidEngine, task: PourTask, motion: Motion) -> None:
+        """Put the scene's vessels, motion and liquid into the engine."""
+        from sim_engine.fluid.engine import POSE_STEP
+        from sim_engine.fluid.kernels import cohesion_strength
+        from sim_engine.fluid.state import SUPPORT
+
         scene, parameters, error = task.scene, task.parameters, task.pose_error or PoseError()
         pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
         d = spacing(scene.liquid.volume, parameters.particles)
-        latest = motion.duration + LONGEST_TAIL
-        poses = motion.sample(np.arange(0.0, latest + 0.1, POSE_STEP))
+        poses = motion.sample(np.arange(0.0, motion.duration + LONGEST_TAIL + 0.1, POSE_STEP))
         # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
         local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed, parameters.wall_distance)
-        positions = _to_world(local, poses[0])
-        fluid = engine()
+        (rotation,) = rotations(poses[:1])
         fluid.load(
-            positions,
+            (local @ rotation.T + poses[0, :3]).astype(np.float32),
             spacing=d,
             pair_acceleration=cohesion_strength(parameters.cohesion, d, SUPPORT * d) / (scene.liquid.density * d**3),
             viscosity=parameters.viscosity,
@@ -186,64 +197,6 @@ class PourSimulator:
             poses=poses,
             start_time=-SETTLING,
         )
-        n = parameters.particles
-        times, poured, spilled = [0.0], [0.0], [0.0]
-        frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]] = []
-        next_frame = 0.0
-        still_since: float | None = None
-        begun = time.process_time()
-        clock, slices = 0.0, 0
-        fluid.advance(0.0)
-        while True:
-            counts = fluid.census()
-            if task.record_rate > 0.0 and clock >= next_frame:
-                frames.append((fluid.time, *fluid.particles()))
-                next_frame += 1.0 / task.record_rate
-            if slices > 0:
-                times.append(fluid.time)
-                poured.append(1.0 - counts[ParticleState.IN_POURER] / n)
-                spilled.append(counts[ParticleState.SPILLED] / n)
-            if fluid.fault is not None or clock >= latest:
-                break
-            # Over when nothing is in flight and nothing can start to fly.
-            still = counts[ParticleState.IN_FLIGHT] == 0
-            still_since = (clock if still_since is None else still_since) if still else None
-            done = clock >= motion.duration or counts[ParticleState.IN_POURER] == 0
-            if still_since is not None and done and clock - still_since >= QUIET:
-                break
-            if cancelled is not None and cancelled():
-                raise SimulationCancelled
-            slices += 1
-            clock = slices * SLICE
-            fluid.advance(clock)
-        cpu = time.process_time() - begun
-        counts = fluid.census()
-        parts = counts / n
-        invalid = fluid.fault
-        if invalid is None and parts[ParticleState.ESCAPED] > ESCAPED_LIMIT:
-            invalid = (
-                f"{100 * parts[ParticleState.ESCAPED]:.2g} % of the particles crossed vessel walls "
-                f"(at most {100 * ESCAPED_LIMIT:g} % is accepted)"
-            )
-        outcome = PourOutcome(
-            received=float(parts[ParticleState.RECEIVED]),
-            spilled=float(parts[ParticleState.SPILLED]),
-            retained=float(parts[ParticleState.IN_POURER]),
-            in_flight=float(parts[ParticleState.IN_FLIGHT]),
-            escaped=float(parts[ParticleState.ESCAPED]),
-            particles=n,
-            spacing=d,
-            density_error=fluid.mean_compression,
-            simulated_time=fluid.time,
-            steps=fluid.steps,
-            cpu_s=cpu,
-            seed=task.seed,
-            curve_times=tuple(float(t) for t in times),
-            curve_poured=tuple(float(p) for p in poured),
-            curve_spilled=tuple(float(p) for p in spilled),
-            invalid=invalid,
-        )
-        return SimulationRun(outcome, _frames(frames, motion) if frames else None)
 
     def close(self) -> None:
         """End Taichi; compiled kernels are kept for the next process."""
@@ -252,19 +205,93 @@ class PourSimulator:
         close_engine()
 
 
-def _to_world(points: NDArray[np.float32], pose: NDArray[np.float64]) -> NDArray[np.float32]:
-    w, x, y, z = pose[3:]
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+@dataclass
+class _Course:
+    """What was seen of a pour on the way."""
+
+    times: list[float] = field(default_factory=lambda: [0.0])
+    poured: list[float] = field(default_factory=lambda: [0.0])
+    spilled: list[float] = field(default_factory=lambda: [0.0])
+    frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]] = field(default_factory=list)
+
+    def recorded(self, motion: Motion) -> RecordedFrames | None:
+        """The frames, if any were asked for."""
+        if not self.frames:
+            return None
+        times = np.array([t for t, _, _ in self.frames])
+        positions, states = [p for _, p, _ in self.frames], [s for _, _, s in self.frames]
+        return RecordedFrames(times, positions, states, motion.sample(times))
+
+
+def _run(fluid: FluidEngine, task: PourTask, motion: Motion, cancelled: Callable[[], bool] | None) -> _Course:
+    """Advance slice by slice until nothing can change any more, or a fault stops it.
+
+    Raises:
+        SimulationCancelled: `cancelled` said so.
+    """
+    course = _Course()
+    n = task.parameters.particles
+    next_frame = 0.0
+    still_since: float | None = None
+    slices = 0
+    while True:
+        clock = slices * SLICE
+        counts = fluid.census()
+        if task.record_rate > 0.0 and clock >= next_frame:
+            course.frames.append((fluid.time, *fluid.particles()))
+            next_frame += 1.0 / task.record_rate
+        if slices > 0:
+            course.times.append(fluid.time)
+            course.poured.append(1.0 - float(counts[ParticleState.IN_POURER]) / n)
+            course.spilled.append(float(counts[ParticleState.SPILLED]) / n)
+        if fluid.fault is not None or clock >= motion.duration + LONGEST_TAIL:
+            return course
+        # Over when nothing is in flight and nothing can start to fly.
+        still = counts[ParticleState.IN_FLIGHT] == 0
+        still_since = (clock if still_since is None else still_since) if still else None
+        done = clock >= motion.duration or counts[ParticleState.IN_POURER] == 0
+        if still_since is not None and done and clock - still_since >= QUIET:
+            return course
+        if cancelled is not None and cancelled():
+            raise SimulationCancelled
+        slices += 1
+        fluid.advance(slices * SLICE)
+
+
+def _outcome(fluid: FluidEngine, task: PourTask, course: _Course, cpu_s: float) -> PourOutcome:
+    """Count where everybody ended."""
+    n = task.parameters.particles
+    received, spilled, retained, in_flight, escaped = (
+        float(fluid.census()[state]) / n
+        for state in (
+            ParticleState.RECEIVED,
+            ParticleState.SPILLED,
+            ParticleState.IN_POURER,
+            ParticleState.IN_FLIGHT,
+            ParticleState.ESCAPED,
+        )
     )
-    moved: NDArray[np.float32] = (points @ rotation.T + pose[:3]).astype(np.float32)
-    return moved
-
-
-def _frames(frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]], motion: Motion) -> RecordedFrames:
-    times = np.array([t for t, _, _ in frames])
-    return RecordedFrames(times, [p for _, p, _ in frames], [s for _, _, s in frames], motion.sample(times))
+    invalid = fluid.fault
+    if invalid is None and escaped > ESCAPED_LIMIT:
+        invalid = (
+            f"{100 * escaped:.2g} % of the particles crossed vessel walls "
+            f"(at most {100 * ESCAPED_LIMIT:g} % is accepted)"
+        )
+    return PourOutcome(
+        received=received,
+        spilled=spilled,
+        retained=retained,
+        in_flight=in_flight,
+        escaped=escaped,
+        particles=n,
+        spacing=spacing(task.scene.liquid.volume, n),
+        density_error=fluid.mean_compression,
+        simulated_time=fluid.time,
+        steps=fluid.steps,
+        cpu_s=cpu_s,
+        seed=task.seed,
+        curve_times=tuple(course.times),
+        curve_poured=tuple(course.poured),
+        curve_spilled=tuple(course.spilled),
+        invalid=invalid,
+    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,8 +43,6 @@ def shown(value: float | None, unit: str) -> str:
     """A quantity as people read it, from its SI value: '39.8 mm', '0.92'; '—' for None."""
     if value is None:
         return "—"
-    if not math.isfinite(value):
-        return "none"
     factor, name = SHOWN_UNITS.get(unit, (1.0, unit))
     number = f"{value * factor:.4g}" if abs(value * factor) < 1000 else f"{value * factor:,.0f}".replace(",", " ")
     return f"{number} {name}".rstrip()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orchestrator.report import style
 from orchestrator.report.section import Floats, Solid, fill_section, place, section
+from sim_engine.outcome import ParticleState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from actors.protocols import SimulationResult
     from sim_engine.task import PourTask
 
-IN_POURER, _FALLING, _RECEIVED, SPILLED, _ESCAPED = range(5)
+IN_POURER, _FALLING, _RECEIVED, SPILLED, _ESCAPED = (int(state) for state in ParticleState)
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 

@@ -35,7 +35,7 @@ PARTICLE_STATES: tuple[tuple[str, str], ...] = (
     ("spilled", SPILLED),
     ("escaped through a wall", ESCAPED),
 )
-"""Meaning and colour of `sim_engine.fluid.state.ParticleState`, by its value."""
+"""Meaning and colour of `sim_engine.outcome.ParticleState`, by its value."""
 
 PARAMETER_NAMES = {"particles": "number of particles", "friction": "wall friction"}
 

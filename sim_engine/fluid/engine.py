@@ -8,8 +8,9 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim_engine.cache import cache_directory
-from sim_engine.fluid.state import SUPPORT, VESSELS, FluidState, ParticleState
+from sim_engine.fluid.state import SUPPORT, VESSELS, FluidState
 from sim_engine.fluid.step import GRAVITY, LONGEST_STEP, Stepper
+from sim_engine.outcome import ParticleState
 from sim_engine.vessel.sdf import SignedDistanceGrid
 
 CAPACITY = 50_000

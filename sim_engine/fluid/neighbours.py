@@ -5,7 +5,8 @@ Source: Green 2010 (counting sort on a grid); Verlet 1967 (lists with a skin).
 
 import taichi as ti
 
-from sim_engine.fluid.state import SUPPORT, ParticleState
+from sim_engine.fluid.state import SUPPORT
+from sim_engine.outcome import ParticleState
 
 LIST_RESERVE = 2_000
 """Entries that one particle may add before the overflow check sees them; far above any packing."""

@@ -1,7 +1,5 @@
 """Arrays of the solver, apart from its algorithm. One set holds several scenes of up to `capacity` particles each."""
 
-from enum import IntEnum
-
 import taichi as ti
 
 SUPPORT = 2.0
@@ -9,16 +7,6 @@ SUPPORT = 2.0
 
 VESSELS = 2
 """Pourer (0) and receiver (1)."""
-
-
-class ParticleState(IntEnum):
-    """Where a particle is. Those from SPILLED on have left the solver for good."""
-
-    IN_POURER = 0
-    IN_FLIGHT = 1
-    RECEIVED = 2
-    SPILLED = 3
-    ESCAPED = 4
 
 
 @ti.data_oriented
@@ -31,7 +19,7 @@ class FluidState:
         density: ρ/ρ₀.
         phi, normal: signed distance to each vessel [m] at the last look, linearised in between; its gradient.
         push: normal displacement given by each wall in this step [m].
-        home: see `ParticleState`; `name`: index before any sorting.
+        home: see `sim_engine.outcome.ParticleState`; `name`: index before any sorting.
         gradient, squares: Σ∇W and what the constraint's gradients amount to, Σ|∇C|².
         first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
     """

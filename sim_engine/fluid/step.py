@@ -11,8 +11,9 @@ import taichi as ti
 from sim_engine.fluid.density import displace, measure, measure_first, multiply
 from sim_engine.fluid.forces import interact
 from sim_engine.fluid.neighbours import rebuild
-from sim_engine.fluid.state import VESSELS, FluidState, ParticleState
+from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
+from sim_engine.outcome import ParticleState
 
 GRAVITY = 9.81
 CFL = 1.2
