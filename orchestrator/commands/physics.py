@@ -46,8 +46,6 @@ def physics(
                 if write is not None and result.figure is not None:
                     image = report.draw(result.figure, write / report.IMAGES / f"validation-{case.name}.png")
             records[case.name] = report.case_record(case, result, image)
-    except ArithmeticError as error:
-        raise RefusalError(f"{case.name}: the solver stopped {error}") from None
     finally:
         simulator.close()
     if write is not None:

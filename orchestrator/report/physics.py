@@ -35,7 +35,8 @@ written by
 decant physics --full --write docs
 ```
 
-θ of all cases unless they say otherwise: {theta}. N is the number of particles.
+θ of all cases unless they say otherwise: {theta}.
+N is the number of particles.
 """
 
 
@@ -112,7 +113,7 @@ def _panel(axes: Axes, figure: Figure, number: int) -> None:
     if figure.log_x:
         axes.set_xscale("log")
     style.dress(axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both")
-    axes.legend(fontsize=8, frameon=False)
+    axes.legend(fontsize=8, framealpha=0.85, edgecolor="none")
 
 
 def case_record(case: Case, result: CaseResult, image: Path | None) -> dict[str, Any]:

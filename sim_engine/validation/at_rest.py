@@ -117,3 +117,48 @@ def at_rest(particles: int, parameters: SimulationParameters, seed: int = 1) -> 
         ),
     )
     return measurements, figure
+
+
+SLIM_RADIUS, SLIM_VOLUME = 0.027, 240e-6
+SLIM_HEIGHT = SLIM_VOLUME / (math.pi * SLIM_RADIUS**2)
+SLIM_CUP = cylinder("slim cup", inner_radius=SLIM_RADIUS, inner_height=0.115)
+
+
+def tall_column(particles: int, parameters: SimulationParameters) -> list[Measurement]:
+    """A slim cup that is nearly full stands still for a second: many layers of particles, where pressure adds up.
+
+    Args:
+        particles: N.
+        parameters: θ; its number of particles is replaced.
+    """
+    from sim_engine.fluid.engine import engine
+    from sim_engine.outcome import ParticleState
+
+    vessel = build_vessel(SLIM_CUP)
+    d = spacing(SLIM_VOLUME, particles)
+    start = fill(vessel, SLIM_VOLUME, particles, 1, parameters.wall_distance).astype(float)
+    heights = []
+    for _ in run(start, d, Container.of(vessel), parameters, WINDOW):
+        x, homes = engine().particles()
+        inside = homes == ParticleState.IN_POURER
+        heights.append(2.0 * float(np.mean(x[inside, 2].astype(float)) - vessel.inner_floor))
+    layers = f"{SLIM_HEIGHT / d:.0f} layers"
+    return [
+        within(
+            f"still in the cup after a second, {layers}",
+            float(engine().census()[ParticleState.IN_POURER] / particles),
+            1.0,
+            0.0,
+            criterion="all of it",
+            particles=particles,
+        ),
+        within(
+            f"height of the surface, {layers}",
+            float(np.mean(heights)),
+            SLIM_HEIGHT,
+            0.02 * SLIM_HEIGHT,
+            unit="m",
+            criterion="within 2 %",
+            particles=particles,
+        ),
+    ]

@@ -151,7 +151,7 @@ def free_jet(
         particles: N.
         parameters: θ; its number of particles is replaced.
     """
-    from sim_engine.fluid.state import ParticleState
+    from sim_engine.outcome import ParticleState
 
     rate, span = 50.0, 5  # frames are taken every 0.02 s at most
     theta = parameters.model_copy(update={"particles": particles})

@@ -41,10 +41,10 @@ class Measurement:
         return self.lower <= self.value <= self.upper
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping; open bounds are None."""
+        """JSON-ready mapping; open bounds, and values that could not be measured, are None."""
         return {
             "name": self.name,
-            "value": self.value,
+            "value": self.value if math.isfinite(self.value) else None,
             "unit": self.unit,
             "reference": self.reference,
             "lower": self.lower if math.isfinite(self.lower) else None,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import inside_mask
 from sim_engine.vessel.sdf import SignedDistanceGrid
@@ -76,6 +77,8 @@ def run(
     poses: Floats | None = None,
     settling: float = 0.0,
     spill_level: float = -1e2,
+    gravity: float = GRAVITY,
+    longest_step: float | None = None,
 ) -> Iterator[int]:
     """Load a scene and run it to each of some times.
 
@@ -88,6 +91,8 @@ def run(
         poses: the vessel's, one per `POSE_STEP` from time 0 on; None: it stands at the origin.
         settling: time before 0 in which the first pose holds [s].
         spill_level: below it and outside the vessel a particle leaves the solver [m].
+        gravity: downwards [m/s²].
+        longest_step: in place of the solver's own [s].
 
     Yields:
         The index of each time when it has been reached: then the engine may be looked at.
@@ -117,6 +122,8 @@ def run(
         spill_level=spill_level,
         poses=still_pose(float(times[-1])) if poses is None else poses,
         start_time=-settling,
+        gravity=gravity,
+        **({} if longest_step is None else {"longest_step": longest_step}),
     )
     for k, time in enumerate(times):
         fluid.advance(float(time))

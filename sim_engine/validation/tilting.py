@@ -134,7 +134,7 @@ def slow_tilt(
         seed: of the initial positions.
     """
     from sim_engine.fluid.engine import POSE_STEP, engine
-    from sim_engine.fluid.state import ParticleState
+    from sim_engine.outcome import ParticleState
 
     d = spacing(volume, particles)
     motion, readings = slow_turn(vessel, volume, angles)
@@ -161,13 +161,14 @@ def slow_tilt(
             )
         )
     tilts = motion.tilt(times)
+    late = tilts > spill_angle(vessel, volume) - BEFORE
     shown = np.linspace(spill_angle(vessel, volume), float(tilts[-1]), 40)
     exact = np.array([min(retained_volume(vessel, float(a)), volume) for a in shown])
     curves = [
         Series(
             f"{vessel.name}, {particles:,} particles",
-            tuple(np.degrees(tilts).tolist()),
-            tuple((1e6 * kept).tolist()),
+            tuple(np.degrees(tilts[late]).tolist()),
+            tuple((1e6 * kept[late]).tolist()),
         ),
         Series(
             f"{vessel.name}, at rest", tuple(np.degrees(shown).tolist()), tuple((1e6 * exact).tolist()), "reference"

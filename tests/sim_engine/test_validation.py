@@ -9,7 +9,19 @@ import pytest
 
 from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import PourSimulator
-from sim_engine.validation import at_rest, pours, suite, tilting, walls
+from sim_engine.validation import (
+    at_rest,
+    convergence,
+    dam_break,
+    droplet,
+    pours,
+    sloshing,
+    suite,
+    tanks,
+    tilting,
+    torricelli,
+    walls,
+)
 from sim_engine.validation.result import Measurement, at_least, at_most, reported, within
 
 STICKY = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=1.0)
@@ -87,7 +99,117 @@ def test_a_seed_is_repeated_to_the_bit(simulator: PourSimulator) -> None:
     assert failures(pours.repeatability(simulator, 500, suite.PLAIN)) == []
 
 
+def test_a_damped_oscillation_is_measured_and_noise_is_told_from_it() -> None:
+    t = np.arange(0.0, 1.5, 0.01)
+    frequency, decay = sloshing.fit_oscillation(t, 3.0 + 0.02 * np.exp(-2.5 * t) * np.cos(20.0 * t + 1.0), 3.0)
+    assert 2.0 * math.pi * frequency == pytest.approx(20.0, rel=1e-3)
+    assert decay == pytest.approx(2.5, rel=1e-2)
+
+
+def test_the_first_mode_has_no_flow_through_the_walls_and_no_divergence() -> None:
+    angle = np.linspace(0.0, 2.0 * math.pi, 40)
+    x, y = at_rest.RADIUS * np.cos(angle), at_rest.RADIUS * np.sin(angle)
+    flow = sloshing.first_mode(x, y, np.full(40, 0.02))
+    largest = float(np.abs(sloshing.first_mode(np.full(1, 1e-6), np.zeros(1), np.full(1, 0.02))).max())
+    assert np.abs((flow[:, 0] * x + flow[:, 1] * y) / at_rest.RADIUS).max() < 1e-3 * largest
+    place, step = np.array([0.012, -0.007, 0.02]), 1e-5
+    divergence = 0.0
+    for axis in range(3):
+        ends = [place.copy(), place.copy()]
+        ends[0][axis] -= step
+        ends[1][axis] += step
+        low, high = (sloshing.first_mode(*(e[i : i + 1] for i in range(3)))[0, axis] for e in ends)
+        divergence += (high - low) / (2.0 * step)
+    assert abs(divergence) < 1e-3 * largest / at_rest.RADIUS
+
+
+def test_sloshing_is_near_theory_and_rough_walls_bring_it_to_rest_sooner(simulator: PourSimulator) -> None:
+    """The full case asks for 5 %; what a thousand particles reach is 15 %."""
+    smooth, _ = sloshing.sloshing(1_000, suite.PLAIN)
+    assert smooth[0].value == pytest.approx(sloshing.FREQUENCY, rel=0.15)
+    rough, _ = sloshing.sloshing(1_000, SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.3))
+    assert rough[1].value > smooth[1].value > 0.0
+
+
+def test_tanks_are_closed_where_they_should_be() -> None:
+    tank = tanks.box(0.2, 0.05, 0.1, 0.0025)
+    at = np.array([[0.1, 0.0, 0.03], [0.1, 0.02, 0.05], [-0.005, 0.0, 0.05], [0.1, 0.0, -0.005], [0.1, 0.0, 0.1]])
+    assert tank.grid.sample(at) == pytest.approx([0.025, 0.005, -0.005, -0.005, 0.025], abs=2e-4)
+    open_cup = tanks.holed_cup(0.04, 0.1, 0.01, 0.003, 0.001)
+    closed = tanks.holed_cup(0.04, 0.1, 0.0, 0.003, 0.001)
+    below = np.array([[0.0, 0.0, -0.001], [0.02, 0.0, -0.001], [0.0, 0.0, 0.02], [0.03, 0.0, 0.05]])
+    assert open_cup.grid.sample(below) == pytest.approx([0.01, -0.001, math.hypot(0.01, 0.02), 0.01], abs=2e-4)
+    assert closed.grid.sample(below) == pytest.approx([-0.001, -0.001, 0.02, 0.01], abs=2e-4)
+
+
+def test_a_closed_cup_holds_and_one_with_a_hole_drains(simulator: PourSimulator) -> None:
+    start, d = torricelli.settled(1_000, suite.PLAIN)
+    assert start[:, 2].min() > 0.0
+    assert 2.0 * start[:, 2].mean() == pytest.approx(at_rest.HEIGHT, rel=0.05)
+    assert d == pytest.approx((at_rest.VOLUME / 1_000) ** (1 / 3))
+    _, curves, discharge = torricelli.torricelli(1_000, suite.PLAIN)
+    assert np.all(np.diff(curves[0].y) <= 1e-9)
+    assert 0.2 < discharge < 0.7  # a hole four spacings wide passes too little
+
+
+def test_the_front_of_a_dam_break_runs_as_fast_as_in_the_experiment(simulator: PourSimulator) -> None:
+    measurements, _ = dam_break.dam_break(0.05715, 10, suite.PLAIN)
+    assert failures([m for m in measurements if m.name.startswith("slope")]) == []
+    with_delay = next(m for m in measurements if "with it" in m.name)
+    assert with_delay.value < 0.10
+
+
+def test_cohesion_makes_a_cube_round_and_nothing_else_does(simulator: PourSimulator) -> None:
+    free = SimulationParameters(cohesion=0.0, viscosity=0.0, friction=0.0)
+    measurement = droplet.cube_to_sphere(343, free)[0]
+    assert measurement.passed
+    axis = np.arange(10) - 4.5
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    radii = droplet.surface_radii(cube)
+    assert float(np.max(np.abs(radii - radii.mean()))) > 1.5
+
+
+def test_spillage_over_resolution_is_reported_with_its_spread(simulator: PourSimulator) -> None:
+    measurements, figure = convergence.convergence(simulator, (300, 600), 2, suite.PLAIN)
+    assert len(measurements) == 2 * 2 * len(convergence.RECEIVERS)
+    slim, tumbler, bowl = (s.y[-1] for s in figure.series)
+    assert slim > tumbler > bowl  # a narrower target is missed more
+
+
+def test_a_fault_of_the_solver_is_a_criterion_that_is_not_met(simulator: PourSimulator) -> None:
+    def work(_: PourSimulator, __: suite.Effort) -> tuple[list[Measurement], None]:
+        raise ArithmeticError("at 0.1 s: diverged")
+
+    result = suite.Case("bad", "Bad", "", work).run(simulator, suite.Effort())
+    assert not result.passed
+    assert "diverged" in result.measurements[0].name
+
+
 def test_cases_are_found_by_name_and_a_wrong_name_lists_them() -> None:
     assert [suite.case(c.name) for c in suite.CASES] == list(suite.CASES)
-    with pytest.raises(KeyError, match="no case 'slosh'; there are rest, retention"):
+    with pytest.raises(KeyError, match="no case 'slosh'; there are rest, column"):
         suite.case("slosh")
+
+
+# What the solver did not reach when the case was written, by case: a case that begins to pass, or one that passes no
+# longer, fails the slow test, so that this list stays true.
+NOT_MET = {
+    "rest": "the column keeps breathing up and down, and is 4 % denser at its floor than on top",
+    "column": "columns of thirty layers of particles swing up and leave the cup",
+    "sloshing": "7 % too fast at 2,000 particles, 5 % at 5,000, 3 % at 10,000",
+    "torricelli": "particles' distance from the hole's edge makes it narrower: C_d 0.54 and 0.58",
+    "dam-break": "early fronts lead the experiment's by the time that its gate took; slopes agree",
+    "cohesion": "small drops creep back and do not oscillate",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", [case.name for case in suite.CASES])
+def test_full_case(simulator: PourSimulator, name: str) -> None:
+    result = suite.case(name).run(simulator, suite.Effort(full=True))
+    failed = failures(list(result.measurements))
+    if name in NOT_MET:
+        assert failed != [], f"{name} now meets all its criteria: take it off the list and write the page again"
+    else:
+        assert failed == []

@@ -1,0 +1,104 @@
+"""Torricelli: a cup drains through a hole in its floor, T = (A / (C_d A₀)) √(2H / g), with C_d between 0.61 and 1.
+
+The cup stands closed until the liquid is at rest; then the floor has a hole. √V falls linearly with time, and its slope
+between 0.8 and 0.2 of the load gives C_d, free of how the flow begins and of the last drops.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sim_engine.hydrostatics import GRAVITY
+from sim_engine.liquid import SimulationParameters
+from sim_engine.validation.at_rest import HEIGHT, RADIUS, VOLUME
+from sim_engine.validation.result import Figure, Measurement, Series, within
+from sim_engine.validation.stage import run
+from sim_engine.validation.tanks import block, holed_cup
+
+HOLE = 0.010
+FLOOR = 0.003
+GRID = 0.001
+FIT = (0.8, 0.2)
+SHARP = 0.61
+"""Contraction of a sharp-edged hole's jet: the lower bound of C_d; the upper one is 1."""
+
+RATIO = (RADIUS / HOLE) ** 2
+FASTEST = RATIO * math.sqrt(2.0 * HEIGHT / GRAVITY)
+"""Drain time for C_d = 1: 1.44 s."""
+
+
+def settled(
+    particles: int, parameters: SimulationParameters
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]], float]:
+    """Positions of a load that has come to rest in the closed cup, (N, 3) [m], and the spacing [m]."""
+    from sim_engine.fluid.engine import engine
+
+    d = float(np.cbrt(VOLUME / particles))
+    half = np.array([RADIUS, RADIUS, 0.0])
+    tall = 1.4 * HEIGHT
+    count = round((2 * RADIUS) ** 2 * tall / d**3)
+    lattice, _ = block(-half, half + np.array([0.0, 0.0, tall]), count, 1)
+    places = lattice[np.hypot(lattice[:, 0], lattice[:, 1]) < RADIUS - 0.45 * d]
+    places = places[np.argsort(places[:, 2], kind="stable")][:particles]
+    closed = holed_cup(RADIUS, 0.10, 0.0, FLOOR, GRID)
+    for _ in run(places, d, closed, parameters, np.array([0.8])):
+        pass
+    return engine().particles()[0].astype(float), d
+
+
+def torricelli(particles: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series], float]:
+    """Drain the cup.
+
+    Args:
+        particles: N.
+        parameters: θ; its number of particles is replaced.
+
+    Returns:
+        Measurements, curves and C_d.
+    """
+    from sim_engine.fluid.engine import engine
+
+    start, d = settled(particles, parameters)
+    count = len(start)
+    times = np.arange(0.02, 2.0 * FASTEST, 0.02)
+    left = np.empty(len(times))
+    cup = holed_cup(RADIUS, 0.10, HOLE, FLOOR, GRID)
+    for k in run(start, d, cup, parameters, times, spill_level=-0.02):
+        left[k] = np.count_nonzero(engine().particles()[0][:, 2] > 0.0) / count
+    part = (left <= FIT[0]) & (left >= FIT[1])
+    slope = float(np.polyfit(times[part], np.sqrt(left[part]), 1)[0]) if part.sum() > 2 else math.nan
+    duration = -1.0 / slope
+    discharge = FASTEST / duration
+    measurements = [
+        within(
+            "time to drain",
+            duration,
+            (FASTEST + FASTEST / SHARP) / 2.0,
+            (FASTEST / SHARP - FASTEST) / 2.0,
+            unit="s",
+            criterion=f"C_d from {SHARP:g} to 1: {FASTEST:.2f} to {FASTEST / SHARP:.2f} s",
+            particles=particles,
+        )
+    ]
+    curve = Series(f"{particles:,} particles, C_d {discharge:.2f}", tuple(times.tolist()), tuple(left.tolist()))
+    return measurements, [curve], discharge
+
+
+def steadiness(discharges: dict[int, float]) -> Measurement:
+    """How much C_d changes from the coarsest to the finest."""
+    coarse, fine = min(discharges), max(discharges)
+    change = abs(discharges[fine] / discharges[coarse] - 1.0)
+    name = f"change of C_d from N = {coarse:,}"
+    return within(name, change, 0.0, 0.10, criterion="at most 10 %", particles=fine)
+
+
+def torricelli_figure(curves: list[Series]) -> Figure:
+    """All resolutions between the two bounds."""
+    bounds = []
+    for discharge in (1.0, SHARP):
+        t = np.linspace(0.0, FASTEST / discharge, 60)
+        left = (1.0 - t * discharge / FASTEST) ** 2
+        bounds.append(Series(f"theory, C_d {discharge:g}", tuple(t.tolist()), tuple(left.tolist()), "reference"))
+    return Figure(("Draining through a hole",), ("time [s]",), ("left in the cup",), (*curves, *bounds))
