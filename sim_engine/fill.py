@@ -36,21 +36,29 @@ def fill(vessel: Vessel, volume: float, particles: int, seed: int, wall_distance
     rng = np.random.default_rng(seed)
     d = spacing(volume, particles)
     # A narrow or brimful vessel may leave the lattice too few places: then squeeze it, the solver relaxes it again.
-    for squeeze in (1.0, 0.98, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84):
-        step = d * squeeze
-        reach = vessel.outer_radius + step
-        across = np.arange(-reach, reach, step)
-        shift = rng.uniform(-0.5, 0.5, 2) * step
-        z = np.arange(vessel.inner_floor + wall_distance * d, vessel.rim_height, step)
-        places = np.stack(np.meshgrid(across + shift[0], across + shift[1], z, indexing="ij"), axis=-1).reshape(-1, 3)
-        places = places[vessel.grid.sample(places) >= 0.9 * wall_distance * d]
-        places = places[in_cavity(vessel.grid, places)]
-        if len(places) >= particles:
-            order = np.lexsort((rng.random(len(places)), np.round(places[:, 2] / step)))
-            chosen = places[order[:particles]]
-            chosen += rng.uniform(-JITTER, JITTER, chosen.shape) * d
-            return chosen.astype(np.float32)
+    # Rims are lowered for particles, so the uppermost spacing is used only if nothing else helps.
+    for top in (vessel.rim_height - d, vessel.rim_height):
+        for squeeze in (1.0, 0.98, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84):
+            places = _lattice(vessel, d, d * squeeze, wall_distance, top, rng)
+            if len(places) >= particles:
+                order = np.lexsort((rng.random(len(places)), np.round(places[:, 2] / (d * squeeze))))
+                chosen = places[order[:particles]]
+                chosen += rng.uniform(-JITTER, JITTER, chosen.shape) * d
+                return chosen.astype(np.float32)
     raise InvalidSceneError(
         f"{vessel.name}: {1e6 * volume:.4g} mL as {particles} particles do not fit under the rim (it holds "
         f"{1e6 * vessel.capacity:.4g} mL to the brim); pour less, use more particles, or a larger vessel"
     )
+
+
+def _lattice(
+    vessel: Vessel, d: float, step: float, wall_distance: float, top: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Places of a cubic lattice, shifted at random, in the cavity below `top`, shape (M, 3) [m]."""
+    reach = vessel.outer_radius + step
+    across = np.arange(-reach, reach, step)
+    shift = rng.uniform(-0.5, 0.5, 2) * step
+    z = np.arange(vessel.inner_floor + wall_distance * d, top, step)
+    places = np.stack(np.meshgrid(across + shift[0], across + shift[1], z, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = places[vessel.grid.sample(places) >= 0.9 * wall_distance * d]
+    return places[in_cavity(vessel.grid, places)]

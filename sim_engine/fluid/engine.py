@@ -105,7 +105,8 @@ class FluidEngine:
         f.spill_level[0] = spill_level
         self._poses = np.ascontiguousarray(poses[None], dtype=np.float32)
         f.table_step[0], f.table_length[0] = POSE_STEP, len(poses)
-        f.time[0], f.steps[0], f.rebuilds[0], f.fault[0], f.compression[0] = start_time, 0, 0, 0, 0.0
+        f.time[0], f.compression[0] = start_time, 0.0
+        f.steps[0], f.rebuilds[0], f.iterations[0], f.fault[0] = 0, 0, 0, 0
         self._put(np.ascontiguousarray(positions, dtype=np.float32))
         self.stepper.begin(self._poses)
 

@@ -68,6 +68,7 @@ class FluidState:
         self.dt = ti.field(ti.f32, shape=scenes)
         self.steps = ti.field(ti.i32, shape=scenes)
         self.skin = ti.field(ti.f32, shape=scenes)  # lists reach so many spacings beyond the support
+        self.iterations = ti.field(ti.i32, shape=scenes)
         self.rebuilds = ti.field(ti.i32, shape=scenes)
         self.moving = ti.field(ti.i32, shape=scenes)
         self.stale = ti.field(ti.i32, shape=scenes)  # 1: neighbour lists must be rebuilt

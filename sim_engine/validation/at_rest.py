@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, Voronoi
 from sim_engine.fill import fill, spacing
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquid import SimulationParameters
+from sim_engine.pour import SETTLING
 from sim_engine.validation.result import Figure, Measurement, Series, at_most, within
 from sim_engine.validation.stage import Container, run
 from sim_engine.vessel.build import build_vessel
@@ -138,7 +139,7 @@ def tall_column(particles: int, parameters: SimulationParameters) -> list[Measur
     d = spacing(SLIM_VOLUME, particles)
     start = fill(vessel, SLIM_VOLUME, particles, 1, parameters.wall_distance).astype(float)
     heights = []
-    for _ in run(start, d, Container.of(vessel), parameters, WINDOW):
+    for _ in run(start, d, Container.of(vessel), parameters, WINDOW, settling=SETTLING):
         x, homes = engine().particles()
         inside = homes == ParticleState.IN_POURER
         heights.append(2.0 * float(np.mean(x[inside, 2].astype(float)) - vessel.inner_floor))

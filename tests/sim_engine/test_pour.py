@@ -13,6 +13,7 @@ from sim_engine.hydrostatics import retained_volume
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.pour import InvalidSceneError, PourSimulator, SimulationCancelled, SimulationRun
 from sim_engine.task import PoseError, PourTask, Scene
+from sim_engine.validation.at_rest import tall_column
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import VesselSpec, cylinder
 
@@ -126,6 +127,14 @@ def test_a_cup_at_rest_holds_its_true_volume(simulator: PourSimulator) -> None:
     assert 2.0 * np.mean(still[:, 2] - floor) == pytest.approx(0.0398, rel=0.02)
     radius = np.hypot(still[:, 0] - frames.pourer_poses[-1, 0], still[:, 1])
     assert radius.max() < 0.04
+
+
+def test_deep_liquid_stands_still(simulator: PourSimulator) -> None:
+    """29 layers of particles in a slim cup: nothing swings up, nothing leaves, and the height is that of the volume."""
+    simulator.vessel(CUP)  # the engine is the simulator's
+    kept, height = tall_column(5000, SimulationParameters(cohesion=0.0, friction=0.0, viscosity=1.0))
+    assert kept.value == 1.0
+    assert height.value == pytest.approx(0.1048, rel=0.02)
 
 
 def test_liquid_is_hardly_compressed(simulator: PourSimulator) -> None:
