@@ -233,8 +233,8 @@ def physics(
     write: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the page validation.md, its data and figures; cases not run now keep what the same "
-            "solver wrote there before.",
+            help="Folder for the page validation.md, its data and figures; cases not run now keep what was "
+            "written there before.",
             show_default=False,
         ),
     ] = None,

@@ -45,11 +45,11 @@ def physics(
                 result = case.run(simulator, effort)
                 if write is not None and result.figure is not None:
                     image = report.draw(result.figure, write / report.IMAGES / f"validation-{case.name}.png")
-            records[case.name] = report.case_record(case, result, image)
+            records[case.name] = report.case_record(case, result, image, fingerprint)
     finally:
         simulator.close()
     if write is not None:
-        together = {**report.kept_records(write, fingerprint), **records}
+        together = {**report.kept_records(write), **records}
         theta = suite.describe(suite.PLAIN)
         order = [case.name for case in suite.CASES]
         page = report.write_page(write, together, order, fingerprint=fingerprint, theta=theta)

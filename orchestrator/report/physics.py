@@ -21,6 +21,8 @@ PAGE_NAME, DATA_NAME, IMAGES = "validation.md", "validation.json", "images"
 SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
 """Factor and name of what people see of an SI unit; others are shown as they are."""
 
+AGAIN = "decant physics --full --write docs"
+
 COLOURS = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST, style.FALLING, style.ESCAPED)
 
 INTRODUCTION = """# Validation
@@ -116,9 +118,10 @@ def _panel(axes: Axes, figure: Figure, number: int) -> None:
     axes.legend(fontsize=8, framealpha=0.85, edgecolor="none")
 
 
-def case_record(case: Case, result: CaseResult, image: Path | None) -> dict[str, Any]:
-    """What is kept of a case between runs, JSON-ready; the image by its file name."""
+def case_record(case: Case, result: CaseResult, image: Path | None, fingerprint: str) -> dict[str, Any]:
+    """What is kept of a case between runs, JSON-ready; the image by its file name, the solver by its fingerprint."""
     return {
+        "solver": fingerprint,
         "title": case.title,
         "about": case.about,
         "cpu_s": round(result.cpu_s, 1),
@@ -127,15 +130,10 @@ def case_record(case: Case, result: CaseResult, image: Path | None) -> dict[str,
     }
 
 
-def kept_records(folder: Path, fingerprint: str) -> dict[str, dict[str, Any]]:
-    """Records of cases that an earlier run wrote into a folder, if the same solver measured them."""
+def kept_records(folder: Path) -> dict[str, dict[str, Any]]:
+    """Records of cases that earlier runs wrote into a folder."""
     path = folder / DATA_NAME
-    if not path.is_file():
-        return {}
-    stored = json.loads(path.read_text(encoding="utf-8"))
-    if stored.get("solver") != fingerprint:
-        return {}
-    return dict(stored["cases"])
+    return dict(json.loads(path.read_text(encoding="utf-8"))["cases"]) if path.is_file() else {}
 
 
 def write_page(
@@ -147,7 +145,7 @@ def write_page(
         folder: of the page.
         records: `case_record`s by case.
         order: of the cases on the page.
-        fingerprint: of the solver that measured them.
+        fingerprint: of the solver as it is now; cases that another one measured are marked.
         theta: of the cases, as people read it.
 
     Raises:
@@ -157,12 +155,12 @@ def write_page(
     data = {"solver": fingerprint, "theta": theta, "cases": sorted_records}
     (folder / DATA_NAME).write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     page = folder / PAGE_NAME
-    page.write_text(page_text(sorted_records, theta), encoding="utf-8")
+    page.write_text(page_text(sorted_records, theta, fingerprint), encoding="utf-8")
     return page
 
 
-def page_text(records: Mapping[str, Mapping[str, Any]], theta: str) -> str:
-    """The page of some records, in their order."""
+def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint: str) -> str:
+    """The page of some records, in their order, see `write_page`."""
     rows = [m for record in records.values() for m in record["measurements"]]
     judged = [m for m in rows if m["judged"]]
     failed = sum(not m["passed"] for m in judged)
@@ -170,6 +168,8 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str) -> str:
     parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
     for name, record in records.items():
         parts.append(f"## {record['title']}\n\n{record['about']} (`decant physics {name}`)\n")
+        if record["solver"] != fingerprint:
+            parts.append(f"Measured before the solver's sources last changed; again: `{AGAIN} {name}`\n")
         lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
         for m in record["measurements"]:
             word = {"FAIL": "**fails**"}.get(verdict(m), verdict(m))

@@ -1,7 +1,8 @@
 """Walls hold: random pours out of and into thin-walled vessels, at any speed, and nothing may cross a wall.
 
 Draws: walls of 1 to 4 mm, straight and conical vessels, 15 to 180 °/s with accelerations up to a step, 500 particles
-and more, tilts to 170°. Draws in which the vessels touch are not pours and are drawn again.
+and more, tilts to 170°. Draws in which the vessels touch, or a wall is too thin for its
+vessel's size, are not pours and are drawn again.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
 from sim_engine.validation.result import Measurement, at_most, reported
 from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.spec import ProfileShape, VesselSpec
 
 ATTEMPTS = 40
@@ -75,11 +77,11 @@ def random_task(rng: np.random.Generator, most_particles: int) -> PourTask:
 
 def _one(rng: np.random.Generator, most_particles: int) -> PourOutcome:
     for _ in range(ATTEMPTS):
-        task = random_task(rng, most_particles)
         try:
+            task = random_task(rng, most_particles)
             # One simulator each: hundreds of vessels need not stay in memory.
             return PourSimulator().simulate(task).outcome
-        except InvalidSceneError:
+        except (VesselError, InvalidSceneError):
             continue
     raise RuntimeError(f"{ATTEMPTS} draws, and in none could the vessels be kept apart")
 
