@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
@@ -60,7 +61,7 @@ class PourTrial:
     measurement: PourMeasurement | None = None
 
 
-class Deployment:
+class Deployment(ABC):
     """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
 
     An invalid action, simulated or poured, gets the worst cost; refused pours don't count against the budget of
@@ -119,9 +120,9 @@ class Deployment:
         else:
             raise ValueError(f"this pour was not asked for: {request}")
 
+    @abstractmethod
     def _next(self, free_simulations: int) -> None:
         """Put the next question, or finish. Nothing is queued and no question is out when this is called."""
-        raise NotImplementedError
 
     def _weigh(self, trial: PourTrial, outcome: Outcome) -> None:
         match outcome:
