@@ -21,6 +21,7 @@ from sim_engine.motion import Motion, plan_motion
 from sim_engine.outcome import ESCAPED_LIMIT, ParticleState, PourOutcome
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.corners import equivalent_distance
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.spec import VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
@@ -51,6 +52,8 @@ LONGEST_TAIL = 1.0
 """The pour ends so long after the motion even if something is still in flight [s]."""
 
 CONTACT_POSES = 121
+
+PLANES_KEPT = 16
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,7 @@ class PourSimulator:
     def __init__(self) -> None:
         self._vessels: dict[VesselSpec, Vessel] = {}
         self._masks: dict[VesselSpec, NDArray[np.uint8]] = {}
+        self._planes: dict[tuple[VesselSpec, float], NDArray[np.float32]] = {}
 
     def vessel(self, spec: VesselSpec) -> Vessel:
         """A vessel, built once.
@@ -189,6 +193,7 @@ class PourSimulator:
             wall_distance=parameters.wall_distance,
             lip_drop=parameters.lip_drop,
             grids=[pourer.grid, receiver.grid],
+            planes=[self._plane(scene.pourer, SUPPORT * d), self._plane(scene.receiver, SUPPORT * d)],
             masks=[self._masks[scene.pourer], self._masks[scene.receiver]],
             walls=[pourer.wall_thickness, receiver.wall_thickness],
             rims=[pourer.rim_height, receiver.rim_height],
@@ -197,6 +202,16 @@ class PourSimulator:
             poses=poses,
             start_time=-SETTLING,
         )
+
+    def _plane(self, spec: VesselSpec, support: float) -> NDArray[np.float32]:
+        """The vessel's `equivalent_distance`; the last few are kept, for calibration changes θ again and again."""
+        key = (spec, support)
+        if key not in self._planes:
+            if len(self._planes) >= PLANES_KEPT:
+                self._planes.pop(next(iter(self._planes)))
+            vessel = self.vessel(spec)
+            self._planes[key] = equivalent_distance(vessel.grid, self._masks[spec], vessel.rim_height, support)
+        return self._planes[key]
 
     def close(self) -> None:
         """End Taichi; compiled kernels are kept for the next process."""

@@ -18,7 +18,8 @@ import taichi as ti
 from sim_engine.fluid.kernels import SIGMA, slope, wall_density, wall_slope, weight
 from sim_engine.fluid.state import SUPPORT, VESSELS
 
-PACKING = 1.032
+import os as _os
+PACKING = float(_os.environ.get('PACKING','1.032'))
 """Kernel sum of a relaxed bulk of spacing d over its continuum value, measured on a cup at rest."""
 
 RELAXATION = 0.4
@@ -86,7 +87,7 @@ def measure(f: ti.template(), s):
 
 
 @ti.func
-def multiply(f: ti.template(), s):
+def multiply(f: ti.template(), s, rate, momentum):
     """Change of all multipliers, from the measured density and the walls' share.
 
     Returns:
@@ -109,7 +110,7 @@ def multiply(f: ti.template(), s):
             compressed += ti.max(rho - 1.0, 0.0)
         # C is dimensionless, its gradients 1/m: multipliers are m².
         before = f.pressure[s, i]
-        after = ti.max(before + RELAXATION * (rho - 1.0) / f.squares[s, i], 0.0)
+        after = ti.max(before + rate * (rho - 1.0) / f.squares[s, i] + momentum * f.dp[s, i], 0.0)
         f.pressure[s, i] = after
         f.dp[s, i] = after - before
     return compressed / ti.max(inside, 1.0)

@@ -16,7 +16,8 @@ from sim_engine.vessel.sdf import SignedDistanceGrid
 CAPACITY = 50_000
 """Particles of a scene; one size for all, so that kernels are compiled once. Memory that is not used is not touched."""
 
-NATURAL_WALL_DISTANCE = 0.4
+import os as _os
+NATURAL_WALL_DISTANCE = float(_os.environ.get('NWD','0.4'))
 """Spacings at which the unshifted wall integral holds liquid off a wall, measured on a cup at rest."""
 
 POSE_STEP = 1e-3
@@ -41,6 +42,7 @@ class FluidEngine:
         self.state = FluidState(1, CAPACITY)
         self.stepper = Stepper(self.state)
         self._grids = np.zeros(0, np.float32)
+        self._planes = np.zeros(0, np.float32)
         self._cavities = np.zeros(0, np.uint8)
         self._poses = np.zeros((1, 2, 7), np.float32)
 
@@ -55,6 +57,7 @@ class FluidEngine:
         wall_distance: float,
         lip_drop: float,
         grids: list[SignedDistanceGrid],
+        planes: list[NDArray[np.float32]],
         masks: list[NDArray[np.uint8]],
         walls: list[float],
         rims: list[float],
@@ -75,6 +78,7 @@ class FluidEngine:
             friction: Coulomb coefficient.
             wall_distance: where liquid comes to rest before a wall, in spacings.
             lip_drop: rims are lower for particles by so many spacings, at most `LARGEST_LIP_DROP`.
+            planes: distance of the plane that is as solid as the walls, at the grids' nodes [m].
             grids, masks, walls, rims: of pourer and receiver; a mask is 1 where a particle counts as inside; thinnest
                 wall [m]; height of the lip in the vessel's frame [m].
             receiver_at: (3,) [m].
@@ -100,6 +104,7 @@ class FluidEngine:
             f.wall[0, b], f.rim[0, b] = walls[b], rims[b]
             offset += grids[b].values.size
         self._grids = np.concatenate([g.values.ravel() for g in grids]).astype(np.float32, copy=False)
+        self._planes = np.concatenate([p.ravel() for p in planes]).astype(np.float32, copy=False)
         self._cavities = np.concatenate([m.ravel() for m in masks]).astype(np.uint8, copy=False)
         f.origin[0, 1], f.turn[0, 1] = list(receiver_at), np.eye(3, dtype=np.float32)
         f.spill_level[0] = spill_level
@@ -141,7 +146,7 @@ class FluidEngine:
 
     def advance(self, until: float) -> None:
         """Run until the scene's time reaches `until` [s] or a fault stops it."""
-        self.stepper.advance(until, self._grids, self._cavities, self._poses)
+        self.stepper.advance(until, self._grids, self._planes, self._cavities, self._poses)
 
     def census(self) -> NDArray[np.int32]:
         """Particles in each `ParticleState`, shape (5,)."""

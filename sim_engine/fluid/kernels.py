@@ -29,17 +29,18 @@ def slope(u: ti.f32) -> ti.f32:
 
 @ti.func
 def wall_density(q: ti.f32) -> ti.f32:
-    """∫ W over the half-space beyond a plane at distance q·h: ½ at q = 0, 0 from q = 1 on."""
-    u = ti.max(1.0 - ti.max(q, 0.0), 0.0)
+    """∫ W over the half-space beyond a plane at distance q·h: 1 up to q = −1, ½ at q = 0, 0 from q = 1 on."""
+    u = ti.max(1.0 - ti.abs(q), 0.0)
     u6 = u * u * u
     u6 = u6 * u6
-    return 21.0 * u6 * (1.0 / 6.0 - u * (3.0 / 14.0 - u / 14.0))
+    beyond = 21.0 * u6 * (1.0 / 6.0 - u * (3.0 / 14.0 - u / 14.0))
+    return ti.select(q < 0.0, 1.0 - beyond, beyond)
 
 
 @ti.func
 def wall_slope(q: ti.f32) -> ti.f32:
     """−h · d(wall_density)/d(distance), ≥ 0."""
-    u = ti.max(1.0 - ti.max(q, 0.0), 0.0)
+    u = ti.max(1.0 - ti.abs(q), 0.0)
     u2 = u * u
     return 21.0 * u2 * u2 * u * (1.0 - u * (1.5 - u * (4.0 / 7.0)))
 

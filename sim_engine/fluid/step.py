@@ -16,20 +16,23 @@ from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient,
 from sim_engine.outcome import ParticleState
 
 GRAVITY = 9.81
-CFL = 1.2
+import os as _os
+HIGH = float(_os.environ.get('HIGH','4.4'))
+LOW = float(_os.environ.get('LOW','0.3'))
+CFL = float(_os.environ.get('CFL','1.2'))
 """Largest displacement per step, in spacings."""
-LONGEST_STEP = 4e-3
-PACE = 0.18
+LONGEST_STEP = float(_os.environ.get('LONGEST','4e-3'))
+PACE = float(_os.environ.get('PACE','0.18'))
 """… and the longest step in units of √(d/g): in a longer one gravity presses layers together faster than the iterations
 part them."""
 SHORTEST_STEP = 1e-4
-ITERATIONS = 3
+ITERATIONS = int(_os.environ.get('ITER','3'))
 """At least so many passes over the density constraint in a step …"""
-TOLERANCE = 0.015
+TOLERANCE = float(_os.environ.get('TOL','0.015'))
 """… and more while the mean compression inside is above this: a deep vessel needs more than a shallow one, …"""
 MOST_ITERATIONS = 30
 """… but never more than so many."""
-SKIN = 0.3
+SKIN = float(_os.environ.get('SKIN','0.3'))
 """Neighbour lists reach that many spacings beyond the support, so that they last for several steps …"""
 SHORT_SKIN = 0.03
 """… unless somebody moves so fast that they would not."""
@@ -37,7 +40,7 @@ SWING_ARM = 0.5
 """Liquid is never farther from the pourer's origin than this [m]."""
 CONTACT = 0.2
 """Particles' centres keep that many spacings from solid; the density constraint keeps about half a spacing."""
-WARM = 0.3
+WARM = float(_os.environ.get('WARM','0.3'))
 """Share of the last step's multipliers that a step starts with. From one half on, deep liquid swings up: multipliers
 then answer to what was, not to what is (docs/how-it-works.md has the analysis)."""
 TREACLE = 0.7
@@ -158,12 +161,22 @@ class Stepper:
         self.apply(s)
         n = 0
         compressed = ti.cast(1.0, ti.f32)
+        centre = ti.cast(0.5 * (HIGH + LOW), ti.f32)
+        half = ti.cast(0.5 * (HIGH - LOW), ti.f32)
+        rho = half / centre
+        rate = 1.0 / centre
+        momentum = ti.cast(0.0, ti.f32)
         while n < ITERATIONS or (compressed > TOLERANCE and n < MOST_ITERATIONS):
             if n == 0:
                 measure_first(f, s)
             else:
                 measure(f, s)
-            compressed = multiply(f, s)
+            if n > 0:
+                new = 1.0 / (2.0 * centre / half - rho)
+                momentum = rho * new
+                rate = 2.0 * new / half
+                rho = new
+            compressed = multiply(f, s, rate, momentum)
             displace(f, s)
             self.apply(s)
             n += 1
@@ -256,7 +269,7 @@ class Stepper:
                 f.x[s, i] = x
 
     @ti.func
-    def step(self, s, grids: ti.template(), cavities: ti.template(), poses: ti.template()):
+    def step(self, s, grids: ti.template(), planes: ti.template(), cavities: ti.template(), poses: ti.template()):
         """One time step of one scene."""
         f = self.state
         fastest = self.top_speed(s)
@@ -277,7 +290,7 @@ class Stepper:
             if fastest * dt > 0.3 * SKIN * f.spacing[s]:
                 skin = SHORT_SKIN
             rebuild(f, s, skin)
-        self.look_at_walls(s, grids)
+        self.look_at_walls(s, planes)
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
         if f.viscosity[s] > 0.0 or f.attraction[s] > 0.0:
@@ -307,6 +320,7 @@ class Stepper:
         self,
         until: ti.f64,
         grids: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        planes: ti.types.ndarray(dtype=ti.f32, ndim=1),
         cavities: ti.types.ndarray(dtype=ti.u8, ndim=1),
         poses: ti.types.ndarray(dtype=ti.f32, ndim=3),
     ):
@@ -314,7 +328,7 @@ class Stepper:
         f = self.state
         for s in range(f.scenes):
             while f.time[s] < until and f.fault[s] == 0:
-                self.step(s, grids, cavities, poses)
+                self.step(s, grids, planes, cavities, poses)
 
     @ti.kernel
     def census(self, s: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=1)):

@@ -30,7 +30,8 @@ WAVE_NUMBER = 1.8412 / RADIUS
 FREQUENCY = math.sqrt(GRAVITY * WAVE_NUMBER * math.tanh(WAVE_NUMBER * HEIGHT)) / (2.0 * math.pi)
 """3.30 Hz."""
 
-REST, PUSH_TIME, PUSH = 1.0, 0.15, 0.006
+import os as _os
+REST, PUSH_TIME, PUSH = 1.0, float(_os.environ.get('PT','0.15')), float(_os.environ.get('PUSH','0.006'))
 """The push begins after this time [s], takes that long [s] and goes that far [m]."""
 WATCHED = 1.6
 """Time after the push [s]."""

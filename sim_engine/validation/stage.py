@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import inside_mask
+from sim_engine.vessel.corners import equivalent_distance
 from sim_engine.vessel.sdf import SignedDistanceGrid
 from sim_engine.vessel.vessel import Vessel
 
@@ -42,17 +43,25 @@ class Container:
         inside: 1 at the grid's nodes where a particle counts as inside.
         wall: smallest thickness [m].
         rim: height of the lip; `NO_RIM` for a tank that nothing is poured from [m].
+        holed: what is not cavity is not all solid: corners are then like any other wall.
     """
 
     grid: SignedDistanceGrid
     inside: NDArray[np.uint8]
     wall: float
     rim: float = NO_RIM
+    holed: bool = False
 
     @classmethod
     def of(cls, vessel: Vessel) -> Container:
         """A vessel's."""
         return cls(vessel.grid, inside_mask(vessel), vessel.wall_thickness, vessel.rim_height)
+
+    def plane(self, support: float) -> NDArray[np.float32]:
+        """Distance of the equivalent plane at the grid's nodes for a kernel's support [m]."""
+        if self.holed:
+            return self.grid.values
+        return equivalent_distance(self.grid, self.inside, self.rim, support)
 
 
 EMPTY_SPACE = Container(NOTHING, NOTHING.cavity, 1e-3)
@@ -115,6 +124,7 @@ def run(
         wall_distance=parameters.wall_distance,
         lip_drop=parameters.lip_drop,
         grids=[container.grid, NOTHING],
+        planes=[container.plane(SUPPORT * spacing), NOTHING.values],
         masks=[container.inside, NOTHING.cavity],
         walls=[container.wall, 1e-3],
         rims=[container.rim, NO_RIM],

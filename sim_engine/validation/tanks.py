@@ -68,7 +68,7 @@ def holed_cup(radius: float, height: float, hole: float, floor: float, spacing: 
     inside = inside[place.reshape(-1)].reshape(shape)
     origin = np.array([across[0], across[0], z[0]])
     grid = SignedDistanceGrid(origin, spacing, values, (inside & (values > 0.0)).astype(np.uint8))
-    return Container(grid, np.ascontiguousarray(inside), min(wall, floor))
+    return Container(grid, np.ascontiguousarray(inside), min(wall, floor), holed=hole > 0.0)
 
 
 def block(low: Floats, high: Floats, count: int, seed: int) -> tuple[Floats, float]:
