@@ -2,7 +2,8 @@
 
 import taichi as ti
 
-SUPPORT = 2.0
+import os as _os
+SUPPORT = float(_os.environ.get('SUP','2.0'))
 """Kernel support h over spacing d."""
 
 VESSELS = 2

@@ -43,14 +43,14 @@ class Container:
         inside: 1 at the grid's nodes where a particle counts as inside.
         wall: smallest thickness [m].
         rim: height of the lip; `NO_RIM` for a tank that nothing is poured from [m].
-        holed: what is not cavity is not all solid: corners are then like any other wall.
+        open: 1 at the nodes that liquid may reach from inside, where that is more than `inside`: a hole's.
     """
 
     grid: SignedDistanceGrid
     inside: NDArray[np.uint8]
     wall: float
     rim: float = NO_RIM
-    holed: bool = False
+    open: NDArray[np.uint8] | None = None
 
     @classmethod
     def of(cls, vessel: Vessel) -> Container:
@@ -59,9 +59,7 @@ class Container:
 
     def plane(self, support: float) -> NDArray[np.float32]:
         """Distance of the equivalent plane at the grid's nodes for a kernel's support [m]."""
-        if self.holed:
-            return self.grid.values
-        return equivalent_distance(self.grid, self.inside, self.rim, support)
+        return equivalent_distance(self.grid, self.inside if self.open is None else self.open, self.rim, support)
 
 
 EMPTY_SPACE = Container(NOTHING, NOTHING.cavity, 1e-3)

@@ -29,7 +29,7 @@ def half_space(q: Floats) -> Floats:
 def equivalent_distance(
     grid: SignedDistanceGrid, inside: NDArray[np.uint8], rim_height: float, support: float
 ) -> NDArray[np.float32]:
-    """Distance of the equivalent plane at the grid's nodes; nowhere more than the signed distance.
+    """Distance of the equivalent plane at the grid's nodes; less than the signed distance in a corner, more at an edge.
 
     Args:
         grid: signed distance and cavity.
@@ -59,7 +59,8 @@ def equivalent_distance(
     share = np.clip(signal.fftconvolve(padded, kernel, mode="valid"), 0.0, 1.0)
     q = np.linspace(-1.0, 1.0, 801)
     plane = support * np.interp(-share, -half_space(q), q)
+    plane = np.where(share > 1e-4, plane, np.maximum(grid.values, support))
     mixed = weight * plane + (1.0 - weight) * grid.values
     near = ndimage.binary_dilation(inside > 0, iterations=1)
-    found = np.where(near & (share > 1e-4), np.minimum(grid.values, mixed), grid.values)
+    found = np.where(near, mixed, grid.values)
     return np.ascontiguousarray(found, dtype=np.float32)
