@@ -174,7 +174,7 @@ class PourSimulator:
     def _load(self, fluid: FluidEngine, task: PourTask, motion: Motion) -> None:
         """Put the scene's vessels, motion and liquid into the engine."""
         from sim_engine.fluid.engine import POSE_STEP
-        from sim_engine.fluid.kernels import cohesion_strength
+        from sim_engine.fluid.kernels import cohesion_acceleration
         from sim_engine.fluid.state import SUPPORT
 
         scene, parameters, error = task.scene, task.parameters, task.pose_error or PoseError()
@@ -187,7 +187,7 @@ class PourSimulator:
         fluid.load(
             (local @ rotation.T + poses[0, :3]).astype(np.float32),
             spacing=d,
-            pair_acceleration=cohesion_strength(parameters.cohesion, d, SUPPORT * d) / (scene.liquid.density * d**3),
+            pair_acceleration=cohesion_acceleration(parameters.cohesion, scene.liquid.density, d, SUPPORT * d),
             viscosity=parameters.viscosity,
             friction=parameters.friction,
             wall_distance=parameters.wall_distance,

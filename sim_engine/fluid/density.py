@@ -65,6 +65,7 @@ def measure_first(f: ti.template(), s):
             if q < 1.0:
                 n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
                 total -= wall_slope(q) * inv_h * n
+        f.edge[s, i] = total.dot(total) / (inv_h * inv_h)
         f.squares[s, i] = scale * scale * f.squares[s, i] + total.dot(total) + 0.05 * inv_h * inv_h
 
 

@@ -8,7 +8,7 @@ Source: Akinci et al. 2013 (pairwise cohesion); Schechter & Bridson 2012 (XSPH);
 
 import taichi as ti
 
-from sim_engine.fluid.kernels import attraction, weight
+from sim_engine.fluid.kernels import slope, weight
 from sim_engine.fluid.state import SUPPORT
 
 LARGEST_PULL = 0.1
@@ -26,17 +26,17 @@ def interact(f: ti.template(), s, dt):
     for i in range(f.moving[s]):
         xi = f.x[s, i]
         vi = f.v[s, i]
+        ei = f.edge[s, i]
         pull = ti.Vector([0.0, 0.0, 0.0])
         drift = ti.Vector([0.0, 0.0, 0.0])
         total = ti.cast(0.0, ti.f32)
         for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
             j = f.neighbour[s, k]
             r = xi - f.x[s, j]
-            distance = ti.sqrt(r.dot(r)) + 1e-9
-            u = ti.max(1.0 - distance * inv_h, 0.0)
+            u = ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0)
             w = weight(u)
             towards = w * (f.v[s, j] - vi)
-            force = (attraction(u) / distance) * r
+            force = ((ei + f.edge[s, j]) * slope(u)) * r
             total += w
             drift += towards
             pull -= force

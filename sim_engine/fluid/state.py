@@ -44,6 +44,7 @@ class FluidState:
         self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=row)
         self.home, self.home_copy, self.name, self.name_copy, self.cell = (scalars(ti.i32) for _ in range(5))
         self.gradient, self.squares = vectors(), scalars()
+        self.edge = scalars()
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
         self.neighbour = ti.field(ti.i32, shape=(scenes, self.list_capacity))
         self.cell_start = ti.field(ti.i32, shape=(scenes, cells + 2))

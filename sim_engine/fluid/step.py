@@ -34,7 +34,7 @@ MOST_ITERATIONS = 30
 """… but never more than so many."""
 SKIN = float(_os.environ.get('SKIN','0.3'))
 """Neighbour lists reach that many spacings beyond the support, so that they last for several steps …"""
-SHORT_SKIN = 0.03
+SHORT_SKIN = float(_os.environ.get('SSKIN','0.03'))
 """… unless somebody moves so fast that they would not."""
 SWING_ARM = 0.5
 """Liquid is never farther from the pourer's origin than this [m]."""

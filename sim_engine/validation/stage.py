@@ -108,11 +108,11 @@ def run(
         ArithmeticError: the solver stopped with a fault.
     """
     from sim_engine.fluid.engine import engine
-    from sim_engine.fluid.kernels import cohesion_strength
+    from sim_engine.fluid.kernels import cohesion_acceleration
     from sim_engine.fluid.state import SUPPORT
 
     fluid = engine()
-    attraction = cohesion_strength(parameters.cohesion, spacing, SUPPORT * spacing) / (DENSITY * spacing**3)
+    attraction = cohesion_acceleration(parameters.cohesion, DENSITY, spacing, SUPPORT * spacing)
     fluid.load(
         np.ascontiguousarray(positions, dtype=np.float32),
         spacing=spacing,
