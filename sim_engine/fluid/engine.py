@@ -95,6 +95,8 @@ class FluidEngine:
         f.particles[0], f.spacing[0] = count, spacing
         f.attraction[0], f.viscosity[0], f.friction[0] = pair_acceleration, viscosity, friction
         f.lip_drop[0] = lip_drop
+        f.waited[0] = 0.0
+        f.wait[0] = float(_os.environ.get('WAIT','0.0'))
         f.gravity[0], f.longest_step[0] = gravity, longest_step
         f.wall_shift[0] = (wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
         offset = 0

@@ -68,6 +68,8 @@ class FluidState:
         # … and what changes with time.
         self.time = ti.field(ti.f64, shape=scenes)
         self.dt = ti.field(ti.f32, shape=scenes)
+        self.wait = ti.field(ti.f32, shape=scenes)
+        self.waited = ti.field(ti.f32, shape=scenes)
         self.steps = ti.field(ti.i32, shape=scenes)
         self.skin = ti.field(ti.f32, shape=scenes)  # lists reach so many spacings beyond the support
         self.iterations = ti.field(ti.i32, shape=scenes)

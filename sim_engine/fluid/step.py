@@ -17,6 +17,7 @@ from sim_engine.outcome import ParticleState
 
 GRAVITY = 9.81
 import os as _os
+LAZY = int(_os.environ.get('LAZY','0'))
 HIGH = float(_os.environ.get('HIGH','4.4'))
 LOW = float(_os.environ.get('LOW','0.3'))
 CFL = float(_os.environ.get('CFL','1.2'))
@@ -157,8 +158,9 @@ class Stepper:
         for i in range(f.moving[s]):
             f.pressure[s, i] = f.pressure[s, i] * WARM * ratio
             f.dp[s, i] = f.pressure[s, i]
-        displace(f, s)
-        self.apply(s)
+        if ti.static(not LAZY):
+            displace(f, s)
+            self.apply(s)
         n = 0
         compressed = ti.cast(1.0, ti.f32)
         centre = ti.cast(0.5 * (HIGH + LOW), ti.f32)
@@ -177,6 +179,10 @@ class Stepper:
                 rate = 2.0 * new / half
                 rho = new
             compressed = multiply(f, s, rate, momentum)
+            if ti.static(LAZY):
+                if n == 0:
+                    for i in range(f.moving[s]):
+                        f.dp[s, i] = f.pressure[s, i]
             displace(f, s)
             self.apply(s)
             n += 1
@@ -293,8 +299,10 @@ class Stepper:
         self.look_at_walls(s, planes)
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
-        if f.viscosity[s] > 0.0 or f.attraction[s] > 0.0:
-            interact(f, s, dt)
+        f.waited[s] += dt
+        if (f.viscosity[s] > 0.0 or f.attraction[s] > 0.0) and f.waited[s] >= f.wait[s]:
+            interact(f, s, f.waited[s])
+            f.waited[s] = 0.0
         if f.time[s] < 0.0:
             for i in range(f.moving[s]):
                 f.v[s, i] = f.v[s, i] * TREACLE
