@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sim_engine.calm import calm_until, liquid_velocity
 from sim_engine.contact import describe_contact, first_contact, rotations
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fill import fill, spacing
@@ -164,14 +165,15 @@ class PourSimulator:
 
         motion = self.prepare(task)
         fluid = engine()
-        self._load(fluid, task, motion)
+        start = calm_until(motion, self.vessel(task.scene.pourer), task.scene.liquid.volume)
+        self._load(fluid, task, motion, start)
         begun = time.process_time()
-        fluid.advance(0.0)
-        course = _run(fluid, task, motion, cancelled)
+        fluid.advance(start)
+        course = _run(fluid, task, motion, start, cancelled)
         outcome = _outcome(fluid, task, course, time.process_time() - begun)
         return SimulationRun(outcome, course.recorded(motion))
 
-    def _load(self, fluid: FluidEngine, task: PourTask, motion: Motion) -> None:
+    def _load(self, fluid: FluidEngine, task: PourTask, motion: Motion, start: float) -> None:
         """Put the scene's vessels, motion and liquid into the engine."""
         from sim_engine.fluid.engine import POSE_STEP
         from sim_engine.fluid.kernels import cohesion_acceleration
@@ -182,10 +184,12 @@ class PourSimulator:
         d = spacing(scene.liquid.volume, parameters.particles)
         poses = motion.sample(np.arange(0.0, motion.duration + LONGEST_TAIL + 0.1, POSE_STEP))
         # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
-        local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed, parameters.wall_distance)
-        (rotation,) = rotations(poses[:1])
+        tilt = float(motion.tilt(np.array([start]))[0]) if start > 0.0 else 0.0
+        local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed, parameters.wall_distance, tilt)
+        (pose,) = motion.sample(np.array([start]))
+        (rotation,) = rotations(pose[None])
         fluid.load(
-            (local @ rotation.T + poses[0, :3]).astype(np.float32),
+            (local @ rotation.T + pose[:3]).astype(np.float32),
             spacing=d,
             pair_acceleration=cohesion_acceleration(parameters.cohesion, scene.liquid.density, d, SUPPORT * d),
             viscosity=parameters.viscosity,
@@ -200,7 +204,9 @@ class PourSimulator:
             receiver_at=np.array([error.x, error.y, 0.0]),
             spill_level=receiver.rim_height - d,
             poses=poses,
-            start_time=-SETTLING,
+            settling=SETTLING,
+            start=start,
+            drift=liquid_velocity(motion, pourer, start) if start > 0.0 else None,
         )
 
     def _plane(self, spec: VesselSpec, support: float) -> NDArray[np.float32]:
@@ -238,7 +244,9 @@ class _Course:
         return RecordedFrames(times, positions, states, motion.sample(times))
 
 
-def _run(fluid: FluidEngine, task: PourTask, motion: Motion, cancelled: Callable[[], bool] | None) -> _Course:
+def _run(
+    fluid: FluidEngine, task: PourTask, motion: Motion, start: float, cancelled: Callable[[], bool] | None
+) -> _Course:
     """Advance slice by slice until nothing can change any more, or a fault stops it.
 
     Raises:
@@ -248,14 +256,14 @@ def _run(fluid: FluidEngine, task: PourTask, motion: Motion, cancelled: Callable
     n = task.parameters.particles
     next_frame = 0.0
     still_since: float | None = None
-    slices = 0
+    first = slices = round(start / SLICE)
     while True:
         clock = slices * SLICE
         counts = fluid.census()
         if task.record_rate > 0.0 and clock >= next_frame:
             course.frames.append((fluid.time, *fluid.particles()))
             next_frame += 1.0 / task.record_rate
-        if slices > 0:
+        if slices > first:
             course.times.append(fluid.time)
             course.poured.append(1.0 - float(counts[ParticleState.IN_POURER]) / n)
             course.spilled.append(float(counts[ParticleState.SPILLED]) / n)

@@ -64,7 +64,9 @@ class FluidEngine:
         receiver_at: NDArray[np.float64],
         spill_level: float,
         poses: NDArray[np.float64],
-        start_time: float,
+        settling: float,
+        start: float = 0.0,
+        drift: NDArray[np.float64] | None = None,
         gravity: float = GRAVITY,
         longest_step: float = LONGEST_STEP,
     ) -> None:
@@ -83,8 +85,10 @@ class FluidEngine:
                 wall [m]; height of the lip in the vessel's frame [m].
             receiver_at: (3,) [m].
             spill_level: below it and in no vessel a particle is spilled [m].
-            poses: (T, 7) of the pourer, `POSE_STEP` apart, from time 0 on; before it the first pose holds.
-            start_time: ≤ 0; the time up to 0 lets the lattice settle [s].
+            poses: (T, 7) of the pourer, `POSE_STEP` apart, from time 0 on.
+            settling: the lattice settles for so long before `start`, in the pose of that time [s].
+            start: time at which the pourer moves off [s].
+            drift: velocity that all liquid is given at `start`, (3,) [m/s].
             gravity: downwards [m/s²].
             longest_step: [s]; gravity, spacing and speeds may shorten it further.
         """
@@ -112,7 +116,8 @@ class FluidEngine:
         f.spill_level[0] = spill_level
         self._poses = np.ascontiguousarray(poses[None], dtype=np.float32)
         f.table_step[0], f.table_length[0] = POSE_STEP, len(poses)
-        f.time[0], f.compression[0] = start_time, 0.0
+        f.time[0], f.start[0], f.compression[0] = start - settling, start, 0.0
+        f.drift[0] = [0.0, 0.0, 0.0] if drift is None else list(drift)
         f.steps[0], f.rebuilds[0], f.iterations[0], f.fault[0] = 0, 0, 0, 0
         self._put(np.ascontiguousarray(positions, dtype=np.float32))
         self.stepper.begin(self._poses)

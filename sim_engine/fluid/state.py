@@ -67,6 +67,8 @@ class FluidState:
         self.spill_level = ti.field(ti.f32, shape=scenes)  # below it and in no vessel: spilled [m]
         # … and what changes with time.
         self.time = ti.field(ti.f64, shape=scenes)
+        self.start = ti.field(ti.f64, shape=scenes)  # the pourer moves off [s]
+        self.drift = ti.Vector.field(3, ti.f32, shape=scenes)  # velocity of all liquid at the start [m/s]
         self.dt = ti.field(ti.f32, shape=scenes)
         self.wait = ti.field(ti.f32, shape=scenes)
         self.waited = ti.field(ti.f32, shape=scenes)

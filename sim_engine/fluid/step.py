@@ -45,7 +45,7 @@ WARM = float(_os.environ.get('WARM','0.3'))
 """Share of the last step's multipliers that a step starts with. From one half on, deep liquid swings up: multipliers
 then answer to what was, not to what is (docs/how-it-works.md has the analysis)."""
 TREACLE = 0.7
-"""Before time 0 velocities shrink to this part in every step: a lattice settles without splashing."""
+"""Before the start velocities shrink to this part in every step: a lattice settles without splashing."""
 
 IN_POURER, IN_FLIGHT, RECEIVED, SPILLED, ESCAPED = (int(s) for s in ParticleState)
 
@@ -74,7 +74,7 @@ class Stepper:
     def place_pourer(self, s, time, poses: ti.template()):
         """Pose of the pourer from the table, rows of which are `table_step` apart."""
         f = self.state
-        u = ti.cast(ti.max(time, 0.0) / f.table_step[s], ti.f32)
+        u = ti.cast(ti.max(time, f.start[s]) / f.table_step[s], ti.f32)
         k = ti.min(ti.cast(u, ti.i32), f.table_length[s] - 2)
         w = ti.min(u - k, 1.0)
         row = ti.Vector([0.0] * 7)
@@ -303,9 +303,12 @@ class Stepper:
         if (f.viscosity[s] > 0.0 or f.attraction[s] > 0.0) and f.waited[s] >= f.wait[s]:
             interact(f, s, f.waited[s])
             f.waited[s] = 0.0
-        if f.time[s] < 0.0:
+        if f.time[s] < f.start[s]:
             for i in range(f.moving[s]):
                 f.v[s, i] = f.v[s, i] * TREACLE
+        elif f.time[s] - dt < f.start[s]:
+            for i in range(f.moving[s]):
+                f.v[s, i] = f.v[s, i] + f.drift[s]
         self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1

@@ -129,7 +129,7 @@ def run(
         receiver_at=FAR_AWAY,
         spill_level=spill_level,
         poses=still_pose(float(times[-1])) if poses is None else poses,
-        start_time=-settling,
+        settling=settling,
         gravity=gravity,
         **({} if longest_step is None else {"longest_step": longest_step}),
     )
