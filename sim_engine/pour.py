@@ -176,7 +176,6 @@ class PourSimulator:
     def _load(self, fluid: FluidEngine, task: PourTask, motion: Motion, start: float) -> None:
         """Put the scene's vessels, motion and liquid into the engine."""
         from sim_engine.fluid.engine import POSE_STEP
-        from sim_engine.fluid.kernels import cohesion_acceleration
         from sim_engine.fluid.state import SUPPORT
 
         scene, parameters, error = task.scene, task.parameters, task.pose_error or PoseError()
@@ -191,7 +190,8 @@ class PourSimulator:
         fluid.load(
             (local @ rotation.T + pose[:3]).astype(np.float32),
             spacing=d,
-            pair_acceleration=cohesion_acceleration(parameters.cohesion, scene.liquid.density, d, SUPPORT * d),
+            tension=parameters.cohesion,
+            density=scene.liquid.density,
             viscosity=parameters.viscosity,
             friction=parameters.friction,
             wall_distance=parameters.wall_distance,

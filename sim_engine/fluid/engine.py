@@ -8,6 +8,8 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim_engine.cache import cache_directory
+from sim_engine.fluid.forces import forces_interval
+from sim_engine.fluid.kernels import cohesion_acceleration
 from sim_engine.fluid.state import SUPPORT, VESSELS, FluidState
 from sim_engine.fluid.step import GRAVITY, LONGEST_STEP, Stepper
 from sim_engine.outcome import ParticleState
@@ -51,7 +53,8 @@ class FluidEngine:
         positions: NDArray[np.float32],
         *,
         spacing: float,
-        pair_acceleration: float,
+        tension: float,
+        density: float,
         viscosity: float,
         friction: float,
         wall_distance: float,
@@ -75,7 +78,8 @@ class FluidEngine:
         Args:
             positions: (N, 3) in the world [m].
             spacing: d [m].
-            pair_acceleration: peak cohesive acceleration of one pair [m/s²].
+            tension: surface tension that cohesion is scaled to [N/m].
+            density: of the liquid [kg/m³].
             viscosity: XSPH rate [1/s].
             friction: Coulomb coefficient.
             wall_distance: where liquid comes to rest before a wall, in spacings.
@@ -97,10 +101,11 @@ class FluidEngine:
         if count > f.capacity:
             raise ValueError(f"{count} particles; at most {f.capacity}")
         f.particles[0], f.spacing[0] = count, spacing
-        f.attraction[0], f.viscosity[0], f.friction[0] = pair_acceleration, viscosity, friction
+        f.attraction[0] = cohesion_acceleration(tension, density, spacing, SUPPORT * spacing)
+        f.viscosity[0], f.friction[0] = viscosity, friction
         f.lip_drop[0] = lip_drop
         f.waited[0] = 0.0
-        f.wait[0] = float(_os.environ.get('WAIT','0.0'))
+        f.wait[0] = forces_interval(viscosity, tension, density, spacing)
         f.gravity[0], f.longest_step[0] = gravity, longest_step
         f.wall_shift[0] = (wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
         offset = 0

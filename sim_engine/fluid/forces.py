@@ -6,11 +6,15 @@ relaxes velocities towards the neighbours' mean at a given rate (XSPH), so that 
 Source: Akinci et al. 2013 (pairwise cohesion); Schechter & Bridson 2012 (XSPH); scaling ours.
 """
 
+import math
+
 import taichi as ti
 
 from sim_engine.fluid.kernels import slope, weight
 from sim_engine.fluid.state import SUPPORT
 
+LONGEST_WAIT = 0.01
+CAPILLARY = 0.2
 LARGEST_PULL = 0.1
 """Cohesion moves a particle by at most so many spacings in a step: a strong tension at fine spacing stays stable."""
 
@@ -54,3 +58,20 @@ def interact(f: ti.template(), s, dt):
         pull *= ti.min(1.0, bound / (pull.norm() + 1e-9))
         # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
         f.v[s, i] = f.v[s, i] + relax / ti.max(f.squares[s, i], 1.0) * f.dx[s, i] + pull
+
+
+def forces_interval(viscosity: float, tension: float, density: float, spacing: float) -> float:
+    """Time after which viscosity and cohesion act again: they are slow, and a pass over all pairs each.
+
+    Args:
+        viscosity: XSPH rate [1/s].
+        tension: [N/m].
+        density: [kg/m³].
+        spacing: d [m].
+
+    Returns:
+        At most `LONGEST_WAIT`, a tenth of the viscous time, and `CAPILLARY` of the capillary time √(ρ d³ / (2π σ))
+        (Brackbill et al. 1992) [s].
+    """
+    capillary = math.sqrt(density * spacing**3 / (2.0 * math.pi * max(tension, 1e-9)))
+    return min(LONGEST_WAIT, 0.1 / max(viscosity, 1e-9), CAPILLARY * capillary)

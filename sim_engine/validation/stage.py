@@ -108,15 +108,14 @@ def run(
         ArithmeticError: the solver stopped with a fault.
     """
     from sim_engine.fluid.engine import engine
-    from sim_engine.fluid.kernels import cohesion_acceleration
     from sim_engine.fluid.state import SUPPORT
 
     fluid = engine()
-    attraction = cohesion_acceleration(parameters.cohesion, DENSITY, spacing, SUPPORT * spacing)
     fluid.load(
         np.ascontiguousarray(positions, dtype=np.float32),
         spacing=spacing,
-        pair_acceleration=attraction,
+        tension=parameters.cohesion,
+        density=DENSITY,
         viscosity=parameters.viscosity,
         friction=parameters.friction,
         wall_distance=parameters.wall_distance,
