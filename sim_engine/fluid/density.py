@@ -22,6 +22,7 @@ import os as _os
 PACKING = float(_os.environ.get('PACKING','1.032'))
 """Kernel sum of a relaxed bulk of spacing d over its continuum value, measured on a cup at rest."""
 
+EDGE = float(_os.environ.get('EDGE','0.3'))
 RELAXATION = 0.4
 """Damping of the Jacobi step: for this kernel at h = 2d the iteration matrix reaches about 4; above ½ it diverges."""
 
@@ -65,7 +66,12 @@ def measure_first(f: ti.template(), s):
             if q < 1.0:
                 n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
                 total -= wall_slope(q) * inv_h * n
-        f.edge[s, i] = total.dot(total) / (inv_h * inv_h)
+        steep = total.norm()
+        f.edge[s, i] = steep
+        face = ti.Vector([0.0, 0.0, 0.0])
+        if steep > EDGE * inv_h:
+            face = total / steep
+        f.facing[s, i] = face
         f.squares[s, i] = scale * scale * f.squares[s, i] + total.dot(total) + 0.05 * inv_h * inv_h
 
 

@@ -50,4 +50,4 @@ TENSION = float(_os.environ.get('TEN','3.6'))
 
 
 def cohesion_acceleration(tension: float, density: float, spacing: float, support: float) -> float:
-    return TENSION * tension / (4.0 * density * support) * SIGMA * spacing**3 / support**5
+    return TENSION * tension / density
