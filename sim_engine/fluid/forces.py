@@ -15,6 +15,9 @@ from sim_engine.fluid.density import PACKING
 from sim_engine.fluid.state import SUPPORT
 
 LONGEST_WAIT = 0.01
+import os as _os
+POS = float(_os.environ.get('POS','1.0'))
+NEG = float(_os.environ.get('NEG','0.2'))
 CAPILLARY = 0.3
 LARGEST_PULL = 0.1
 """Cohesion moves a particle by at most so many spacings in a step: a strong tension at fine spacing stays stable."""
@@ -67,7 +70,7 @@ def interact(f: ti.template(), s, dt):
         pull = ti.Vector([0.0, 0.0, 0.0])
         if f.rims[s, i] > 1.0:
             curvature = scale * f.bend[s, i] / (volume * f.rims[s, i])
-            curvature = ti.max(ti.min(curvature, 1.0 / d), -1.0 / d)
+            curvature = ti.max(ti.min(curvature, POS / d), -NEG / d)
             pull = (dt * f.attraction[s] * f.edge[s, i] * curvature) * f.facing[s, i]
         # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
         f.v[s, i] = f.v[s, i] + relax / ti.max(f.squares[s, i], 1.0) * f.dx[s, i] + pull
