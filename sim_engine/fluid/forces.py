@@ -67,11 +67,35 @@ def interact(f: ti.template(), s, dt):
     relax = 1.0 - ti.exp(-f.viscosity[s] * dt)
     volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
     for i in range(f.moving[s]):
-        pull = ti.Vector([0.0, 0.0, 0.0])
+        curvature = ti.cast(0.0, ti.f32)
         if f.rims[s, i] > 1.0:
             curvature = scale * f.bend[s, i] / (volume * f.rims[s, i])
             curvature = ti.max(ti.min(curvature, POS / d), -NEG / d)
-            pull = (dt * f.attraction[s] * f.edge[s, i] * curvature) * f.facing[s, i]
+        f.bend[s, i] = curvature
+        flag = ti.select(f.facing[s, i].dot(f.facing[s, i]) > 0.0, 1.0, 0.0)
+        f.dp[s, i] = flag
+        f.rims[s, i] = flag
+        f.density_copy[s, i] = curvature * flag
+    for i in range(f.moving[s]):
+        xi = f.x[s, i]
+        ci = f.bend[s, i] * f.dp[s, i]
+        fi = f.dp[s, i]
+        sums = ti.cast(0.0, ti.f32)
+        total = ti.cast(0.0, ti.f32)
+        for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
+            j = f.neighbour[s, k]
+            r = xi - f.x[s, j]
+            w = weight(ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0))
+            fj = f.dp[s, j]
+            sums += w * fj * f.bend[s, j]
+            total += w * fj
+            f.density_copy[s, j] = f.density_copy[s, j] + w * ci
+            f.rims[s, j] = f.rims[s, j] + w * fi
+        f.density_copy[s, i] = f.density_copy[s, i] + sums
+        f.rims[s, i] = f.rims[s, i] + total
+    for i in range(f.moving[s]):
+        curvature = f.density_copy[s, i] / ti.max(f.rims[s, i], 1.0)
+        pull = (dt * f.attraction[s] * f.edge[s, i] * curvature) * f.facing[s, i]
         # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
         f.v[s, i] = f.v[s, i] + relax / ti.max(f.squares[s, i], 1.0) * f.dx[s, i] + pull
 

@@ -47,6 +47,7 @@ class FluidState:
         self.edge = scalars()
         self.facing = vectors()
         self.bend = scalars()
+        self.density_copy = scalars()
         self.rims = scalars()
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
         self.neighbour = ti.field(ti.i32, shape=(scenes, self.list_capacity))

@@ -31,7 +31,8 @@ STRETCH = 1.15
 """Along z at first; across by its inverse square root."""
 WATCHED = 0.2
 """[s]."""
-CAPILLARY = 0.3
+import os
+CAPILLARY = float(os.environ.get('CAP','0.3'))
 """Longest step, over the capillary limit."""
 
 
