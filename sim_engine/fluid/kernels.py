@@ -45,9 +45,22 @@ def wall_slope(q: ti.f32) -> ti.f32:
     return 21.0 * u2 * u2 * u * (1.0 - u * (1.5 - u * (4.0 / 7.0)))
 
 
+@ti.func
+def attraction(u: ti.f32) -> ti.f32:
+    """Shape of the cohesive pair force over u = max(1 − q, 0): 1 at its peak q = ½, 0 at q = 0 and from 1 on."""
+    w = u * (1.0 - u)
+    return 64.0 * w * w * w
+
+
+ATTRACTION_MOMENT = 64.0 * math.factorial(7) * math.factorial(3) / math.factorial(11)
+"""∫₀¹ attraction(q) q⁴ dq, for the scaling of cohesion to a tension."""
+
+
 import os as _os
-TENSION = float(_os.environ.get('TEN','3.6'))
+POW = float(_os.environ.get('POW','3'))
+TENSION = float(_os.environ.get('TEN','1'))
 
 
 def cohesion_acceleration(tension: float, density: float, spacing: float, support: float) -> float:
-    return TENSION * tension / density
+    force = TENSION * tension * spacing**6 / (math.pi / 8.0 * ATTRACTION_MOMENT * support**5)
+    return force / (density * spacing**3)

@@ -32,7 +32,7 @@ STRETCH = 1.15
 WATCHED = 0.2
 """[s]."""
 import os
-CAPILLARY = float(os.environ.get('CAP','0.3'))
+CAPILLARY = float(os.environ.get('CAP','0.1'))
 """Longest step, over the capillary limit."""
 
 
