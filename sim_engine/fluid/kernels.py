@@ -56,11 +56,20 @@ ATTRACTION_MOMENT = 64.0 * math.factorial(7) * math.factorial(3) / math.factoria
 """∫₀¹ attraction(q) q⁴ dq, for the scaling of cohesion to a tension."""
 
 
-import os as _os
-POW = float(_os.environ.get('POW','3'))
-TENSION = float(_os.environ.get('TEN','1'))
-
 
 def cohesion_acceleration(tension: float, density: float, spacing: float, support: float) -> float:
-    force = TENSION * tension * spacing**6 / (math.pi / 8.0 * ATTRACTION_MOMENT * support**5)
+    """Peak acceleration of one pair [m/s²] that gives a liquid of that spacing a surface tension.
+
+    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for the amplitude of the
+    pair force f.
+
+    Args:
+        tension: σ [N/m].
+        density: of the liquid [kg/m³].
+        spacing: d [m].
+        support: h [m].
+
+    Source: Fowler 1937; for particle methods Tartakovsky & Panchenko 2016.
+    """
+    force = tension * spacing**6 / (math.pi / 8.0 * ATTRACTION_MOMENT * support**5)
     return force / (density * spacing**3)

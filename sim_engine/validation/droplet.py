@@ -31,8 +31,7 @@ STRETCH = 1.15
 """Along z at first; across by its inverse square root."""
 WATCHED = 0.2
 """[s]."""
-import os
-CAPILLARY = float(os.environ.get('CAP','0.1'))
+CAPILLARY = 0.1
 """Longest step, over the capillary limit."""
 
 

@@ -30,8 +30,7 @@ WAVE_NUMBER = 1.8412 / RADIUS
 FREQUENCY = math.sqrt(GRAVITY * WAVE_NUMBER * math.tanh(WAVE_NUMBER * HEIGHT)) / (2.0 * math.pi)
 """3.30 Hz."""
 
-import os as _os
-REST, PUSH_TIME, PUSH = 1.0, float(_os.environ.get('PT','0.15')), float(_os.environ.get('PUSH','0.006'))
+REST, PUSH_TIME, PUSH = 1.0, 0.15, 0.006
 """The push begins after this time [s], takes that long [s] and goes that far [m]."""
 WATCHED = 1.6
 """Time after the push [s]."""
@@ -93,7 +92,8 @@ def sloshing(particles: int, parameters: SimulationParameters) -> tuple[list[Mea
         particles: N.
         parameters: θ; its number of particles is replaced.
     """
-    from sim_engine.fluid.engine import POSE_STEP, engine
+    from sim_engine.fluid.engine import engine
+    from sim_engine.fluid.setup import POSE_STEP
 
     vessel = build_vessel(CUP)
     start = fill(vessel, VOLUME, particles, 1, parameters.wall_distance).astype(float)

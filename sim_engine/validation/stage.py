@@ -67,7 +67,7 @@ EMPTY_SPACE = Container(NOTHING, NOTHING.cavity, 1e-3)
 
 def still_pose(duration: float) -> Floats:
     """Poses of a vessel that stands at the world's origin, for `run`'s pose table."""
-    from sim_engine.fluid.engine import POSE_STEP
+    from sim_engine.fluid.setup import POSE_STEP
 
     poses = np.zeros((int(duration / POSE_STEP) + 3, 7))
     poses[:, 3] = 1.0
@@ -108,11 +108,15 @@ def run(
         ArithmeticError: the solver stopped with a fault.
     """
     from sim_engine.fluid.engine import engine
+    from sim_engine.fluid.setup import SceneSetup, SolidWalls
     from sim_engine.fluid.state import SUPPORT
 
     fluid = engine()
-    fluid.load(
-        np.ascontiguousarray(positions, dtype=np.float32),
+    walls = SolidWalls(
+        container.grid, container.plane(SUPPORT * spacing), container.inside, container.wall, container.rim
+    )
+    setup = SceneSetup(
+        positions=np.ascontiguousarray(positions, dtype=np.float32),
         spacing=spacing,
         tension=parameters.cohesion,
         density=DENSITY,
@@ -120,20 +124,18 @@ def run(
         friction=parameters.friction,
         wall_distance=parameters.wall_distance,
         lip_drop=parameters.lip_drop,
-        grids=[container.grid, NOTHING],
-        planes=[container.plane(SUPPORT * spacing), NOTHING.values],
-        masks=[container.inside, NOTHING.cavity],
-        walls=[container.wall, 1e-3],
-        rims=[container.rim, NO_RIM],
+        pourer=walls,
+        receiver=SolidWalls(NOTHING, NOTHING.values, NOTHING.cavity, 1e-3, NO_RIM),
         receiver_at=FAR_AWAY,
         spill_level=spill_level,
         poses=still_pose(float(times[-1])) if poses is None else poses,
         settling=settling,
         gravity=gravity,
-        **({} if longest_step is None else {"longest_step": longest_step}),
+        longest_step=longest_step,
     )
+    fluid.load([setup])
     for k, time in enumerate(times):
         fluid.advance(float(time))
-        if fluid.fault is not None:
-            raise ArithmeticError(f"at {fluid.time:.3f} s: {fluid.fault}")
+        if fluid.fault() is not None:
+            raise ArithmeticError(f"at {fluid.time():.3f} s: {fluid.fault()}")
         yield k
