@@ -134,9 +134,9 @@ class Stepper:
 
     @ti.func
     def apply(self, s):
-        """Move by the displacements found; linearised wall contact."""
+        """Move by the displacements found; linearised wall contact. `CONTACT` is kept at the step's end only: held to it in
+        every iteration, the ring of particles in a corner never came to rest."""
         f = self.state
-        clear = CONTACT * f.spacing[s]
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             x = f.x[i] + f.dx[i]
             for b in ti.static(range(VESSELS)):
@@ -144,10 +144,10 @@ class Stepper:
                 if phi < 4.0 * f.spacing[s]:
                     n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                     phi += n.dot(f.dx[i])
-                    if phi < clear:
-                        x += (clear - phi) * n
-                        f.push[i][b] = f.push[i][b] + (clear - phi)
-                        phi = clear
+                    if phi < 0.0:
+                        x -= phi * n
+                        f.push[i][b] = f.push[i][b] - phi
+                        phi = 0.0
                     f.phi[i][b] = phi
             f.x[i] = x
 
