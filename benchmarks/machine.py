@@ -22,6 +22,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def describe() -> dict[str, Any]:
     """Machine, software and moment: without them a figure means nothing."""
+    from sim_engine.validation.suite import solver_fingerprint
+
     return {
         "processor": _processor(),
         "cores": psutil.cpu_count(),
@@ -31,6 +33,7 @@ def describe() -> dict[str, Any]:
         "taichi": version("taichi"),
         "numpy": version("numpy"),
         "solver": _solver(),
+        "fingerprint": solver_fingerprint(),
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "load_average": [round(load, 1) for load in psutil.getloadavg()],
     }
