@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 
 from actors.virtual_ur.exchange import Registers, Signals
+from actors.virtual_ur.messages import Listener, Message
 from actors.virtual_ur.models import HOME, Joints, RobotModel
 from actors.virtual_ur.motion.mover import ViolationError
 from actors.virtual_ur.power import Power, RobotMode
@@ -14,6 +14,7 @@ from actors.virtual_ur.robot import Robot
 from actors.virtual_ur.safety import Safety, SafetyConfiguration, SafetyMode
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.program import Program
+from actors.virtual_ur.watchdogs import Watchdogs
 
 
 class RuntimeState(IntEnum):
@@ -29,38 +30,6 @@ class RuntimeState(IntEnum):
 
 _POWERLESS = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.FAULT)
 """Modes in which the arm has no power."""
-
-
-@dataclass(frozen=True)
-class Message:
-    """Something for people or for clients of the primary interface.
-
-    Attributes:
-        kind: 'text', 'key', 'error', 'exception', 'safety', 'popup'.
-        text: what it says.
-        line: of the program, for an exception.
-        time: of the controller [s].
-    """
-
-    kind: str
-    text: str
-    line: int = 0
-    time: float = 0.0
-
-
-@dataclass
-class Watchdog:
-    """Wants a register written often enough.
-
-    Attributes:
-        longest: between two writes [s of wall time].
-        action: 'pause' or 'stop'.
-        waited: since the last write [s of wall time].
-    """
-
-    longest: float
-    action: str
-    waited: float = 0.0
 
 
 Watcher = Callable[[], bool]
@@ -81,6 +50,7 @@ class Controller:
 
     Attributes:
         now: controller time [s].
+        switches: how often somebody switched between remote and local control.
     """
 
     def __init__(
@@ -101,6 +71,7 @@ class Controller:
         self.dt = 1.0 / self.frequency
         self.time_scale = time_scale
         self.remote = remote
+        self.switches = 0
         self.now = 0.0
         self.ticks = 0
         configuration = configuration or SafetyConfiguration.of(model)
@@ -113,9 +84,9 @@ class Controller:
         self.program: Program | None = None
         self.secondary: list[Program] = []
         self.running: Program | None = None
-        self.watchdogs: dict[str, Watchdog] = {}
+        self.watchdogs = Watchdogs()
         self.watchers: list[Watcher] = []
-        self.listeners: list[Callable[[Message], None]] = []
+        self.listeners: list[Listener] = []
         self.popup: str | None = None
         self.safety_popup = False
         self._resumes = False
@@ -149,18 +120,21 @@ class Controller:
         if not (self.power.running and self.safety.may_move):
             self.tell("key", f"program {program.name} not started: the robot is not ready")
             return
+        if self.runtime in (RuntimeState.PAUSED, RuntimeState.PAUSING):
+            # Seen with the manufacturer's simulator: the first upload only ends the program that is held.
+            self.tell("key", f"program {program.name} not started: a paused program was stopped instead")
+            self.stop()
+            return
         self._drop_program()
         self.robot.mover.thaw()
         self.program = program
         self.runtime = RuntimeState.PLAYING
         self.tell("key", f"program {program.name} started")
 
-    def receive_program(self, text: str) -> None:
-        """A program came over the network; in local control it is ignored."""
-        if self.model.remote_control and not self.remote:
-            self.tell("key", "a program was ignored: the robot is in local control")
-            return
-        self.upload(text)
+    @property
+    def local(self) -> bool:
+        """Whether commands over the network are refused. CB3 controllers know no such thing."""
+        return self.model.remote_control and not self.remote
 
     def stop(self) -> None:
         """End the program; the arm comes to rest."""
@@ -230,9 +204,10 @@ class Controller:
 
     def set_remote(self, active: bool) -> None:
         """Somebody switches between remote and local control; a program that came over the network ends."""
-        if self.remote and not active:
+        if self.remote != active:
             self.stop()
-        self.remote = active
+            self.remote = active
+            self.switches += 1
 
     def reboot(self) -> None:
         """As after a power cut: everything but the safety configuration and the remote switch is forgotten."""
@@ -300,26 +275,6 @@ class Controller:
         self._drop_program()
         self.power.off()
 
-    # ---- watchdogs
-
-    def written(self, name: str) -> None:
-        """A client wrote this input."""
-        if name in self.watchdogs:
-            self.watchdogs[name].waited = 0.0
-
-    def _watch(self) -> None:
-        if not self.playing:
-            return
-        for name, watchdog in list(self.watchdogs.items()):
-            watchdog.waited += self.dt / self.time_scale
-            if watchdog.waited > watchdog.longest:
-                self.tell("key", f"watchdog: {name} was not written for {watchdog.longest:g} s")
-                if watchdog.action == "pause":
-                    watchdog.waited = 0.0
-                    self.pause()
-                else:
-                    self.stop()
-
     # ---- time
 
     def tick(self) -> None:
@@ -329,10 +284,12 @@ class Controller:
         self.power.step(self.now)
         if self.watchers:
             self.watchers = [watcher for watcher in self.watchers if not watcher()]
-        if self.watchdogs:
-            self._watch()
         if self.runtime is RuntimeState.PLAYING:
-            self._run()
+            due = self.watchdogs.step(self.dt / self.time_scale)
+            if due is not None:
+                self._bite(*due)
+            else:
+                self._run()
         if self.secondary:
             self._run_secondary()
         try:
@@ -344,6 +301,13 @@ class Controller:
             self.runtime = RuntimeState.STOPPED if self.runtime is RuntimeState.STOPPING else RuntimeState.PAUSED
         if not self.safety.may_move:
             self._after_stop()
+
+    def _bite(self, action: str, why: str) -> None:
+        self.tell("key", why)
+        if action == "pause":
+            self.pause()
+        else:
+            self.stop()
 
     def _in_motion(self) -> bool:
         return any(abs(v) > 1e-6 for v in self.robot.mover.qd)

@@ -123,8 +123,8 @@ class Faults:
         self._when(self._controller.safety_fault, **when)
 
     def checksum(self, value: str | None = None) -> None:
-        """Report another safety checksum; none for the true one."""
-        self._controller.safety.reported_checksum = None if value is None else str(value)[:32]
+        """Report another safety checksum, up to eight hexadecimal digits; none for the true one."""
+        self._controller.safety.reported_checksum = None if value is None else f"{int(value, 16) & 0xFFFFFFFF:08X}"
 
     def limits(
         self,
@@ -162,26 +162,25 @@ class Faults:
         """
 
         def begin() -> None:
-            self._host.stalled, self._host.halted = True, not motion
-            self._host.rtde.silent = True
+            self._host.stall(True, motion=bool(motion))
             if seconds is not None:
                 self._later(_finite(seconds), self._resume)
 
         self._when(begin, **when)
 
     def _resume(self) -> None:
-        self._host.stalled = self._host.halted = self._host.rtde.silent = False
+        self._host.stall(False)
 
     def drop(self, **when: Any) -> None:
         """Cut all connections off; new ones are welcome."""
-        self._when(self._host.drop, **when)
+        self._when(self._host.connections.drop, **when)
 
     def refuse(self, seconds: float | None = None, **when: Any) -> None:
         """Cut all connections off and accept none, for some wall seconds or until 'clear'."""
 
         def begin() -> None:
             self._host.close()
-            self._host.drop()
+            self._host.connections.drop()
             if seconds is not None:
                 self._later(_finite(seconds), self._reopen)
 
@@ -221,7 +220,7 @@ class Faults:
 
     def remote(self, active: bool, **when: Any) -> None:
         """Someone switches remote control on or off."""
-        self._when(lambda: self._controller.set_remote(bool(active)), **when)
+        self._when(lambda: self._host.set_remote(bool(active)), **when)
 
     def inputs(self, digital: dict[str, bool] | None = None, analog: list[float] | None = None) -> None:
         """What is wired to the inputs: levels by number, 0–7 standard, 8–15 configurable, 16–17 tool."""

@@ -161,7 +161,7 @@ def write(controller: Controller, values: dict[str, Any]) -> None:
     """Take over what a client sent. Values that make no sense (NaN, say) are left out."""
     registers, signals = controller.registers, controller.signals
     for name, value in values.items():
-        controller.written(name)
+        controller.watchdogs.written(name)
         if name.startswith("input_int_register_"):
             registers.input_int[int(name[19:])] = value
         elif name.startswith("input_double_register_"):

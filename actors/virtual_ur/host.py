@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import time
 from collections import deque
@@ -10,10 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from actors.virtual_ur.controller import Controller
-from actors.virtual_ur.servers import dashboard_server, rtde_server, script_server
-from actors.virtual_ur.servers.dashboard_server import Dashboard, DashboardClient
-from actors.virtual_ur.servers.rtde_server import RtdeClient, RtdeServer
-from actors.virtual_ur.servers.script_server import ScriptClient
+from actors.virtual_ur.servers import dashboard_server, primary_server, rtde_server, script_server
+from actors.virtual_ur.servers.connections import Connections
+from actors.virtual_ur.servers.dashboard_server import Dashboard, DashboardConnection
+from actors.virtual_ur.servers.primary_server import PrimaryConnection, PrimaryServer
+from actors.virtual_ur.servers.rtde_server import RtdeConnection, RtdeServer
+from actors.virtual_ur.servers.script_server import ScriptConnection
 
 SLOWEST_WAKE = 0.002
 """Wall time between two wake-ups of the clock at most rate [s]; where time is scaled up each does several ticks."""
@@ -66,12 +69,11 @@ class Host:
         self.controller = controller
         self.address = address
         self.timing = Timing()
-        self.stalled = False
         self.halted = False
-        self.rtde = RtdeServer(controller)
+        self.connections = Connections(controller)
+        self.rtde = RtdeServer(controller, self.connections)
+        self.primary = PrimaryServer(controller, self.connections)
         self.dashboard = Dashboard(controller)
-        self.dashboards: set[DashboardClient] = set()
-        self.scripts: set[ScriptClient] = set()
         self.messages: deque[str] = deque(maxlen=50)
         controller.listeners.append(lambda message: self.messages.append(f"{message.kind}: {message.text}"))
         self._servers: list[asyncio.Server] = []
@@ -82,10 +84,14 @@ class Host:
     # ---- ports
 
     def _doors(self) -> list[tuple[int, Callable[[], asyncio.Protocol]]]:
+        def primary_door(messages: bool, writable: bool) -> Callable[[], asyncio.Protocol]:
+            return lambda: PrimaryConnection(self.primary, messages=messages, writable=writable)
+
         return [
-            (rtde_server.PORT, lambda: RtdeClient(self.rtde)),
-            (script_server.PORT, lambda: ScriptClient(self.controller, self.scripts)),
-            (dashboard_server.PORT, lambda: DashboardClient(self.dashboard, self.dashboards, lambda: self.stalled)),
+            (rtde_server.PORT, lambda: RtdeConnection(self.rtde)),
+            (script_server.PORT, lambda: ScriptConnection(self.connections)),
+            (dashboard_server.PORT, lambda: DashboardConnection(self.connections, self.dashboard)),
+            *((port, primary_door(*kind)) for port, kind in primary_server.PORTS.items()),
         ]
 
     async def open(self) -> None:
@@ -109,11 +115,16 @@ class Host:
         if not self._servers and (self._opening is None or self._opening.done()):
             self._opening = asyncio.get_running_loop().create_task(self.open())
 
-    def drop(self) -> None:
-        """Cut all connections off."""
-        clients: list[RtdeClient | DashboardClient | ScriptClient] = [*self.rtde.clients, *self.dashboards]
-        for client in [*clients, *self.scripts]:
-            client.drop()
+    def stall(self, active: bool, *, motion: bool = True) -> None:
+        """Keep connections but say nothing; without `motion` the controller itself hangs too."""
+        self.connections.silence(active)
+        self.halted = active and not motion
+
+    def set_remote(self, active: bool) -> None:
+        """Switch between remote and local control. Into local control, connections that take programs are cut off."""
+        self.controller.set_remote(active)
+        if self.controller.local:
+            self.connections.drop(ScriptConnection)
 
     # ---- clock
 
@@ -140,7 +151,9 @@ class Host:
                 self.timing.ticks += 1
                 controller.tick()
         if not self.halted:
-            self.rtde.publish(controller.now / max(1.0, controller.time_scale))
+            clock = controller.now / max(1.0, controller.time_scale)
+            self.rtde.publish(clock)
+            self.primary.publish(clock)
         self._clock = loop.call_at(max(self._next, now + min(period, SLOWEST_WAKE)), self._wake)
 
 
@@ -157,7 +170,8 @@ async def until_orphaned(parent: int, interval: float = 0.5) -> None:
             loop.remove_reader(0)
             gone.set()
 
-    loop.add_reader(0, readable)
+    with contextlib.suppress(OSError):  # not every standard input can be waited for: /dev/null can't
+        loop.add_reader(0, readable)
     while not gone.is_set() and os.getppid() == parent:
         try:
             await asyncio.wait_for(gone.wait(), interval)

@@ -89,12 +89,10 @@ class Settings:
 
     def set_watchdog(self, variable_name: Any, min_frequency: Any, action: Any = "pause") -> None:
         """Pause or stop the program when a client doesn't write an input often enough."""
-        from actors.virtual_ur.controller import Watchdog
-
         name, doing = str(variable_name), str(action).lower()
         if doing not in ("pause", "stop", "ignore"):
             raise ScriptError(f"a watchdog can 'pause', 'stop' or 'ignore', not '{doing}'")
         if number(min_frequency) == 0.0 or doing == "ignore":
-            self._controller.watchdogs.pop(name, None)
+            self._controller.watchdogs.remove(name)
             return
-        self._controller.watchdogs[name] = Watchdog(1.0 / positive(min_frequency, "min_frequency"), doing)
+        self._controller.watchdogs.set(name, 1.0 / positive(min_frequency, "min_frequency"), doing)

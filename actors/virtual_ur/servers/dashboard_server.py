@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 
 from actors.virtual_ur.controller import Controller
+from actors.virtual_ur.servers.connections import Connection, Connections
 
 PORT = 29999
 
 GREETING = "Connected: Universal Robots Dashboard Server"
+
+REFUSAL = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode and reconnect to port 29999"
 
 LONGEST_LINE = 10_000
 
@@ -50,24 +52,29 @@ class Dashboard:
             ("brake release", self._release, True),
             ("restart safety", self._restart_safety, True),
             ("PolyscopeVersion", self._version, False),
-            ("version", self._version, False),
+            ("version", lambda _: "{}.{}.{}.{}".format(*c.model.version), False),
             ("get robot model", lambda _: c.model.name, False),
             ("get serial number", lambda _: c.model.serial, False),
             ("is in remote control", lambda _: str(c.remote).lower(), False),
             ("get operational mode", lambda _: "NONE", False),
             ("set operational mode", lambda a: f"Setting operational mode: {a}", False),
-            ("clear operational mode", lambda _: "No longer controlling the operational mode", False),
+            ("clear operational mode", lambda _: "operational mode is no longer controlled by Dashboard Server", False),
             ("setUserRole", self._set_role, False),
             ("getUserRole", lambda _: self._role, False),
         ]
 
-    def answer(self, line: str) -> str:
-        """What a line is answered with."""
+    def answer(self, line: str, privileged: bool = True) -> str:
+        """What a line is answered with.
+
+        Args:
+            line: as sent.
+            privileged: whether it came over a connection that may command.
+        """
         asked = " ".join(line.split())
         for name, do, remote_only in self._commands:
             if asked.lower() == name.lower() or asked.lower().startswith(name.lower() + " "):
-                if remote_only and self._controller.model.remote_control and not self._controller.remote:
-                    return "Command is not allowed due to safety reasons"
+                if remote_only and not privileged:
+                    return REFUSAL
                 return do(asked[len(name) + 1 :])
         return f"could not understand: '{asked[:200]}'"
 
@@ -128,36 +135,25 @@ class Dashboard:
         return f"Setting user role: {role}"
 
 
-class DashboardClient(asyncio.Protocol):
+class DashboardConnection(Connection):
     """One connection.
 
     Args:
+        connections: it adds itself to these.
         dashboard: answers.
-        clients: all connections of this kind; it adds and removes itself.
-        silent: whether nothing is to be answered now.
     """
 
-    def __init__(self, dashboard: Dashboard, clients: set[DashboardClient], silent: Callable[[], bool]) -> None:
-        self._dashboard, self._clients, self._silent = dashboard, clients, silent
+    def __init__(self, connections: Connections, dashboard: Dashboard) -> None:
+        super().__init__(connections)
+        self._dashboard = dashboard
         self._rest = b""
-        self._transport: asyncio.Transport | None = None
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See `asyncio.Protocol`."""
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        self._clients.add(self)
-        if not self._silent():
-            transport.write(f"{GREETING}\n".encode())
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """See `asyncio.Protocol`."""
-        self._clients.discard(self)
+    def greet(self) -> None:
+        """See `Connection.greet`."""
+        self.send(f"{GREETING}\n".encode())
 
     def data_received(self, data: bytes) -> None:
         """See `asyncio.Protocol`."""
-        if self._silent() or self._transport is None:
-            return
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST_LINE:
             self.drop()
@@ -166,12 +162,7 @@ class DashboardClient(asyncio.Protocol):
             text = line.decode("utf-8", "replace").strip()
             if not text:
                 continue
-            self._transport.write(f"{self._dashboard.answer(text)}\n".encode())
+            self.send(f"{self._dashboard.answer(text, self.privileged)}\n".encode())
             if text.lower() == "quit":
-                self._transport.close()
+                self.finish()
                 return
-
-    def drop(self) -> None:
-        """Cut the connection off."""
-        if self._transport is not None:
-            self._transport.abort()

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 
 from actors.virtual_ur.controller import Controller
 from actors.virtual_ur.fields import INPUT_KINDS, output_fields, write
+from actors.virtual_ur.servers.connections import Connection, Connections
 from actors.virtual_ur.wire import rtde
 from actors.virtual_ur.wire.rtde import Frames, FramingError, InputRecipe, OutputRecipe
 
 PORT = 30004
 
-MOST_UNSENT = 1_000_000
-"""Bytes that a client may leave unread before it is cut off."""
+SLOWEST = 0.1
+"""Lowest rate of outputs [Hz]; a client that asks for less gets this."""
 
 LONGEST_NAMES = 2048
-"""Bytes that a list of field names may have, as on a controller."""
+"""Bytes that a list of field names may have, as the guide says; what is beyond is cut."""
 
 
 class RtdeServer:
@@ -24,35 +24,39 @@ class RtdeServer:
 
     Args:
         controller: read and written.
+        connections: its clients are among these.
     """
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Controller, connections: Connections) -> None:
         self.controller = controller
+        self.connections = connections
         self.fields = output_fields(controller)
-        self.clients: set[RtdeClient] = set()
-        self.owners: dict[str, RtdeClient] = {}
-        self.silent = False
+        self.owners: dict[str, RtdeConnection] = {}
 
-    def publish(self, wall: float) -> None:
+    def publish(self, clock: float) -> None:
         """Send every client what is due.
 
         Args:
-            wall: monotonic wall time [s]. Rates are of wall time where time is scaled up, of controller time else.
+            clock: what rates are measured by [s]: wall time where time is scaled up, controller time else.
         """
-        if self.silent:
+        if self.connections.silent:
             return
-        for client in list(self.clients):
-            client.publish(wall)
+        for connection in list(self.connections.open):
+            if isinstance(connection, RtdeConnection):
+                connection.publish(clock)
 
 
-class RtdeClient(asyncio.Protocol):
-    """One connection."""
+class RtdeConnection(Connection):
+    """One client.
+
+    Args:
+        server: whose client it is.
+    """
 
     def __init__(self, server: RtdeServer) -> None:
+        super().__init__(server.connections)
         self._server = server
-        self._controller = server.controller
         self._frames = Frames()
-        self._transport: asyncio.Transport | None = None
         self._protocol = 1
         self._outputs: OutputRecipe | None = None
         self._recipes = 0
@@ -61,40 +65,24 @@ class RtdeClient(asyncio.Protocol):
         self._due = 0.0
         self._started = False
 
-    # ---- asyncio's side
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See `asyncio.Protocol`."""
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        self._server.clients.add(self)
-
     def connection_lost(self, exc: Exception | None) -> None:
         """See `asyncio.Protocol`."""
-        self._server.clients.discard(self)
+        super().connection_lost(exc)
         for name in [name for name, owner in self._server.owners.items() if owner is self]:
             del self._server.owners[name]
 
     def data_received(self, data: bytes) -> None:
         """See `asyncio.Protocol`."""
-        if self._server.silent:
-            return
         try:
             for kind, payload in self._frames.feed(data):
                 self._handle(kind, payload)
         except FramingError:
             self.drop()
 
-    def drop(self) -> None:
-        """Cut the connection off."""
-        if self._transport is not None:
-            self._transport.abort()
-
     # ---- the protocol's side
 
     def _send(self, kind: int, payload: bytes) -> None:
-        if self._transport is not None:
-            self._transport.write(rtde.frame(kind, payload))
+        self.send(rtde.frame(kind, payload))
 
     def _handle(self, kind: int, payload: bytes) -> None:
         match kind:
@@ -104,13 +92,13 @@ class RtdeClient(asyncio.Protocol):
                     self._protocol = payload[1]
                 self._send(kind, bytes([known]))
             case rtde.GET_URCONTROL_VERSION:
-                self._send(kind, struct.pack(">4I", *self._controller.model.version))
+                self._send(kind, struct.pack(">4I", *self.controller.model.version))
             case rtde.SETUP_OUTPUTS:
                 self._setup_outputs(payload)
             case rtde.SETUP_INPUTS:
                 self._setup_inputs(payload)
             case rtde.START:
-                self._started = self._outputs is not None or bool(self._inputs)
+                self._started = self._outputs is not None
                 self._due = 0.0
                 self._send(kind, bytes([self._started]))
             case rtde.PAUSE:
@@ -125,23 +113,24 @@ class RtdeClient(asyncio.Protocol):
 
     def _complain(self, text: str) -> None:
         # Never before the start: a client in its setup takes whatever comes next for its answer.
-        if self._started and self._transport is not None:
-            self._transport.write(rtde.text_message(self._protocol, text, "RTDE", 1))
+        if self._started:
+            self.send(rtde.text_message(self._protocol, text, "RTDE", 1))
 
     def _setup_outputs(self, payload: bytes) -> None:
-        frequency = self._controller.frequency
+        highest = self.controller.frequency
+        frequency = highest
         if self._protocol == 2:
             if len(payload) < 8:
                 self._send(rtde.SETUP_OUTPUTS, b"\0")
                 return
             (frequency,) = struct.unpack_from(">d", payload)
             payload = payload[8:]
-        if len(payload) > LONGEST_NAMES * 4 or not 0.1 <= frequency <= self._controller.frequency:
-            frequency = min(max(frequency, 0.1), self._controller.frequency) if frequency == frequency else 1.0
-        names = rtde.names(payload)
+        if not SLOWEST <= frequency <= highest:  # also where it is no number
+            frequency = SLOWEST if frequency < SLOWEST else highest
+        names = rtde.names(payload[:LONGEST_NAMES])
         kinds = [self._server.fields[n].kind if n in self._server.fields else "NOT_FOUND" for n in names]
-        number = 1 if self._protocol == 2 else 0
         whole = bool(names) and "NOT_FOUND" not in kinds
+        number = 1 if self._protocol == 2 else 0
         if whole:
             self._outputs = OutputRecipe(number, [self._server.fields[n] for n in names])
             self._interval = 1.0 / frequency
@@ -149,7 +138,7 @@ class RtdeClient(asyncio.Protocol):
         self._send(rtde.SETUP_OUTPUTS, head + ",".join(kinds).encode())
 
     def _setup_inputs(self, payload: bytes) -> None:
-        names, owners = rtde.names(payload), self._server.owners
+        names, owners = rtde.names(payload[:LONGEST_NAMES]), self._server.owners
         kinds = []
         for name in names:
             if name not in INPUT_KINDS:
@@ -171,14 +160,12 @@ class RtdeClient(asyncio.Protocol):
         if values is None:
             self._complain("a data package that fits no recipe is ignored")
             return
-        write(self._controller, values)
+        write(self.controller, values)
 
-    def publish(self, wall: float) -> None:
+    def publish(self, clock: float) -> None:
         """Send the present values if they are due."""
-        if not self._started or self._outputs is None or wall < self._due or self._transport is None:
+        if not self._started or self._outputs is None or clock < self._due - 1e-9:
             return
-        self._due = wall + self._interval if wall > self._due + self._interval else self._due + self._interval
-        if self._transport.get_write_buffer_size() > MOST_UNSENT:
-            self.drop()
-            return
-        self._transport.write(self._outputs.package())
+        late = clock > self._due + self._interval
+        self._due = (clock if late else self._due) + self._interval
+        self.send(self._outputs.package())
