@@ -63,9 +63,7 @@ def of_ours(particles: int, runs: list[Measured]) -> dict[str, Any]:
         "iterations_per_step": round(middle.iterations / middle.outcome.steps, 2),
         "particle_iterations_per_s": round(statistics.median(rates)),
         "simulated_time_s": round(statistics.median(run.outcome.simulated_time for run in runs), 3),
-        **_physics(
-            left, [run.outcome.received for run in runs], statistics.mean(run.density for run in runs), LEFT_LIMIT
-        ),
+        **_physics(left, [run.outcome.received for run in runs], [run.density for run in runs]),
         "density_error": round(statistics.mean(run.outcome.density_error for run in runs), 4),
         "repeats": len(runs),
     }
@@ -85,19 +83,19 @@ def of_theirs(particles: int, runs: list[PeerRun]) -> dict[str, Any]:
         "iterations_per_step": round(middle.iterations / middle.steps, 2),
         "particle_iterations_per_s": round(particles * middle.iterations / middle.cpu_s),
         "simulated_time_s": END,
-        **_physics(left, [run.delivered for run in runs], statistics.mean(run.density for run in runs), LEFT_LIMIT),
+        **_physics(left, [run.delivered for run in runs], [run.density for run in runs]),
         "repeats": len(runs),
     }
 
 
-def _physics(left: list[float], received: list[float], density: float, limit: float) -> dict[str, Any]:
+def _physics(left: list[float], received: list[float], densities: list[float]) -> dict[str, Any]:
     off = [abs(value - reference) for value, reference in zip(left, LEFT, strict=True)]
     return {
         "left": {f"{t:g} s": round(value, 3) for t, value in zip(TIMES, left, strict=True)},
-        "left_is_right": all(value <= limit for value in off),
+        "left_is_right": all(value <= LEFT_LIMIT for value in off),
         "delivered": round(statistics.mean(received), 4),
         "delivered_of_each": [round(value, 4) for value in received],
-        "density_at_rest": round(density, 4),
+        "density_at_rest": round(statistics.mean(densities), 4),
     }
 
 

@@ -52,10 +52,6 @@ MOMENTS = {"at rest": 1.0, "in full flow": 2.7}
 WINDOW = 0.15
 """A moment lasts from so long before to so long after [s]."""
 
-CORE_LIMIT = (3.5e6, 8.0e6)
-"""What plain C reaches on such a core with a resting lattice, density passes and list building alone: lists built in
-every step, and lists kept for eight [particle-iterations/s]."""
-
 ENTRIES = 1 << 20
 PROCESS_CPU_CLOCK = 2
 """CLOCK_PROCESS_CPUTIME_ID of Linux: other work on the machine does not count."""
@@ -207,7 +203,6 @@ def profile(particles: int, plain_cpu_s: float) -> dict[str, Any]:
     moments = {
         name: shares([call for call in calls if abs(call[2] - moment) <= WINDOW]) for name, moment in MOMENTS.items()
     }
-    rate = particles * run.iterations / plain_cpu_s
     return {
         "particles": particles,
         "whole pour": shares(calls),
@@ -215,9 +210,8 @@ def profile(particles: int, plain_cpu_s: float) -> dict[str, Any]:
         "cpu_s": round(plain_cpu_s, 3),
         "slower": round(run.cpu_s / plain_cpu_s, 3),
         "explained": round(sum(own for _, own, _ in calls) / run.cpu_s, 3),
-        "particle_iterations_per_s": round(rate),
-        "core_limit": list(CORE_LIMIT),
-        "of_core_limit": [round(rate / limit, 2) for limit in CORE_LIMIT],
+        "iterations_per_step": round(run.iterations / run.outcome.steps, 3),
+        "particle_iterations_per_s": round(particles * run.iterations / plain_cpu_s),
     }
 
 

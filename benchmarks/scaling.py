@@ -3,7 +3,7 @@
     python benchmarks/scaling.py [--particles 1000 2000 5000 10000 20000] [--memory 1000 2000 5000 10000 20000 50000]
                                  [--repeats 3] [--core 1] [--json]
 
-A process for each number, so that memory is its own. Memory is the resident set half a second into the pour, and by how
+A process for each number, so that memory is its own. Memory is the resident set early in the pour, and by how
 much it grew with each step on the way there: packages, Taichi, the solver's arrays, kernels and vessels (by a pour of
 200 particles), the pour of N itself. The exponent is that of a power law through all CPU seconds.
 """
@@ -24,7 +24,8 @@ from sim_engine.pour import SETTLING, SLICE, PourSimulator, SimulationCancelled
 
 PARTICLES = (1_000, 2_000, 5_000, 10_000, 20_000)
 MEMORY = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
-HALF_A_SECOND = round((0.5 + SETTLING) / SLICE)
+EARLY = round((0.1 + SETTLING) / SLICE)
+"""Slices after which all memory that a pour needs is in use."""
 
 
 def resident() -> int:
@@ -66,14 +67,14 @@ def memory(particles: int) -> dict[str, Any]:
     def enough() -> bool:
         nonlocal slices
         slices += 1
-        return slices > HALF_A_SECOND
+        return slices > EARLY
 
     try:
         simulator.simulate(standard_task(particles, 1), cancelled=enough)
     except SimulationCancelled:
         pouring = resident()
     else:
-        raise SystemExit(f"the standard pour with {particles} particles was over within half a second")
+        raise SystemExit(f"the standard pour with {particles} particles was over at once")
     simulator.close()
     return {
         "particles": particles,
