@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from actors.balance.dialects import DIALECTS, KCP, KERN_SWT, MT_SICS, SBI, Dialect, LineSettings
-from actors.balance.errors import UnknownDialectError
+from actors.balance.errors import LineSettingsError, UnknownDialectError
 from actors.balance.reading import FrameError, Reading
 from actors.balance.wire import Wire
 
@@ -34,13 +34,17 @@ class Attempt:
         line: the setting.
         heard: what came unasked.
         answers: question → what came.
+        possible: whether the port can be set so.
     """
 
     line: LineSettings
     heard: bytes = b""
     answers: dict[str, bytes] = field(default_factory=dict)
+    possible: bool = True
 
     def __str__(self) -> str:
+        if not self.possible:
+            return f"{self.line}: the port can't be set so"
         parts = [f"unasked {_shown(self.heard)}"] if self.heard else []
         parts += [f"{title} → {_shown(came)}" for title, came in self.answers.items()]
         return f"{self.line}: {', '.join(parts)}"
@@ -90,9 +94,13 @@ def detect(
     for line in candidates:
         if interrupted():
             break
-        wire = open_wire(line)
         attempt = Attempt(line)
         attempts.append(attempt)
+        try:
+            wire = open_wire(line)
+        except LineSettingsError:
+            attempt.possible = False
+            continue
         try:
             found = _try(wire, attempt, allowed)
         except BaseException:
@@ -191,7 +199,9 @@ def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect])
     """What was tried, what came back, and what to look at."""
     came = [data for attempt in attempts for data in (attempt.heard, *attempt.answers.values()) if data]
     everything = b"".join(came)
-    if not came:
+    if not any(attempt.possible for attempt in attempts):
+        advice = "The port can't be set to what was asked for; set another 'baud' or 'format'."
+    elif not came:
         advice = (
             "Nothing came at all: is the balance switched on, is its interface set to remote control and to one of "
             "these protocols, is it the right port and the right cable (some need a crossed one)?"

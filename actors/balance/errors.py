@@ -13,6 +13,10 @@ class NoConnectionError(BalanceError):
     """The port can't be opened, has vanished, or nobody answers on it."""
 
 
+class LineSettingsError(NoConnectionError):
+    """The port can't be set to this speed or format."""
+
+
 class UnknownDialectError(NoConnectionError):
     """Something may be there, but it speaks none of the dialects."""
 

@@ -17,7 +17,10 @@ from actors.balance.spec import AUTO, SerialBalanceSpec, parse_format
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Record. Returns the exit code."""
-    asked = _parser().parse_args(arguments)
+    parser = _parser()
+    asked = parser.parse_args(arguments)
+    if asked.to.exists():
+        parser.error(f"{asked.to} exists; name another file")
     spec = SerialBalanceSpec(
         port=asked.port,
         dialect=asked.dialect,

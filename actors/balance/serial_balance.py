@@ -27,6 +27,7 @@ from actors.balance.protocol import Weight
 from actors.balance.reading import Acknowledgement, Answer, Reading, Status
 from actors.balance.settling import Settled, Settling
 from actors.balance.spec import SerialBalanceSpec
+from actors.balance.units import kilograms
 from actors.balance.wire import Tap
 
 ZERO_STEPS = 2.0
@@ -42,6 +43,9 @@ COMMAND_TIME = 3.0
 """How long the display may take to follow tare or zero [s of bench time]."""
 
 _RETRY_INTERVAL = 0.5
+
+STRANGE_UNITS = 3
+"""Readings in a row in a unit that is no mass, before that is an error."""
 
 LOSSES = 3
 """How often the connection may be lost during one weighing."""
@@ -64,9 +68,9 @@ class SerialBalance:
         self._link = Link(spec, self._interrupted, tap)
         self._unit = ""
         self._step = spec.step or 0.0
-        self._last = Weight(math.nan, False, time.monotonic(), str(Status.LOST))
+        self._last = Weight(math.nan, False, 0.0, str(Status.LOST))
         self._tared = self._reference_lost = False
-        self._losses = 0
+        self._losses = self._strange_units = 0
 
     # What counts.
 
@@ -291,7 +295,8 @@ class SerialBalance:
             self._note(reading, moment)
 
     def _note(self, reading: Reading, moment: float) -> None:
-        self._unit = reading.unit or self._unit
+        if kilograms(reading.unit) is not None:
+            self._unit = reading.unit
         step = reading.step(self._unit)
         if self._spec.step is None and step is not None:
             self._step = step
@@ -351,7 +356,11 @@ class SerialBalance:
             raise self._error(ReferenceLostError, LOST_REFERENCE.format(shown=self._last.shown or "nothing"))
 
     def _check_unit(self, reading: Reading) -> None:
-        if reading.value is not None and reading.unit and reading.mass() is None:
+        """Refuse what is no mass; but a unit that lost a letter on the line is none either, so not at once."""
+        strange = reading.value is not None and bool(reading.unit) and reading.mass() is None
+        self._strange_units = self._strange_units + 1 if strange else 0
+        if self._strange_units >= STRANGE_UNITS:
+            self._strange_units = 0
             raise self._error(
                 UnitError,
                 f"it shows {reading.value} {reading.unit}, and that is no mass that is understood; switch it to g",

@@ -10,10 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.balance.dialects.dialect import LineSettings
-from actors.balance.errors import NoConnectionError
+from actors.balance.errors import LineSettingsError, NoConnectionError
 
 if TYPE_CHECKING:
     from serial import Serial
+
+try:
+    from termios import error as _TermiosError  # noqa: N812
+except ImportError:  # not on Windows, and not raised there
+    _TermiosError = OSError  # type: ignore[misc, assignment]
 
 Tap = Callable[[str, bytes], None]
 """Sees the bytes of a wire: direction 'out' (to the balance) or 'in', and what went."""
@@ -22,8 +27,8 @@ LONGEST_LINE = 128
 """Characters without an end of line that can't be a line of any dialect."""
 
 _WRITE_TIME = 2.0
-_GLANCE = 0.05
-"""Longest single wait for a character [s]."""
+_GLANCE = 0.02
+"""Longest single wait for a character [s]; fixed, since pyserial sets the whole port anew for another."""
 
 
 class PortLostError(NoConnectionError):
@@ -60,6 +65,7 @@ class Wire:
         tap: sees all bytes.
 
     Raises:
+        LineSettingsError: it can't be set to that line.
         NoConnectionError: it can't be opened; says why and what to do.
     """
 
@@ -93,7 +99,7 @@ class Wire:
 
     def flush(self) -> None:
         """Throw away what came unasked; whole lines are counted as stale."""
-        while self._pull(0.0):
+        while self._pull(only_waiting=True):
             pass
         self.counters.stale += self._buffer.count(b"\n")
         self._buffer.clear()
@@ -119,10 +125,9 @@ class Wire:
             if len(self._buffer) > LONGEST_LINE:
                 self.counters.damaged += 1
                 self._buffer.clear()
-            left = moment - time.monotonic()
-            if left <= 0.0:
+            if moment <= time.monotonic():
                 return None
-            self._pull(min(left, _GLANCE))
+            self._pull()
 
     def take(self) -> bytes:
         """What is waiting and has no end of line yet, taken out."""
@@ -135,11 +140,11 @@ class Wire:
         with contextlib.suppress(OSError):
             self._serial.close()
 
-    def _pull(self, wait: float) -> bool:
-        """Take in what has come, waiting a little for the first character; whether anything came."""
+    def _pull(self, *, only_waiting: bool = False) -> bool:
+        """Take in what has come, or wait a moment for a first character; whether anything came."""
         try:
-            self._serial.timeout = wait
-            data = self._serial.read(self._serial.in_waiting or 1)
+            count = self._serial.in_waiting
+            data = self._serial.read(count or 1) if count or not only_waiting else b""
         except OSError as error:
             raise self._lost(error) from error
         except TypeError as error:  # pyserial, closed by another thread in the middle of a read
@@ -171,13 +176,17 @@ def _open(port: str, line: LineSettings, handshake: str) -> Serial:
             write_timeout=_WRITE_TIME,
             exclusive=True,
         )
-    except (OSError, ValueError) as error:
+    except (_TermiosError, ValueError) as error:
+        if isinstance(error, OSError):
+            raise NoConnectionError(f"{port}: {_reason(port, error)}") from error
+        raise LineSettingsError(f"{port}: can't be set to {line}") from error
+    except OSError as error:  # pyserial's errors are such
         raise NoConnectionError(f"{port}: {_reason(port, error)}") from error
 
 
-def _reason(port: str, error: OSError | ValueError) -> str:
+def _reason(port: str, error: OSError) -> str:
     """Why a port can't be opened, and what to do."""
-    number = error.errno if isinstance(error, OSError) else None
+    number = error.errno
     if number == 2 or not Path(port).exists():
         found = ports()
         there = f"there are {', '.join(found)}" if found else "no serial port of a balance is there"

@@ -28,6 +28,7 @@ class Replay:
 
     def hear(self, data: bytes, now: float) -> None:
         """See `Character.hear`."""
+        self._begin(now)
         self._heard += data
         while (found := self._find()) is not None:
             self._heard = self._heard[len(self._events[found].data) :]
@@ -39,9 +40,7 @@ class Replay:
 
     def speak(self, now: float) -> bytes:
         """See `Character.speak`."""
-        if not self._begun:
-            self._begun = True
-            self._play(-1, now)
+        self._begin(now)
         ready = b"".join(data for at, data in self._queue if at <= now)
         self._queue = [(at, data) for at, data in self._queue if at > now]
         return ready
@@ -55,6 +54,11 @@ class Replay:
         if order.get("do") == "state":
             return {"played": self._at, "of": len(self._events)}
         raise ValueError(f"a recording can't do {order.get('do')!r}")
+
+    def _begin(self, now: float) -> None:
+        if not self._begun:
+            self._begun = True
+            self._play(-1, now)
 
     def _find(self) -> int | None:
         """The next recorded question that was just heard."""
