@@ -1,4 +1,4 @@
-"""Settings of a balance on a serial line. Plain values."""
+"""Settings of a balance: its serial line, where it stands. Plain values."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from actors.balance.dialects import DIALECTS, LineSettings
+from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
+from actors.balance.virtual_serial.scale import ScaleSettings
 
 AUTO = "auto"
 """Dialect that is found out."""
@@ -70,6 +72,25 @@ class SerialBalanceSpec:
         if self.format is None:  # a known speed: the formats that are usual at any
             return tuple(dict.fromkeys(LineSettings(bauds[0], *form) for form in forms))
         return tuple(dict.fromkeys(LineSettings(baud, *forms[0]) for baud in bauds))
+
+
+@dataclass(frozen=True)
+class BalanceSpec:
+    """A laboratory's balance.
+
+    Attributes:
+        placement: where it stands.
+        serial: its line; None where the operator types what it shows.
+        virtual: what its data sheet would say, where there is none: it is started, and `serial.port` set to its port.
+        pourer_elsewhere: the pourer is weighed on another balance, and typed.
+        load_tolerance: how far a load may lie from the one asked for [kg].
+    """
+
+    placement: Placement
+    serial: SerialBalanceSpec | None
+    virtual: ScaleSettings | None = None
+    pourer_elsewhere: bool = False
+    load_tolerance: float = 5e-3
 
 
 def parse_format(text: str) -> tuple[int, str, int]:
