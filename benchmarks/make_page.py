@@ -151,8 +151,10 @@ def main() -> None:
         if name not in PLAN:
             raise SystemExit(f"--measure {name}: there is no such measurement, only {', '.join(PLAN)}")
     for name in names:
-        if (BENCHMARKS / PLAN[name][0]).exists():
-            keep(options.folder, name, measure(name))
+        if not (BENCHMARKS / PLAN[name][0]).exists():
+            say(f"{name}: there is no {PLAN[name][0]}; left as it is")
+            continue
+        keep(options.folder, name, measure(name))
     say(f"written: {write(options.folder)}")
 
 

@@ -12,6 +12,8 @@ import page_figures
 TARGETS = {2_000: (1.5, 0.6), 5_000: (5.0, 2.0), 10_000: (12.0, 5.0)}
 """Required and aimed-at CPU seconds of the standard pour, by particles."""
 
+PHYSICS = ("left at 2.3 s", "2.7 s", "3.1 s", "", "delivered", "density inside")
+
 Record = Mapping[str, Any]
 """`command`, and the `result` that it printed."""
 
@@ -58,9 +60,7 @@ def targets(pours: Sequence[Record]) -> str:
     speed_table = table(
         ("N", "required", "aim", "CPU s", "", "steps", "iterations a step", "particle-iterations/s"), rows, "rrrrlrrr"
     )
-    physics_table = table(
-        ("N", "left at 2.3 s", "2.7 s", "3.1 s", "delivered", "density inside", "mean compression"), physics, "rrrrrrr"
-    )
+    physics_table = table(("N", *PHYSICS, "mean compression"), physics, "rrrrlrrr")
     about = prose(
         f"""Medians over seeds. A pour is over when nothing can change any more, which for this one is after
         {pours[0]["result"]["simulated_time_s"]:.1f} s. Particles that have left the solver still count in
@@ -115,7 +115,7 @@ def beside_the_peer(pours: Sequence[Record]) -> str:
 {table(head, rows, "rrrrrrrr")}
 Its physics, measured as ours:
 
-{table(("N", "left at 2.3 s", "2.7 s", "3.1 s", "delivered", "density inside"), physics, "rrrrrr")}
+{table(("N", *PHYSICS), physics, "rrrrlrr")}
 ![CPU seconds against the number of particles](images/{page_figures.COST})
 
 {settings(both)}"""
@@ -288,17 +288,15 @@ def facts(result: Record) -> str:
 
 
 def settings(records: Sequence[Record]) -> str:
-    """Machine, software, moment and commands of one or several measurements, small."""
-    machines: dict[str, None] = {}
+    """Machine, software, commands, and the moment of each of one or several measurements, small."""
+    machines: dict[str, list[str]] = {}
     for record in records:
         m, core = record["result"]["machine"], record["result"].get("core")
-        place = f", core {core}" if core is not None else ""
-        machines[
-            f"{m['processor']}, {m['cores']} cores{place}, {m['system']}, Python {m['python']}, Taichi {m['taichi']}, "
-            f"solver {m['solver']}, {m['date']}, load {m['load_average'][0]}"
-        ] = None
-    commands = ", ".join(f"`{record['command']}`" for record in records)
-    return f"<sub>{'; '.join(machines)}. {commands}</sub>\n"
+        place = f"{m['processor']}, {m['cores']} cores, {m['system']}, Python {m['python']}, Taichi {m['taichi']}"
+        where = f"core {core}, " if core is not None else ""
+        moment = f"solver {m['solver']}, {m['date']}, {where}load {m['load_average'][0]}"
+        machines.setdefault(place, []).append(f"`{record['command']}` ({moment})")
+    return "<sub>" + "; ".join(f"{place}: {', '.join(made)}" for place, made in machines.items()) + "</sub>\n"
 
 
 def prose(text: str) -> str:
@@ -331,7 +329,8 @@ def verdict(cpu_s: float, required: float | None, aim: float | None) -> str:
 
 def _physics(result: Record) -> tuple[str, ...]:
     left = tuple(f"{value:.3f}" for value in result["left"].values())
-    return (*left, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
+    word = "right" if result["left_is_right"] else "**off**"
+    return (*left, word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
 
 
 def _words(key: str) -> str:

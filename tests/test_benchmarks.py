@@ -167,7 +167,12 @@ MACHINE = {
 
 
 def pour_record(particles: int, cpu_s: float) -> dict[str, Any]:
-    physics = {"left": {"2.3 s": 0.91, "2.7 s": 0.65, "3.1 s": 0.30}, "delivered": 0.99, "density_at_rest": 1.003}
+    physics = {
+        "left": {"2.3 s": 0.91, "2.7 s": 0.65, "3.1 s": 0.30},
+        "left_is_right": True,
+        "delivered": 0.99,
+        "density_at_rest": 1.003,
+    }
     rates = {"steps": 1200, "iterations_per_step": 3.5, "particle_iterations_per_s": 5e6, "simulated_time_s": 4.0}
     peer = {"name": "Peer 2", "cpu_s": 17.0, **rates, **physics}
     ours = {"particles": particles, "cpu_s": cpu_s, "density_error": 0.012, **rates, **physics}
@@ -189,10 +194,25 @@ def test_page_says_what_is_met_what_is_missed_and_what_is_not_measured(tmp_path:
     assert "| 5,000 | 5.00 | 2.00 | **4.00** | met |" in page
     assert "| 10,000 | 12.0 | 5.00 | **15.0** | **missed** |" in page
     assert "| 2,000 | 0.50 | 17.0 | **34** |" in page
-    assert "abacus, 10 cores, core 1" in page
+    assert "| 2,000 | 0.910 | 0.650 | 0.300 | right | 0.990 | 1.003 |" in page
+    assert "abacus, 10 cores, wood" in page
+    assert "`python pour` (solver abc, today, core 1, load 0.1)" in page
     assert "## Start-up\n\nNot measured yet: `python benchmarks/start_up.py --json`" in page
     assert page.endswith("## What was tried and did not pay\n\nNothing.\n")
     assert (tmp_path / "images" / "performance-cost.png").stat().st_size > 1000
+
+
+def test_page_shows_a_result_of_any_shape() -> None:
+    import make_page
+
+    rows = [{"batch": 1, "pours_per_min": 30.25}, {"batch": 1024, "pours_per_min": 2100.0}]
+    result = {"busy_fraction": 0.98751, "nodes": {"lost": True}, "rows": rows, "machine": MACHINE}
+    page = make_page.page_text({"pool": {"command": "python pool", "result": result}}, "")
+    assert "| busy fraction | 0.9875 |" in page
+    assert "nodes:\n\n" in page
+    assert "| lost | yes |" in page
+    assert "| batch | pours per min |" in page
+    assert "| 1,024 | 2100 |" in page
 
 
 def test_page_warns_of_figures_from_different_solvers() -> None:
