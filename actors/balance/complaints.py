@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from actors.balance.errors import BalanceError, BalanceFaultError, NoConnectionError, NotStableError, OutOfRangeError
+from actors.balance.errors import (
+    BalanceError,
+    BalanceFaultError,
+    CommandError,
+    NoConnectionError,
+    NotStableError,
+    OutOfRangeError,
+)
 from actors.balance.reading import Reading, Status
 
 _OUTSIDE = {
     Status.OVER: "over range: more is on it than it weighs. Take something off, or use a larger balance",
     Status.UNDER: "under range: something that was on it when it was switched on is missing (its pan?), or it hangs",
 }
+
+REFUSED = "it refuses the question"
+"""Begins the detail of a reading that is no reading."""
 
 LOST_REFERENCE = (
     "the connection was lost since the last tare. If it stayed switched on, its display still holds the weight (last "
@@ -42,6 +52,8 @@ def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[t
         case Status.ERROR:
             detail = f" ({seen.detail})" if seen.detail else ""
             return BalanceFaultError, f"it reports a fault{detail}; look it up in its manual"
+        case Status.BUSY if seen.detail.startswith(REFUSED):
+            return CommandError, f"{seen.detail}. Does it speak this dialect? Set 'dialect: auto' to find out"
         case Status.SILENT:
             return (
                 NoConnectionError,

@@ -8,12 +8,16 @@ import threading
 import time
 from collections.abc import Iterator
 
+from actors.balance.complaints import REFUSED
 from actors.balance.detect import Detected, detect, dialects
 from actors.balance.dialects import Dialect, LineSettings
 from actors.balance.errors import CommandError, NoConnectionError
 from actors.balance.reading import Acknowledgement, FrameError, Reading, Reply, Status
 from actors.balance.spec import SerialBalanceSpec
 from actors.balance.wire import Counters, PortLostError, Tap, Wire
+
+MOST_LINES = 100
+"""Lines that are looked at for one answer."""
 
 _REOPEN_INTERVAL = 0.2
 _GLANCE = 0.1
@@ -111,12 +115,12 @@ class Link:
         with self._wire_at_rest() as wire:
             wire.send(self.dialect.query)
             end = time.monotonic() + self._spec.answer_time
-            while (line := self._line(wire, end)) is not None:
+            for line in self._lines(wire, end):
                 reply = self._understood(line)
                 if isinstance(reply, Reading):
                     return reply, time.monotonic()
                 if isinstance(reply, Acknowledgement) and not reply.command:
-                    return Reading(Status.BUSY, detail=f"it refused the question: {reply.text}"), time.monotonic()
+                    return Reading(Status.BUSY, detail=f"{REFUSED}: {reply.text}"), time.monotonic()
         self.counters.unanswered += 1
         return Reading(Status.SILENT), time.monotonic()
 
@@ -140,7 +144,7 @@ class Link:
                 return None
             wanted = data.strip().decode("ascii")
             end = time.monotonic() + max(patience, self._spec.answer_time)
-            while (line := self._line(wire, end)) is not None:
+            for line in self._lines(wire, end):
                 reply = self._understood(line)
                 if isinstance(reply, Acknowledgement) and reply.command in (wanted, ""):
                     return reply
@@ -173,6 +177,14 @@ class Link:
         except PortLostError:
             self.close()
             raise
+
+    def _lines(self, wire: Wire, end: float) -> Iterator[bytes]:
+        """Lines until a time, but no flood of them: that would have no end."""
+        for _ in range(MOST_LINES):
+            line = self._line(wire, end)
+            if line is None:
+                return
+            yield line
 
     def _line(self, wire: Wire, end: float) -> bytes | None:
         """The next line, looking up for an interruption."""

@@ -7,7 +7,6 @@ KILOGRAMS = {
     "g": 1e-3,
     "mg": 1e-6,
     "ug": 1e-9,
-    "t": 1e3,
     "ct": 2e-4,
     "lb": 0.45359237,
     "oz": 0.028349523125,
@@ -16,7 +15,8 @@ KILOGRAMS = {
     "gn": 6.479891e-5,
 }
 """Mass of one unit [kg], by its name in lower case: pounds and ounces avoirdupois, `ozt` the troy ounce, `gn` the
-grain, `dwt` the pennyweight, `ct` the metric carat. Exact by definition."""
+grain, `dwt` the pennyweight, `ct` the metric carat. Exact by definition. No tonne: a
+damaged `ct` must not become one."""
 
 
 def kilograms(unit: str) -> float | None:

@@ -27,6 +27,7 @@ LONGEST_LINE = 128
 """Characters without an end of line that can't be a line of any dialect."""
 
 _WRITE_TIME = 2.0
+_FLUSHES = 100
 _GLANCE = 0.02
 """Longest single wait for a character [s]; fixed, since pyserial sets the whole port anew for another."""
 
@@ -90,8 +91,7 @@ class Wire:
             PortLostError: the port vanished, or doesn't take the bytes.
         """
         try:
-            self._serial.write(data)
-            self._serial.flush()
+            self._serial.write(data)  # not drained: that has no deadline where the other side stops the line
         except OSError as error:  # pyserial's errors are OSErrors
             raise self._lost(error) from error
         if self._tap is not None:
@@ -99,8 +99,9 @@ class Wire:
 
     def flush(self) -> None:
         """Throw away what came unasked; whole lines are counted as stale."""
-        while self._pull(only_waiting=True):
-            pass
+        for _ in range(_FLUSHES):  # a flood has no end
+            if not self._pull(only_waiting=True):
+                break
         self.counters.stale += self._buffer.count(b"\n")
         self._buffer.clear()
 
@@ -137,8 +138,9 @@ class Wire:
 
     def close(self) -> None:
         """Close the port; never fails."""
-        with contextlib.suppress(OSError):
-            self._serial.close()
+        for step in (self._serial.reset_output_buffer, self._serial.close):  # unsent bytes would hold the closing up
+            with contextlib.suppress(OSError, _TermiosError):
+                step()
 
     def _pull(self, *, only_waiting: bool = False) -> bool:
         """Take in what has come, or wait a moment for a first character; whether anything came."""

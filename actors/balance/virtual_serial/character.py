@@ -142,7 +142,7 @@ class Emulation:
         self._now = now
 
     def _carry_out(self, command: bytes, now: float) -> None:
-        said = self._voice.answer(command, self._display)
+        said = self._voice.answer(b"?" if self._display.faults.stranger else command, self._display)
         if isinstance(said, Repeat):
             self._repeat_at = now
         elif isinstance(said, Waiting):

@@ -21,6 +21,7 @@ class Faults:
         restless: never stable.
         powerless: acknowledges tare and zero, and does nothing.
         fault: reports this error instead of weights.
+        stranger: understands no question, and says so where its dialect has words for it.
         unit: shown instead of its own, e.g. 'pcs'.
         garbage: share of lines that noise is mixed into.
         halved: share of lines that lose their first half.
@@ -33,6 +34,7 @@ class Faults:
     frozen: bool = False
     restless: bool = False
     powerless: bool = False
+    stranger: bool = False
     fault: str = ""
     unit: str = ""
     garbage: float = 0.0

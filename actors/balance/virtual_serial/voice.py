@@ -160,7 +160,7 @@ class KernSwtVoice:
             return weight_line(self.dialect, display.reading())
         if command == b"s":
             return Waiting(lambda: weight_line(self.dialect, display.reading()))
-        return Waiting(lambda: _silently(display.tare))
+        return Waiting(lambda: _silently(display.tare)) if command == b"t" else b""
 
 
 class SbiVoice:

@@ -14,6 +14,7 @@ from actors.balance.settling import SettlingRule
 from actors.balance.spec import SerialBalanceSpec
 from actors.balance.virtual_serial.faults import Faults
 from actors.balance.virtual_serial.handle import VirtualSerialBalance
+from actors.balance.virtual_serial.scale import ScaleSettings
 
 PACE = 20.0
 """Bench seconds per second in these tests."""
@@ -44,7 +45,9 @@ def voices() -> Iterator[Callable[[str], VirtualSerialBalance]]:
 
     def of(voice: str) -> VirtualSerialBalance:
         if voice not in started:
-            started[voice] = VirtualSerialBalance.start(voice, baud=0, time_scale=PACE, latency=0.001)
+            started[voice] = VirtualSerialBalance.start(
+                voice, baud=0, scale=ScaleSettings(settling_time=0.4), time_scale=PACE, latency=0.001
+            )
         return started[voice]
 
     yield of

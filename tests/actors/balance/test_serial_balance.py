@@ -19,10 +19,13 @@ from actors.balance.errors import (
     OutOfRangeError,
     UnitError,
 )
+from actors.balance.serial_balance import SerialBalance
 from actors.balance.settling import SettlingRule
 from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.voice import VOICES
-from actors.device import LocalDevice
+from actors.device import LocalDevice, RayDevice
+
+from .conftest import spec_for
 
 SOON = {"settling": SettlingRule(deadline=4.0)}
 """Gives up early, where giving up is what is tested."""
@@ -160,7 +163,7 @@ def test_a_bad_cable_costs_time_but_never_gives_another_weight(driver, each_dial
     far.put(0.35)
     balance.tare()
     far.faults(garbage=0.25, halved=0.15)
-    for grams in (12.3, 112.3):
+    for grams in (12.3, 112.3, 2.3, 99.9, 10.0):
         far.put(0.35 + grams / 1e3)
         far.advance(5.0)
         assert balance.weigh().mass == pytest.approx(grams / 1e3, abs=1e-9)
@@ -262,6 +265,25 @@ def test_a_port_that_does_not_exist_is_named_at_once(driver):
     assert time.monotonic() - started < 0.5
 
 
+def test_a_flood_of_damaged_lines_does_not_hold_a_call_beyond_its_deadline(driver, each_dialect):
+    far, balance = driver(each_dialect, **SOON)
+    balance.connect()
+    far.faults(unasked=0.0005, halved=0.0, garbage=0.0, interleaved=True, unit="pcs?!")
+    started = time.monotonic()
+    with pytest.raises(BalanceError):
+        balance.weigh()
+    balance.read()
+    assert time.monotonic() - started < 2.0
+
+
+@pytest.mark.parametrize("dialect", ["kcp", "mt-sics"])
+def test_a_balance_that_knows_another_command_set_says_so(driver, dialect):
+    far, balance = driver(dialect, **SOON)
+    far.faults(stranger=True)
+    with pytest.raises(CommandError, match=r"refuses the question: syntax error.*dialect: auto"):
+        balance.weigh()
+
+
 def test_an_interrupt_ends_a_wait_and_resume_lets_it_last_again(driver, each_dialect):
     far, balance = driver(each_dialect, settling=SettlingRule(deadline=200.0))
     balance.connect()
@@ -345,6 +367,26 @@ def test_behind_its_device_it_is_a_balance_like_any_other(driver):
     assert weight.mass == pytest.approx(0.0012, abs=1e-9)
     assert [w.shown for w in shown] == ["1.2 g"] * 3
     assert counts["lines"] > 5
+
+
+@pytest.mark.ray
+def test_in_a_process_of_its_own_it_weighs_and_its_errors_keep_their_kind(ray_running, virtual):
+    far = virtual("mt-sics")
+
+    async def play():
+        device = RayDevice("balance", SerialBalance, spec_for(far, "mt-sics"), "kern-1")
+        behind = DeviceBalance(device, longest_call=30.0)
+        far.put(0.35)
+        await behind.tare()
+        far.put(0.3512)
+        weight = await behind.weigh()
+        far.put(8.0)
+        with pytest.raises(OutOfRangeError, match=r"balance kern-1 .* over range"):
+            await behind.weigh()
+        await device.close()
+        return weight
+
+    assert asyncio.run(play()).mass == pytest.approx(0.0012, abs=1e-9)
 
 
 async def _first(stream, count):

@@ -95,6 +95,31 @@ def test_same_seed_and_loads_weigh_the_same_however_often_one_looks(virtual):
     assert weighings(0, 5) == weighings(7, 5)
 
 
+def test_a_pour_whose_time_passes_by_order_weighs_the_same_to_the_bit_however_the_clock_runs():
+    """What a virtual bench needs: drift and settling depend on bench time, and bench time on nothing else."""
+    sheet = ScaleSettings(resolution=1e-5, noise=1e-4, drift=1e-6, settling_time=1.5)
+    far = VirtualSerialBalance.start("kern-swt", baud=0, scale=sheet, time_scale=0.0)
+    try:
+        masses = []
+        for pause in (0.0, 0.3):
+            far.prepare((3,))
+            driver = SerialBalance(spec_for(far, "kern-swt"))
+            far.put(0.41)
+            far.advance(85.0)
+            driver.tare()
+            far.put(Load((0.0, 4.0), (0.41, 0.4157)))
+            for _ in range(5):
+                far.advance(1.7)
+                time.sleep(pause)
+                driver.read()
+            masses.append(driver.weigh().mass)
+            driver.close()
+    finally:
+        far.close()
+    assert masses[0] == masses[1]
+    assert masses[0] == pytest.approx(5.7e-3, abs=5e-4)
+
+
 def test_noise_of_a_seed_is_the_same_over_the_line_and_another_with_another_seed():
     far = VirtualSerialBalance.start(
         "mt-sics", baud=0, scale=ScaleSettings(resolution=1e-6, noise=1e-3), time_scale=20.0
