@@ -6,6 +6,7 @@ page is not current. Run from the project's root: python docs/make_tables.py
 
 from __future__ import annotations
 
+import itertools
 import re
 import types
 import typing
@@ -126,7 +127,7 @@ def seeds() -> str:
     """What the defaults spill in these pours, and how much a seed differs from it."""
     rows = []
     measured = _measured("sensitivity")
-    for mean, deviation in zip(measured, measured[1:], strict=False):
+    for mean, deviation in itertools.pairwise(measured):
         pour, marked, _ = str(mean["name"]).partition(" pour with the defaults: ")
         if marked:
             rows.append((pour, f"{mean['particles']}", f"{mean['value']:.3f}", f"{deviation['value']:.3f}"))

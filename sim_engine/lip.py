@@ -96,7 +96,7 @@ class FlowCourse:
         volume: that leaves in the step [m³].
         velocity, film: at the lip [m/s], [m].
         stream_velocity, diameter: of the stream at the receiver's rim [m/s], [m].
-        covered: whether liquid covers the whole opening while there is air inside.
+        covered: whether liquid covers the whole opening.
     """
 
     volume: Floats
@@ -168,8 +168,7 @@ def flow_course(motion: Motion, volume: float, pourer: Vessel, receiver: Vessel)
         film=outflow / (velocity * opening.width),
         stream_velocity=falling,
         diameter=np.sqrt(4.0 * outflow / (math.pi * falling)),
-        # a vessel that is still brimful has no air in it
-        covered=opening.covered & (flow.inside[leaving] < 0.99 * pourer.capacity),
+        covered=opening.covered,
     )
 
 

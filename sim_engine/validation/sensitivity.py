@@ -160,7 +160,7 @@ def _widest(means: Floats, errors: Floats) -> tuple[int, int, int]:
             for direction in (1, -1):
                 fit = isotonic_regression(means[inside], weights=errors[inside] ** -2, increasing=direction > 0).x
                 change = direction * float(fit[-1] - fit[0])
-                if change > 0.0 and _explained(means[inside] - fit, errors[inside]):
+                if _explained(means[inside] - fit, errors[inside]):
                     found.append((last - first, change, direction, first, last))
     _, _, direction, first, last = max(found)
     return direction, first, last

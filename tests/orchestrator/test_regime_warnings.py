@@ -143,6 +143,16 @@ def test_a_campaign_begins_with_what_is_not_simulated_in_it_each_kind_once(verb:
     assert sum(line.strip().startswith("into narrow, dribbling: ") for line in told) == 1
 
 
+def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from orchestrator.commands.common import RefusalError, run_in_front_of_people
+
+    plan = load_campaign(folder / "small.yaml")
+    for resume, times in ((False, 1), (True, 0)):
+        with pytest.raises(RefusalError, match="No space left"):
+            run_in_front_of_people(plan, folder, resume=resume, again="")
+        assert capsys.readouterr().err.count("not simulated (") == times
+
+
 def test_calibrate_is_silent_about_a_deployment_that_it_does_not_make(folder: Path) -> None:
     assert "into narrow" not in invoke("calibrate small.yaml").stderr
 

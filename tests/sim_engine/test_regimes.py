@@ -213,7 +213,7 @@ def test_a_bottle_turned_over_glugs_and_one_that_is_tilted_slowly_breathes() -> 
     assert not {"glugging", "airtight"} & kinds(slowly)
 
 
-def test_a_brimful_cup_has_no_air_that_could_be_shut_in() -> None:
+def test_a_brimful_cup_tilted_a_little_lets_air_in_over_its_upper_rim() -> None:
     full = Liquid(mass=0.999 * build_vessel(CUP).capacity * 998.0)
     assert "glugging" not in kinds(planned(replace(SCENE, liquid=full), STANDARD.with_values(max_angle=60 * DEG)))
 
