@@ -12,7 +12,13 @@ from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
 from actors.balance.spec import BalanceSpec
 from actors.balance.virtual_serial.scale import ScaleSettings
-from orchestrator.config.balance import BalanceDeviceSection, balance_as_file, resolve_balance
+from orchestrator.config.balance import (
+    BalanceDeviceSection,
+    SettlingSection,
+    VirtualScaleSection,
+    balance_as_file,
+    resolve_balance,
+)
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.validate import validate
 from orchestrator.config.yaml_source import Document, Place, Report
@@ -89,6 +95,19 @@ def test_where_the_operator_types_there_is_no_line():
 def test_the_resolved_balance_loads_to_the_same(text, mode):
     spec = load(text, mode)
     assert load(json.dumps(balance_as_file(spec)), mode) == spec
+
+
+def test_the_page_on_balances_names_every_key():
+    page = (Path(__file__).parents[2] / "docs" / "balances.md").read_text(encoding="utf-8")
+    for model in (BalanceDeviceSection, SettlingSection, VirtualScaleSection):
+        for key in model.written_keys():
+            assert f"`{key}`" in page
+
+
+def test_the_balance_shown_on_that_page_is_one():
+    page = (Path(__file__).parents[2] / "docs" / "balances.md").read_text(encoding="utf-8")
+    shown = page.partition("```yaml\nbalance:\n")[2].partition("```")[0]
+    assert load(shown).placement is Placement.TRAY
 
 
 @pytest.mark.parametrize(
