@@ -66,6 +66,7 @@ class Step:
         when: 'once' for a vessel (and again when it is replaced), else 'before' or 'after' the pour.
         key: of the weighing; '' for other steps.
         by: who gives the number: the 'balance' that stands here, or the 'operator', who types it.
+        hands: whether somebody has to do something first; else it is done at once, before anything drifts or dries.
     """
 
     do: Literal["tare", "weigh", "pour"]
@@ -73,6 +74,7 @@ class Step:
     when: When
     key: str = ""
     by: Literal["balance", "operator"] = "balance"
+    hands: bool = True
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,8 @@ _LOADED = {"pourer_full": 1.0, "pourer_empty": -1.0}
 _RETAINED = {"pourer_after": 1.0, "pourer_empty": -1.0}
 
 
-def _tare(put: str, when: When) -> Step:
-    return Step("tare", put, when)
+def _tare(put: str, when: When, *, hands: bool = True) -> Step:
+    return Step("tare", put, when, hands=hands)
 
 
 _PLANS: dict[Placement, _Plan] = {
@@ -103,8 +105,8 @@ _PLANS: dict[Placement, _Plan] = {
             Step("weigh", "Fill the pourer and put it on the tray." + _PUT_BACK, "before", "pourer_full"),
             _tare("Wipe the tray, and put the receiver on its stand; it must not touch the tray.", "before"),
             _POUR,
-            Step("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled"),
-            _tare("Leave the spill on the tray.", "after"),
+            Step("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled", hands=False),
+            _tare("Leave the spill on the tray.", "after", hands=False),
             Step("weigh", "Put the pourer on the tray, beside what lies there.", "after", "pourer_after"),
         ),
         {"loaded": _LOADED, "spilled": {"spilled": 1.0}, "retained": _RETAINED},
@@ -116,7 +118,7 @@ _PLANS: dict[Placement, _Plan] = {
             Step("weigh", _FULL + _PUT_BACK, "before", "pourer_full"),
             _tare("Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
             _POUR,
-            Step("weigh", "Touch nothing: what is in the receiver is weighed.", "after", "received"),
+            Step("weigh", "Touch nothing: what is in the receiver is weighed.", "after", "received", hands=False),
             _tare("Take everything off the balance, and wipe its pan.", "after"),
             Step("weigh", "Put the pourer on the balance, alone.", "after", "pourer_after"),
         ),
@@ -133,9 +135,9 @@ _PLANS: dict[Placement, _Plan] = {
             Step("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
             Step("weigh", "Fill the pourer and put it on the tray." + _PUT_BACK, "before", "pourer_full"),
             Step("weigh", "Put the empty receiver on the tray, where it will stand.", "before", "receiver_empty"),
-            _tare("Leave tray and receiver as they are.", "before"),
+            _tare("Leave tray and receiver as they are.", "before", hands=False),
             _POUR,
-            Step("weigh", "Touch nothing: what was poured is weighed.", "after", "poured"),
+            Step("weigh", "Touch nothing: what was poured is weighed.", "after", "poured", hands=False),
             Step(
                 "weigh",
                 "Lift the receiver off without losing a drop, and leave the spill: less than nothing is shown.",

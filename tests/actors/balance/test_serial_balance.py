@@ -159,7 +159,7 @@ def test_silence_is_not_taken_for_rest(driver, each_dialect):
 
 
 def test_a_bad_cable_costs_time_but_never_gives_another_weight(driver, each_dialect):
-    far, balance = driver(each_dialect, settling=SettlingRule(deadline=60.0), answer_time=0.05)
+    far, balance = driver(each_dialect, settling=SettlingRule(deadline=400.0), answer_time=0.05)
     far.put(0.35)
     balance.tare()
     far.faults(garbage=0.25, halved=0.15)
@@ -171,7 +171,7 @@ def test_a_bad_cable_costs_time_but_never_gives_another_weight(driver, each_dial
 
 
 def test_lines_that_come_unasked_and_cut_answers_in_two_do_no_harm(driver, each_dialect):
-    far, balance = driver(each_dialect, settling=SettlingRule(deadline=60.0), answer_time=0.05)
+    far, balance = driver(each_dialect, settling=SettlingRule(deadline=400.0), answer_time=0.05)
     far.put(0.35)
     far.faults(unasked=0.02, interleaved=True)
     balance.tare()

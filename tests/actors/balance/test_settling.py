@@ -28,6 +28,11 @@ def test_readings_that_come_quickly_must_still_last_for_the_span():
     assert index == 12
 
 
+def test_readings_that_come_slowly_must_still_be_four():
+    index, _ = fed([12.3] * 10, interval=2.0)
+    assert index == 3
+
+
 def test_an_unstable_reading_begins_anew():
     index, _ = fed([12.3, 12.3, 12.3, None, 12.3, 12.3, 12.3, 12.3])
     assert index == 7
