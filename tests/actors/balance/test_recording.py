@@ -80,6 +80,24 @@ def _later(driver: SerialBalance):
     return driver.read()
 
 
+def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
+    path = tmp_path / "damaged.jsonl"
+    lines = [b"S S 0.01230 kg", b"S S 0.01230 k", b"S S 12.30 g", *[b"S S 0.01230 kg"] * 6]
+    events = [
+        event
+        for i, line in enumerate(lines)
+        for event in (Event(i, "out", b"SI\r\n"), Event(i + 0.01, "in", line + b"\r\n"))
+    ]
+    Recording("typed", tuple(events)).save(path)
+    far = RecordedBalance.start(path, speed=20.0)
+    try:
+        driver = SerialBalance(spec_for(far, "kcp"))
+        assert driver.weigh().mass == pytest.approx(0.0123)
+        driver.close()
+    finally:
+        far.close()
+
+
 def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
     path = tmp_path / "slow.jsonl"
     Recording("typed", (Event(0.0, "out", b"w"), Event(0.1, "in", b"12"), Event(0.5, "in", b"34"))).save(path)

@@ -97,10 +97,12 @@ def test_a_restless_balance_is_given_up_with_advice_in_the_time_allowed(driver, 
 
 
 def test_an_overload_is_named_and_not_waited_out(driver, each_dialect):
-    far, balance = driver(each_dialect)
+    far, balance = driver(each_dialect, settling=SettlingRule(deadline=200.0))
     far.put(8.0)
+    started = time.monotonic()
     with pytest.raises(OutOfRangeError, match=r"over range.*Take something off"):
         balance.weigh()
+    assert time.monotonic() - started < 5.0
     weight = balance.read()
     assert weight.status == "over range"
     assert math.isnan(weight.mass)
@@ -129,6 +131,16 @@ def test_pieces_are_no_weight(driver, each_dialect):
     far.faults(unit="pcs")
     with pytest.raises(UnitError, match=r"it shows 200\.0 pcs.*switch it to g"):
         balance.weigh()
+
+
+def test_a_moving_load_is_not_tared(driver, each_dialect):
+    far, balance = driver(each_dialect, **SOON)
+    far.put(0.2)
+    far.advance(5.0)
+    far.faults(restless=True)
+    with pytest.raises(NotStableError, match="no stable weight"):
+        balance.tare()
+    assert far.state()["shown"] == "200.0 g, unstable"
 
 
 def test_a_tare_without_effect_is_noticed(driver, each_dialect):
@@ -213,6 +225,26 @@ def test_a_port_that_stays_away_is_reported_in_the_time_allowed(driver, each_dia
         balance.weigh()
     assert time.monotonic() - started < 2.0
     assert balance.read().status == "lost"
+
+
+def test_a_connection_that_comes_and_goes_is_reported(driver):
+    far, balance = driver("kcp", settling=SettlingRule(readings=100, span=100.0, deadline=400.0), reconnect_time=5.0)
+    balance.connect()
+    over = threading.Event()
+
+    def shake() -> None:
+        while not over.wait(0.1):
+            far.unplug()
+            far.plug()
+
+    shaking = threading.Thread(target=shake)
+    shaking.start()
+    try:
+        with pytest.raises(NoConnectionError, match=r"its connection comes and goes.*look at cable and plug"):
+            balance.weigh()
+    finally:
+        over.set()
+        shaking.join()
 
 
 def test_after_a_lost_connection_the_old_tare_counts_only_once_confirmed(driver, each_dialect):
@@ -320,6 +352,18 @@ def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(
     assert len(seen) >= 3
     assert [w.time for w in seen] == sorted(w.time for w in seen)
     assert seen[-1].status == "stable"
+
+
+def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver):
+    _, balance = driver("kcp")
+    shown = balance.weigh().shown
+    listening = threading.Thread(target=balance.listen, args=(1.5,))
+    listening.start()
+    time.sleep(0.2)
+    started = time.monotonic()
+    assert balance.read().shown == shown
+    assert time.monotonic() - started < 0.8
+    listening.join()
 
 
 def test_questions_keep_the_pace_that_the_manual_asks_for(driver):
