@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.config import campaign, laboratory, vessel
+from orchestrator.config import campaign, cluster, laboratory, vessel
 from orchestrator.config.quantities import Quantity
 from orchestrator.config.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.scenes import DEFAULTS, NEEDED
@@ -45,6 +45,7 @@ SECTIONS: dict[str, type[Section]] = {
     "vessel": vessel.VesselFile,
     "profile": vessel.ProfileSection,
     "laboratory": laboratory.LaboratoryFile,
+    "ray": cluster.RaySection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
     "pose-error": laboratory.PoseErrorSection,

@@ -17,7 +17,7 @@ _FREE = ("source", "outputs", "resolved", "on_unknown")
 _TOLD = ("surface_tension", "dynamic_viscosity")
 """Properties of a liquid that decide which warnings are given, and no request."""
 
-_MACHINE = ("simulators", "in_process", "object_store_mb")
+_MACHINE = ("simulators", "in_process", "object_store_mb", "ray")
 """Fields of a laboratory that belong to the machine, not to the campaign."""
 
 

@@ -249,6 +249,19 @@ class RaySimulatorPool:
         while self._waiting:
             self._waiting.popleft().fail(LaboratoryError(reason))
 
+    def abandon(self, error: LaboratoryError) -> None:
+        """All jobs fail: their simulators can't come back.
+
+        Args:
+            error: why.
+        """
+        for member in self._crew.up:
+            self._waiting.extend(sent.job for sent in member.sent if not sent.recalled)
+            for sent in member.sent:
+                sent.recalled = True
+        while self._waiting:
+            self._waiting.popleft().fail(error)
+
     async def close(self) -> None:
         """Write the members' compiled kernels, and end their processes; jobs that are left have no result."""
         if self._closed:

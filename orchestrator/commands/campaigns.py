@@ -12,6 +12,7 @@ from orchestrator.commands.common import (
     Finished,
     RefusalError,
     check_campaign_can_run,
+    check_laboratory_answers,
     print_json,
     read_campaign,
     run_in_front_of_people,
@@ -97,6 +98,7 @@ def plan_pour(
     assert plan.deployment is not None
     planning = deployment_stages(plan, plan.deployment)
     stages = [*planning, *prediction_stages(plan, plan.deployment, seeds)]
+    check_laboratory_answers(plan, stages, in_process=in_process)
     directory = _run_directory(plan, resume=False, run_id=None)
     if parameters is None:
         say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
@@ -186,8 +188,11 @@ def _run(
     in_process: bool,
     stages: list[StageDefinition] | None,
 ) -> Finished:
+    from orchestrator.stages import stages_of
+
     if answer is not None and not resume:
         raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
+    check_laboratory_answers(plan, stages_of(plan) if stages is None else stages, in_process=in_process)
     directory = _run_directory(plan, resume=resume, run_id=run_id)
     again = f"decant {verb} {path} --resume --run {directory.name}"
     finished = run_in_front_of_people(

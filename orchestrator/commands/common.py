@@ -84,6 +84,30 @@ def check_campaign_can_run(plan: CampaignPlan) -> None:
         raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
 
 
+def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool) -> None:
+    """What the laboratory needs from other machines, before anything starts.
+
+    Args:
+        plan: with its laboratory.
+        stages: that are to run.
+        in_process: everything in this process: nothing is needed.
+
+    Raises:
+        RefusalError: with what is missing, exit code 2.
+    """
+    from actors.laboratory import check_laboratory
+    from actors.protocols import LaboratoryError
+
+    if in_process or plan.laboratory.in_process:
+        return
+    if plan.laboratory.ray is not None:
+        say(f"looking at the Ray cluster at {plan.laboratory.ray.address} …")
+    try:
+        check_laboratory(plan.laboratory, need_bench=any(stage.pours for stage in stages))
+    except LaboratoryError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+
+
 def check_output(path: Path | None, option: str, suffix: str) -> None:
     """A file that a command is to write, before hours are spent on what goes into it.
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from actors.spec import RaySpec
 from orchestrator.config.assignments import assigned_action, set_action
 from orchestrator.config.check import check_campaign
 from orchestrator.config.errors import ConfigError
@@ -287,6 +288,23 @@ def test_parameters_as_a_program_or_a_person_writes_them(text: str, tmp_path: Pa
     assert loaded.model_dump() == pytest.approx(expected.model_dump())
 
 
+@pytest.mark.parametrize("address", ["auto", "ray://head:10001", "head", "head:0", "head:70000", ":6379", "a b:6379"])
+def test_an_address_of_a_cluster_that_ray_would_puzzle_over_is_refused(address: str, tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(f"name: far\nmode: virtual\nray: {{address: '{address}'}}\n")
+    with pytest.raises(ConfigError, match=r"lab\.yaml:3:16: ray\.address: .* should be host:port of the cluster's"):
+        load_laboratory(path)
+
+
+def test_a_cluster_needs_an_address_and_its_bench_has_a_usual_name(tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text("name: far\nmode: virtual\nray: {address: '[fd00::1]:6379'}\n")
+    assert load_laboratory(path).ray == RaySpec("[fd00::1]:6379", "decant_bench")
+    path.write_text("name: far\nmode: virtual\nray: {bench_resource: left}\n")
+    with pytest.raises(ConfigError, match="key 'address' is missing"):
+        load_laboratory(path)
+
+
 def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path: Path) -> None:
     vessels = CONFIGS / "vessels"
     text = textwrap.dedent(f"""\
@@ -297,6 +315,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           simulators: 3
           in_process: true
           object_store: 300 MB
+          ray: {{address: "head.local:6379", bench_resource: left_bench}}
           bench:
             liquid: {{particles: 3100, cohesion: 31 mN/m, viscosity: 7 Hz, friction: 0.31}}
             pose_error: {{x: 1.1 mm, y: -2 mm, tilt: 0.7 deg, speed_factor: 1.03}}
@@ -351,6 +370,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert dataclasses.astuple(plan.outputs) == (tmp_path / "here", False, False, 4.0, 2)
     lab = plan.laboratory
     assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
+    assert lab.ray == RaySpec("head.local:6379", "left_bench")
     assert (bench.liquid.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
     assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03))
     assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02))
