@@ -16,9 +16,6 @@ from actors.balance.reading import Acknowledgement, FrameError, Reading, Reply, 
 from actors.balance.spec import SerialBalanceSpec
 from actors.balance.wire import Counters, PortLostError, Tap, Wire
 
-MOST_LINES = 100
-"""Lines that are looked at for one answer."""
-
 _REOPEN_INTERVAL = 0.2
 _GLANCE = 0.1
 
@@ -115,7 +112,7 @@ class Link:
         with self._wire_at_rest() as wire:
             wire.send(self.dialect.query)
             end = time.monotonic() + self._spec.answer_time
-            for line in self._lines(wire, end):
+            while (line := self._line(wire, end)) is not None:
                 reply = self._understood(line)
                 if isinstance(reply, Reading):
                     return reply, time.monotonic()
@@ -144,7 +141,7 @@ class Link:
                 return None
             wanted = data.strip().decode("ascii")
             end = time.monotonic() + max(patience, self._spec.answer_time)
-            for line in self._lines(wire, end):
+            while (line := self._line(wire, end)) is not None:
                 reply = self._understood(line)
                 if isinstance(reply, Acknowledgement) and reply.command in (wanted, ""):
                     return reply
@@ -177,14 +174,6 @@ class Link:
         except PortLostError:
             self.close()
             raise
-
-    def _lines(self, wire: Wire, end: float) -> Iterator[bytes]:
-        """Lines until a time, but no flood of them: that would have no end."""
-        for _ in range(MOST_LINES):
-            line = self._line(wire, end)
-            if line is None:
-                return
-            yield line
 
     def _line(self, wire: Wire, end: float) -> bytes | None:
         """The next line, looking up for an interruption."""

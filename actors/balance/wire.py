@@ -23,11 +23,7 @@ except ImportError:  # not on Windows, and not raised there
 Tap = Callable[[str, bytes], None]
 """Sees the bytes of a wire: direction 'out' (to the balance) or 'in', and what went."""
 
-LONGEST_LINE = 128
-"""Characters without an end of line that can't be a line of any dialect."""
-
 _WRITE_TIME = 2.0
-_FLUSHES = 100
 _GLANCE = 0.02
 """Longest single wait for a character [s]; fixed, since pyserial sets the whole port anew for another."""
 
@@ -99,9 +95,8 @@ class Wire:
 
     def flush(self) -> None:
         """Throw away what came unasked; whole lines are counted as stale."""
-        for _ in range(_FLUSHES):  # a flood has no end
-            if not self._pull(only_waiting=True):
-                break
+        while self._pull(only_waiting=True):
+            pass
         self.counters.stale += self._buffer.count(b"\n")
         self._buffer.clear()
 
@@ -123,9 +118,6 @@ class Wire:
                 line = bytes(self._buffer[:end])
                 del self._buffer[: end + 1]
                 return line.removesuffix(b"\r")
-            if len(self._buffer) > LONGEST_LINE:
-                self.counters.damaged += 1
-                self._buffer.clear()
             if moment <= time.monotonic():
                 return None
             self._pull()

@@ -41,8 +41,8 @@ def decode(line: bytes) -> Reply:
     if text is None:
         raise FrameError("not printable ASCII")
     words = text.split()
-    if not words or text != text.lstrip():
-        raise FrameError("empty, or begins with a space")
+    if not words:
+        raise FrameError("empty")
     if words[0] in REFUSALS and len(words) == 1:
         return Acknowledgement("", Answer.REFUSED, REFUSALS[words[0]])
     if words[0] == "S":

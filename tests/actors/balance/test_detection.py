@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import termios
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 
@@ -107,8 +108,10 @@ def test_a_search_can_be_interrupted(unknown):
     far, balance = unknown("kcp")
     far.faults(silent=True)
     balance.interrupt()
+    started = time.monotonic()
     with pytest.raises(BalanceError, match="interrupted"):
         balance.connect()
+    assert time.monotonic() - started < 1.0
 
 
 def test_a_setting_that_the_port_refuses_is_left_out_and_named(unknown, monkeypatch):

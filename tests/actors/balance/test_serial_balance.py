@@ -330,6 +330,17 @@ def test_an_interrupt_ends_a_wait_and_resume_lets_it_last_again(driver, each_dia
     assert balance.weigh().mass == 0.0
 
 
+def test_an_interrupt_ends_the_wait_for_an_answer_too(driver):
+    far, balance = driver("kcp", answer_time=10.0)
+    balance.connect()
+    far.faults(silent=True)
+    threading.Timer(0.2, balance.interrupt).start()
+    started = time.monotonic()
+    with pytest.raises(BalanceError, match="interrupted"):
+        balance.weigh()
+    assert time.monotonic() - started < 3.0
+
+
 def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(driver, each_dialect):
     far, balance = driver(each_dialect)
     far.put(0.35)
