@@ -66,8 +66,8 @@ class Faults:
             raise FaultError(f"no fault '{name[:50]}'; there are {', '.join(self._names)}")
         try:
             return self._names[name](**arguments) or {}
-        except (TypeError, ValueError, KeyError, IndexError, OverflowError) as error:
-            raise FaultError(f"{name}: {error}") from error
+        except (TypeError, ValueError, LookupError, ArithmeticError) as error:
+            raise FaultError(f"{name}: {error!r} with {arguments}"[:500]) from error
 
     # ---- when
 

@@ -11,7 +11,10 @@ PORT = 29999
 
 GREETING = "Connected: Universal Robots Dashboard Server"
 
-REFUSAL = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode and reconnect to port 29999"
+REFUSAL = (
+    "Command is not allowed due to safety reasons, "
+    "please switch robot to Remote Control mode and reconnect to port 29999"
+)
 
 LONGEST_LINE = 10_000
 

@@ -1,6 +1,6 @@
-"""Primary (30001, 30011) and secondary (30002, 30012) interface: the robot's state at 10 Hz, and programs the other way.
+"""Primary (30001, 30011) and secondary (30002, 30012) interface: the robot's state at 10 Hz, programs the other way.
 
-The ports that end in 1x only read. On the others a connection that was made in local control only reads too, and stays so.
+Ports 30011 and 30012 only read. On the others a connection that was made in local control only reads too, for good.
 """
 
 from __future__ import annotations

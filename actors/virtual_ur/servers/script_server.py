@@ -1,4 +1,4 @@
-"""Program upload on port 30003: text in, nothing out. (A real controller also streams its state here; clients ignore it.)"""
+"""Program upload on port 30003: text in, nothing out. A real controller also streams its state here."""
 
 from __future__ import annotations
 

@@ -52,10 +52,9 @@ class Program:
     """
 
     def __init__(self, text: str, commands: Mapping[str, Command]) -> None:
-        tree = _read(text)
+        tree, self._translation = _translate(text, {name: command.waits for name, command in commands.items()})
         self.name = tree.name
         self.secondary = tree.kind == "sec"
-        self._translation = Translation(tree, {name: command.waits for name, command in commands.items()})
         self._loops = 0
         self._threads: dict[int, Steps] = {}
         self._started = 0
@@ -180,9 +179,10 @@ class Program:
         self._critical = None
 
 
-def _read(text: str) -> Function:
+def _translate(text: str, commands: Mapping[str, bool]) -> tuple[Function, Translation]:
     try:
-        return parse(text)
+        tree = parse(text)
+        return tree, Translation(tree, commands)
     except RecursionError:
         raise ScriptError("nested too deeply") from None
 

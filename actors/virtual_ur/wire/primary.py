@@ -3,8 +3,8 @@
 A package is `int32 size, uint8 type, …`, big-endian, the size including itself; a robot state (type 16) consists of
 sub-packages of the same shape.
 
-Source: the manufacturer's page on primary and secondary interfaces (software 5.10). Where it says "used internally", zeros
-are sent; the safety data's first four bytes are the checksum, as a developer of the controller wrote in its forum.
+Source: the manufacturer's page on primary and secondary interfaces (software 5.10). Where it says "used internally",
+zeros are sent; the safety data's first four bytes are the checksum, as was said in the manufacturer's forum.
 """
 
 from __future__ import annotations
