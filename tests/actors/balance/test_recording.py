@@ -98,6 +98,21 @@ def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
         far.close()
 
 
+def test_a_late_answer_to_another_command_is_not_taken_for_the_one_awaited(tmp_path):
+    path = tmp_path / "late.jsonl"
+    events = [Event(0.0, "out", b"T\r\n"), Event(0.01, "in", b"Z +\r\n"), Event(0.1, "in", b"T S 350.00 g\r\n")]
+    for i in range(5):
+        events += [Event(1.0 + i, "out", b"SI\r\n"), Event(1.01 + i, "in", b"S S 0.00 g\r\n")]
+    Recording("typed", tuple(events)).save(path)
+    far = RecordedBalance.start(path, speed=20.0)
+    try:
+        driver = SerialBalance(spec_for(far, "kcp"))
+        driver.tare()
+        driver.close()
+    finally:
+        far.close()
+
+
 def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
     path = tmp_path / "slow.jsonl"
     Recording("typed", (Event(0.0, "out", b"w"), Event(0.1, "in", b"12"), Event(0.5, "in", b"34"))).save(path)

@@ -217,8 +217,10 @@ def test_an_order_that_is_unknown_or_comes_too_late_is_refused():
         far.faults(quiet=True)
     with pytest.raises(LaboratoryError, match="no virtual balance speaks 'latin'; there are kcp"):
         VirtualSerialBalance.start("latin")
+    started = time.monotonic()
     far.close()
     far.close()
+    assert time.monotonic() - started < 3.0
     assert not Path(far.port).parent.exists()
     with pytest.raises(LaboratoryError, match="its process is gone"):
         far.put(0.1)
