@@ -7,13 +7,13 @@ watches (`read`, `stream`) never fails and never disturbs.
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
 
 from actors.balance.complaints import LOST_REFERENCE, WITHOUT_EFFECT, unsettled
+from actors.balance.display import Display
 from actors.balance.errors import (
     BalanceError,
     CommandError,
@@ -27,7 +27,6 @@ from actors.balance.protocol import Weight
 from actors.balance.reading import Acknowledgement, Answer, Reading, Status
 from actors.balance.settling import Settled, Settling
 from actors.balance.spec import SerialBalanceSpec
-from actors.balance.units import kilograms
 from actors.balance.wire import Tap
 
 ZERO_STEPS = 2.0
@@ -66,9 +65,7 @@ class SerialBalance:
         self._interrupted = threading.Event()
         self._lock = threading.RLock()
         self._link = Link(spec, self._interrupted, tap)
-        self._unit = ""
-        self._step = spec.step or 0.0
-        self._last = Weight(math.nan, False, 0.0, str(Status.LOST))
+        self._display = Display(spec.step)
         self._tared = self._reference_lost = False
         self._losses = self._strange_units = 0
 
@@ -116,19 +113,19 @@ class SerialBalance:
             NotStableError: not settled within the rule's deadline.
             BalanceError: out of range, another unit, a fault, no answer.
         """
-        settled = self._settle(reference_needed=True)
-        return Weight(settled.mass, True, settled.time, str(Status.STABLE), self._step, self._last.shown)
+        settled, seen = self._settle(reference_needed=True), self._display
+        return Weight(settled.mass, True, settled.time, str(Status.STABLE), seen.step, seen.last.shown)
 
     # What only watches.
 
     def read(self) -> Weight:
         """What the display shows; never fails. While another call waits for an answer, the last reading."""
         if not self._lock.acquire(timeout=self._spec.answer_time / 4.0):
-            return self._last
+            return self._display.last
         try:
-            if time.monotonic() - self._last.time >= 0.9 * self._link.interval:
+            if time.monotonic() - self._display.last.time >= 0.9 * self._link.interval:
                 self._glance()
-            return self._last
+            return self._display.last
         finally:
             self._lock.release()
 
@@ -204,7 +201,7 @@ class SerialBalance:
             if settled is None:
                 self._tared, self._reference_lost = True, False
                 return
-            said = f"it still shows {self._shown(settled.mass)}, stable"
+            said = f"it still shows {self._display.in_grams(settled.mass)}, stable"
         raise self._error(CommandError, WITHOUT_EFFECT.format(name=name, times=COMMAND_ATTEMPTS, said=said))
 
     def _send(self, name: str, data: bytes) -> str:
@@ -234,7 +231,7 @@ class SerialBalance:
         end = time.monotonic() + COMMAND_TIME / self._spec.time_scale
         while True:
             settled = self._settle()
-            if abs(settled.mass) <= ZERO_STEPS * self._step * (1 + 1e-9) + 3.0 * self._spec.repeatability:
+            if abs(settled.mass) <= ZERO_STEPS * self._display.step * (1 + 1e-9) + 3.0 * self._spec.repeatability:
                 return None
             if time.monotonic() > end:
                 return settled
@@ -263,13 +260,13 @@ class SerialBalance:
             else:
                 outside_since = None
             stable = reading.status is Status.STABLE
-            settled = settling.feed(reading.mass() if stable else None, moment, self._step)
+            settled = settling.feed(reading.mass() if stable else None, moment, self._display.step)
             if settled is not None:
                 self._losses = 0
                 return settled
         self._check_interrupted()
         damaged = self._link.counters.damaged
-        raise self._error(*unsettled(seen, self._last.shown, self._spec.settling.deadline, damaged))
+        raise self._error(*unsettled(seen, self._display.last.shown, self._spec.settling.deadline, damaged))
 
     def _exchange(self) -> tuple[Reading, float] | None:
         """One question and its answer; None after the connection was lost and made again."""
@@ -277,7 +274,7 @@ class SerialBalance:
             with self._exclusive():
                 self._link.open()
                 reading, moment = self._link.ask()
-                self._note(reading, moment)
+                self._display.note(reading, moment)
                 return reading, moment
         except NoConnectionError as error:
             self._wait_for_return(error)
@@ -292,28 +289,11 @@ class SerialBalance:
         except NoConnectionError:
             self._note_loss()
         else:
-            self._note(reading, moment)
-
-    def _note(self, reading: Reading, moment: float) -> None:
-        if kilograms(reading.unit) is not None:
-            self._unit = reading.unit
-        step = reading.step(self._unit)
-        if self._spec.step is None and step is not None:
-            self._step = step
-        mass = reading.mass(self._unit)
-        shown = "" if reading.value is None else f"{reading.value} {reading.unit or self._unit}".strip()
-        self._last = Weight(
-            math.nan if mass is None else mass,
-            reading.status is Status.STABLE and mass is not None,
-            moment,
-            str(reading.status),
-            self._step,
-            shown or (self._last.shown if reading.status is Status.SILENT else str(reading)),
-        )
+            self._display.note(reading, moment)
 
     def _note_loss(self) -> None:
         self._reference_lost = self._reference_lost or self._tared
-        self._last = Weight(math.nan, False, time.monotonic(), str(Status.LOST), self._step, self._last.shown)
+        self._display.lose()
 
     def _open(self) -> None:
         """Open for the first time; a port that isn't there then won't come by waiting."""
@@ -353,7 +333,7 @@ class SerialBalance:
 
     def _check_reference(self) -> None:
         if self._reference_lost:
-            raise self._error(ReferenceLostError, LOST_REFERENCE.format(shown=self._last.shown or "nothing"))
+            raise self._error(ReferenceLostError, LOST_REFERENCE.format(shown=self._display.last.shown or "nothing"))
 
     def _check_unit(self, reading: Reading) -> None:
         """Refuse what is no mass; but a unit that lost a letter on the line is none either, so not at once."""
@@ -365,9 +345,6 @@ class SerialBalance:
                 UnitError,
                 f"it shows {reading.value} {reading.unit}, and that is no mass that is understood; switch it to g",
             )
-
-    def _shown(self, mass: float) -> str:
-        return f"{1e3 * mass:.{max(0, -math.floor(math.log10(self._step * 1e3)))}f} g" if self._step else f"{mass} kg"
 
     @contextlib.contextmanager
     def _exclusive(self) -> Iterator[None]:

@@ -44,6 +44,12 @@ def test_a_tared_balance_weighs_what_is_added(driver, voice):
     assert weight.time == pytest.approx(time.monotonic(), abs=0.5)
 
 
+def test_a_step_that_is_not_one_of_the_last_digit_is_taken_from_the_settings(driver):
+    far, balance = driver("sbi", step=5e-4)
+    far.put(0.1)
+    assert balance.weigh().step == 5e-4
+
+
 def test_less_than_nothing_is_weighed_too(driver, each_dialect):
     far, balance = driver(each_dialect)
     far.put(0.2)
