@@ -6,12 +6,14 @@ import argparse
 import asyncio
 import json
 import sys
+from math import radians
 
 from actors.virtual_ur.controller import Controller
 from actors.virtual_ur.faults import FaultServer
 from actors.virtual_ur.host import Host, until_orphaned
-from actors.virtual_ur.models import MODELS
+from actors.virtual_ur.models import HOME, MODELS
 from actors.virtual_ur.power import RobotMode
+from actors.virtual_ur.safety import SafetyConfiguration
 
 _STATES = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMode.POWER_OFF}
 
@@ -24,10 +26,12 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--time-scale", type=float, default=1.0, help="controller seconds per wall second")
     parser.add_argument("--frequency", type=float, help="control cycles per controller second; the model's by default")
     parser.add_argument("--state", choices=sorted(_STATES), default="running", help="power, to begin with")
+    parser.add_argument("--joints", help="six joint positions to begin with [deg], separated by commas")
     parser.add_argument("--local", action="store_true", help="begin in local control: programs are ignored")
     parser.add_argument("--fault-port", type=int, default=0, help="port for faults; any free one by default")
     parser.add_argument("--parent", type=int, help="end when this process does, or when standard input ends")
     chosen = parser.parse_args(given)
+    given_joints: str | None = chosen.joints
     if not chosen.address.startswith("127."):
         parser.error(
             f"--address {chosen.address}: only loopback addresses (127.x.y.z); nobody outside is to reach this"
@@ -36,6 +40,16 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
         parser.error(f"--time-scale {chosen.time_scale:g}: 0 < scale ≤ 1000")
     if chosen.frequency is not None and not 10.0 <= chosen.frequency <= 1000.0:
         parser.error(f"--frequency {chosen.frequency:g}: 10 … 1000 Hz")
+    chosen.joints = HOME
+    if given_joints is not None:
+        try:
+            a, b, c, d, e, f = (radians(float(part)) for part in given_joints.split(","))
+            chosen.joints = (a, b, c, d, e, f)
+        except ValueError:
+            parser.error(f"--joints {given_joints}: six numbers [deg], separated by commas")
+        beyond = SafetyConfiguration.of(MODELS[chosen.model]).joints_violation(chosen.joints)
+        if beyond is not None:
+            parser.error(f"--joints {given_joints}: {beyond}")
     return chosen
 
 
@@ -47,6 +61,7 @@ async def serve(chosen: argparse.Namespace) -> None:
         time_scale=chosen.time_scale,
         mode=_STATES[chosen.state],
         remote=not chosen.local,
+        joints=chosen.joints,
     )
     host = Host(controller, chosen.address)
     await host.open()

@@ -96,7 +96,7 @@ class Controller:
 
     def tell(self, kind: str, text: str, line: int = 0) -> None:
         """Give a message to all who listen."""
-        message = Message(kind, text, line, self.now)
+        message = Message(kind, text.encode("utf-8", "replace").decode("utf-8"), line, self.now)
         for listener in self.listeners:
             listener(message)
 
@@ -213,13 +213,13 @@ class Controller:
         """As after a power cut: everything but the safety configuration and the remote switch is forgotten."""
         self.power_off()
         self.runtime = RuntimeState.STOPPED
+        self.now = 0.0
+        self.robot.forget()
         self.secondary.clear()
         self.watchers.clear()
         self.safety.restart()
         self.robot.mover.place(self.robot.mover.q)
         self.robot.mover.slider = 1.0
-        self.robot.set_tcp((0.0,) * 6)
-        self.robot.payload, self.robot.cog = 0.0, (0.0, 0.0, 0.0)
         for store in (self.registers.input_int, self.registers.output_int):
             store[:] = [0] * len(store)
         for values in (self.registers.input_double, self.registers.output_double):
@@ -282,8 +282,9 @@ class Controller:
         self.ticks += 1
         self.now += self.dt
         self.power.step(self.now)
-        if self.watchers:
-            self.watchers = [watcher for watcher in self.watchers if not watcher()]
+        for watcher in list(self.watchers):
+            if watcher() and watcher in self.watchers:  # what it does may have cleared the list
+                self.watchers.remove(watcher)
         if self.runtime is RuntimeState.PLAYING:
             due = self.watchdogs.step(self.dt / self.time_scale)
             if due is not None:
@@ -294,7 +295,9 @@ class Controller:
             self._run_secondary()
         try:
             self.robot.step(self.now, self.dt)
-        except ViolationError as violation:
+        except (ViolationError, ValueError, ArithmeticError) as violation:
+            # Whatever can't be computed must not move: the mover keeps its last targets and brakes.
+            self.robot.mover.freeze()
             if self.safety.may_move:
                 self.protective_stop(str(violation))
         if self.runtime in (RuntimeState.STOPPING, RuntimeState.PAUSING) and not self._in_motion():

@@ -259,6 +259,7 @@ class Faults:
             "slider": c.robot.mover.slider,
             "checksum": c.safety.checksum,
             "popup": c.popup,
+            "safety_popup": c.safety_popup,
             "messages": list(self._host.messages),
             "timing": self._host.timing.report(),
         }

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -145,15 +146,20 @@ class Host:
         if behind > MOST_BEHIND:
             self.timing.dropped += behind - MOST_BEHIND
             self._next = now - MOST_BEHIND
-        while self._next <= now:
-            self._next += period
+        try:
+            while self._next <= now:
+                self._next += period
+                if not self.halted:
+                    self.timing.ticks += 1
+                    controller.tick()
             if not self.halted:
-                self.timing.ticks += 1
-                controller.tick()
-        if not self.halted:
-            clock = controller.now / max(1.0, controller.time_scale)
-            self.rtde.publish(clock)
-            self.primary.publish(clock)
+                clock = controller.now / max(1.0, controller.time_scale)
+                self.rtde.publish(clock)
+                self.primary.publish(clock)
+        except Exception:
+            # A defect of this program: a clock that silently stood still would be worse than an end.
+            traceback.print_exc()
+            raise SystemExit(1) from None
         self._clock = loop.call_at(max(self._next, now + min(period, SLOWEST_WAKE)), self._wake)
 
 

@@ -9,7 +9,10 @@ import select
 import socket
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Sequence
+from math import degrees
 from types import TracebackType
 from typing import Any
 
@@ -46,6 +49,7 @@ class VirtualController:
         *,
         state: str = "running",
         local: bool = False,
+        joints: Sequence[float] | None = None,
         patience: float = START_TIME,
     ) -> VirtualController:
         """Start the process and wait until all its ports are open.
@@ -57,6 +61,7 @@ class VirtualController:
             frequency: control cycles per controller second [Hz]; the model's by default.
             state: of power, 'running', 'idle' or 'off'.
             local: begin in local control.
+            joints: six positions to begin with [rad]; a pose in the middle of its reach by default.
             patience: longest wait [s].
 
         Raises:
@@ -66,19 +71,22 @@ class VirtualController:
         command += ["--time-scale", repr(float(time_scale)), "--state", state, "--parent", str(os.getpid())]
         command += [] if frequency is None else ["--frequency", repr(float(frequency))]
         command += ["--local"] if local else []
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-        )
-        try:
-            ready = json.loads(_first_line(process, patience))
-            return cls(process, address, int(ready["fault_port"]))
-        except Exception as error:
-            process.kill()
-            _, said = process.communicate()
-            text = said.decode("utf-8", "replace").strip().splitlines()
-            raise VirtualControllerError(
-                f"virtual controller at {address}: not ready within {patience:g} s: {text[-1] if text else error}"
-            ) from error
+        command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
+        with tempfile.TemporaryFile() as complaints:  # a pipe that nobody reads would fill up and hang the process
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints, start_new_session=True
+            )
+            try:
+                ready = json.loads(_first_line(process, patience))
+                return cls(process, address, int(ready["fault_port"]))
+            except Exception as error:
+                process.kill()
+                process.communicate()
+                complaints.seek(0)
+                said = complaints.read().decode("utf-8", "replace").strip().splitlines()
+                raise VirtualControllerError(
+                    f"virtual controller at {address}: not ready within {patience:g} s: {said[-1] if said else error}"
+                ) from error
 
     def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
         """Ask for a fault, or for what the controller knows of itself; see docs/virtual-ur.md for names.
@@ -122,9 +130,8 @@ class VirtualController:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        for stream in (self._process.stdout, self._process.stderr):
-            if stream is not None:
-                stream.close()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
 
     def __enter__(self) -> VirtualController:
         return self

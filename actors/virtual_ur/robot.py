@@ -83,6 +83,13 @@ class Robot:
         self._point = self.arm.frame(self.mover.q)[1]
         self._cache.clear()
 
+    def forget(self) -> None:
+        """As after a power cut: no tool, no payload, no memory."""
+        self.set_tcp((0.0,) * 6)
+        self.payload, self.cog, self.inertia = 0.0, (0.0, 0.0, 0.0), (0.0,) * 6
+        self.history.clear()
+        self._next_memory = 0.0
+
     def step(self, now: float, dt: float) -> None:
         """One control cycle.
 

@@ -12,6 +12,9 @@ from actors.virtual_ur.urscript.values import number, numbers, show
 if TYPE_CHECKING:
     from actors.virtual_ur.controller import Controller
 
+FARTHEST = 10.0
+"""Entries of a tool centre point [m], [rad]: more is a mistake of units."""
+
 HEAVIEST = 12.5
 """Payload that the arm can carry [kg]."""
 
@@ -57,7 +60,10 @@ class Settings:
 
     def set_tcp(self, pose: Any, tcp_name: Any = "") -> None:
         """Tool centre point in the flange's frame."""
-        self._robot.set_tcp(six(pose))
+        tool = six(pose)
+        if max(abs(x) for x in tool) > FARTHEST:
+            raise ScriptError(f"a tool centre point at {show(list(tool))}: no entry may be beyond {FARTHEST:g}")
+        self._robot.set_tcp(tool)
 
     def set_payload(self, m: Any, cog: Any = None, inertia: Any = None, transition_time: Any = 0) -> None:
         """Mass [kg], centre of gravity [m] and inertia [kg m²] behind the flange."""

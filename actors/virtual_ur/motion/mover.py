@@ -230,7 +230,7 @@ class Mover:
                     f"its limit is {degrees(self.joint_speed[i]):.0f} deg/s"
                 )
             low, high = self.joint_range[i]
-            if not low <= q[i] <= high and abs(q[i]) > abs(self.q[i]):
+            if not low <= q[i] <= high and abs(q[i] - 0.5 * (low + high)) > abs(self.q[i] - 0.5 * (low + high)):
                 raise ViolationError(f"joint {i} would leave its range at {degrees(q[i]):.1f} deg")
 
     def _break_off(self, dt: float) -> None:

@@ -40,7 +40,7 @@ class PrimaryServer:
 
     def publish(self, clock: float) -> None:
         """Send a state if it is due; see `RtdeServer.publish`."""
-        if clock < self._due - 1e-9:
+        if self._due - INTERVAL <= clock < self._due - 1e-9:  # a clock that was set back is due at once
             return
         self._due = clock + INTERVAL
         clients = [c for c in self.connections.open if isinstance(c, PrimaryConnection)]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from types import CodeType
 from typing import Any
 
 from actors.virtual_ur.urscript import values
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.parser import parse
 from actors.virtual_ur.urscript.translator import Translation
-from actors.virtual_ur.urscript.tree import Function
 
 LOOPS_PER_CYCLE = 20_000
 """Turns of loops in one control cycle after which a thread counts as stuck. A controller gives up likewise."""
@@ -52,15 +54,15 @@ class Program:
     """
 
     def __init__(self, text: str, commands: Mapping[str, Command]) -> None:
-        tree, self._translation = _translate(text, {name: command.waits for name, command in commands.items()})
-        self.name = tree.name
-        self.secondary = tree.kind == "sec"
+        translated = _translate(text, frozenset((name, command.waits) for name, command in commands.items()))
+        self.name = translated.name
+        self.secondary = translated.secondary
+        self._lines = translated.lines
         self._loops = 0
         self._threads: dict[int, Steps] = {}
         self._started = 0
         self._critical: int | None = None
         self._current = 0
-        self._ended: Callable[[int], None] | None = None
         space: dict[str, Any] = {
             "__builtins__": {},
             "_add": values.add,
@@ -82,25 +84,13 @@ class Program:
             "_exit_critical": self._exit_critical,
         }
         space.update({f"c_{name}": command.function for name, command in commands.items()})
-        try:
-            exec(compile(self._translation.source, "<program>", "exec"), space)
-        except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
-            raise ScriptError(f"can't be translated: {error}") from error
+        exec(translated.code, space)
         self._threads[0] = space["main"]()
 
     @property
     def current(self) -> int:
         """Number of the thread that is being advanced."""
         return self._current
-
-    @property
-    def threads(self) -> int:
-        """How many are alive."""
-        return len(self._threads)
-
-    def on_kill(self, told: Callable[[int], None]) -> None:
-        """Have `told` called with the number of each thread that is killed."""
-        self._ended = told
 
     def tick(self) -> bool:
         """Advance all threads by one control cycle.
@@ -137,7 +127,7 @@ class Program:
         line, trace = 0, error.__traceback__
         while trace is not None:
             if trace.tb_frame.f_code.co_filename == "<program>":
-                line = self._translation.lines[min(trace.tb_lineno, len(self._translation.lines)) - 1]
+                line = self._lines[min(trace.tb_lineno, len(self._lines)) - 1]
             trace = trace.tb_next
         return line
 
@@ -162,8 +152,6 @@ class Program:
         if number == self._current:
             raise ScriptError("a thread can't kill itself")
         self._threads.pop(number).close()
-        if self._ended is not None:
-            self._ended(number)
 
     def _join(self, number: Any) -> Steps:
         while number in self._threads and number != self._current:
@@ -179,12 +167,25 @@ class Program:
         self._critical = None
 
 
-def _translate(text: str, commands: Mapping[str, bool]) -> tuple[Function, Translation]:
+@dataclass(frozen=True)
+class _Translated:
+    name: str
+    secondary: bool
+    lines: list[int]
+    code: CodeType
+
+
+@lru_cache(maxsize=8)  # clients send the same program again and again
+def _translate(text: str, commands: frozenset[tuple[str, bool]]) -> _Translated:
     try:
         tree = parse(text)
-        return tree, Translation(tree, commands)
+        translation = Translation(tree, dict(commands))
+        code = compile(translation.source, "<program>", "exec")
     except RecursionError:
         raise ScriptError("nested too deeply") from None
+    except (SyntaxError, ValueError, MemoryError) as error:
+        raise ScriptError(f"can't be translated: {error}") from error
+    return _Translated(tree.name, tree.kind == "sec", translation.lines, code)
 
 
 def _explain(error: Exception) -> str:

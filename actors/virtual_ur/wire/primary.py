@@ -119,6 +119,19 @@ def robot_state(s: State, *more: bytes) -> bytes:
     )
 
 
+def safety_checksum(state: bytes) -> str | None:
+    """Checksum of the safety configuration in a robot state, as eight hexadecimal digits.
+
+    Args:
+        state: the body of a package of type `ROBOT_STATE`, as `split` gives it.
+
+    Returns:
+        None if the state has none: controllers leave it out while no configuration is applied.
+    """
+    data = dict(split(state)).get(SAFETY_DATA, b"")
+    return f"{int.from_bytes(data[:4], 'big'):08X}" if len(data) >= 4 else None
+
+
 def kinematics_info(a: Sequence[float], d: Sequence[float], alpha: Sequence[float]) -> bytes:
     """Denavit–Hartenberg parameters without calibration."""
     zeros = (0.0,) * 6

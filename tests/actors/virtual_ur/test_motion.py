@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.virtual_ur.controller import RuntimeState
+from actors.virtual_ur.fields import output_fields
 from actors.virtual_ur.models import HOME
 from actors.virtual_ur.safety import Plane, SafetyConfiguration, SafetyMode
+from actors.virtual_ur.wire.rtde import OutputRecipe
 
 from .conftest import Bench
 
@@ -300,3 +302,50 @@ def test_whatever_a_program_commands_no_joint_s_target_ever_jumps(commands: list
     assert (np.abs(bench.speeds) <= limits).all()
     if what < 4:
         assert np.abs(bench.speeds[-1]).max() == 0.0
+
+
+_extremes = st.sampled_from([0, 1, -1, 1e-300, -1e-300, 1e-9, 1e9, 1e300, -1e300, 6.3, -6.3, 3.1415926535897931, 1e16])
+_six = st.lists(_extremes, min_size=6, max_size=6)
+_wild = st.one_of(
+    st.builds(lambda q, a, v, t, r: f"movej({q}, a={a}, v={v}, t={t}, r={r})", _six, *[_extremes] * 4),
+    st.builds(lambda q, a, v, t, r: f"movel(p{q}, a={a}, v={v}, t={t}, r={r})", _six, *[_extremes] * 4),
+    st.builds(
+        lambda q, t, look, gain: f"servoj({q}, t={t}, lookahead_time={look}, gain={gain})", _six, *[_extremes] * 3
+    ),
+    st.builds(lambda q, a, t: f"speedj({q}, a={a}, t={t})", _six, _extremes, _extremes),
+    st.builds(lambda x, a, t, r: f"speedl({x}, a={a}, t={t}, aRot={r})", _six, *[_extremes] * 3),
+    st.builds(lambda p, a, v: f"servoc(p{p}, a={a}, v={v})", _six, _extremes, _extremes),
+    st.builds(lambda name, a: f"{name}({a})", st.sampled_from(["stopj", "stopl", "sleep"]), _extremes),
+    st.builds(lambda p: f"set_tcp(p{p})", _six),
+    st.builds(lambda m, c: f"set_payload({m}, {c[:3]})", _extremes, _six),
+    st.builds(lambda d: f"set_gravity({d[:3]})", _six),
+    st.builds(lambda p: f"x = get_inverse_kin(p{p})", _six),
+    st.builds(lambda q, p: f"x = get_forward_kin({q}, p{p})", _six, _six),
+    st.builds(lambda p, q: f"x = pose_trans(p{p}, p{q})", _six, _six),
+    st.builds(lambda p, q, k: f"x = interpolate_pose(p{p}, p{q}, {k})", _six, _six, _extremes),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(commands=st.lists(_wild, min_size=1, max_size=4), slider=st.sampled_from([0.0, 1e-9, 1.0]))
+def test_the_wildest_numbers_neither_move_an_arm_wildly_nor_stop_the_controller(
+    commands: list[str], slider: float
+) -> None:
+    bench = Bench(frequency=125)
+    bench.robot.mover.slider = slider
+    for command in commands:
+        bench.start(command)
+        bench.tick(0.2)
+        bench.controller.protective_stop("the next one, please")
+        bench.tick(5.1)
+        assert bench.controller.unlock_protective_stop() is None
+        bench.controller.stop()
+        bench.tick(0.1)
+    assert np.isfinite(np.array(bench.joints)).all()
+    assert (np.abs(bench.speeds) <= 1.11 * np.array(bench.controller.model.joint_speed)).all()
+    fields = output_fields(bench.controller)
+    OutputRecipe(1, list(fields.values())).package()
+    bench.robot.mover.slider = 1.0
+    bench.run("set_tcp(p[0, 0, 0, 0, 0, 0])\nset_gravity([0, 0, 9.82])")
+    bench.run(f"movej({list(HOME)})", limit=100.0)
+    assert bench.joints[-1] == pytest.approx(HOME)

@@ -54,6 +54,14 @@ def test_it_is_ready_when_it_says_so_and_gone_when_it_is_closed() -> None:
     controller.close()  # once more does no harm
 
 
+def test_the_arm_begins_where_it_is_told_to() -> None:
+    joints = [0.1, -1.2, 1.3, -1.4, -1.5, 1.6]
+    with VirtualController.start(address=next_address(), joints=joints, state="idle") as controller:
+        state = controller.fault("state")
+    assert state["joints"] == pytest.approx(joints)
+    assert state["robot_mode"] == "IDLE"
+
+
 def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
     with pytest.raises(VirtualControllerError, match=f"{shared.address}.*is another one running there"):
         VirtualController.start(address=shared.address)
@@ -68,6 +76,8 @@ def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
         ({"time_scale": float("nan")}, "scale"),
         ({"frequency": 1.0}, "Hz"),
         ({"model": "ur5"}, "ur10"),
+        ({"joints": [0.0, 1.0]}, "six numbers"),
+        ({"joints": [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]}, "joint 5"),
     ],
 )
 def test_settings_that_make_no_sense_are_told(options: dict[str, object], says: str) -> None:

@@ -315,11 +315,13 @@ def test_the_primary_port_says_its_version_and_then_its_state() -> None:
 
 def test_the_safety_checksum_can_be_read_where_a_real_controller_gives_it() -> None:
     controller = Controller(UR10E)
-    parts = dict(primary.split(dict(primary.split(Wire(_primary(controller)).take()))[primary.ROBOT_STATE]))
-    assert f"{struct.unpack_from('>I', parts[primary.SAFETY_DATA])[0]:08X}" == controller.safety.checksum
+
+    def told() -> str | None:
+        return primary.safety_checksum(dict(primary.split(Wire(_primary(controller)).take()))[primary.ROBOT_STATE])
+
+    assert told() == controller.safety.configuration.checksum
     controller.safety.reported_checksum = "DEADBEEF"
-    parts = dict(primary.split(dict(primary.split(Wire(_primary(controller)).take()))[primary.ROBOT_STATE]))
-    assert struct.unpack_from(">I", parts[primary.SAFETY_DATA])[0] == 0xDEADBEEF
+    assert told() == "DEADBEEF"
 
 
 def test_primary_clients_are_told_what_programs_say_and_why_they_end() -> None:
