@@ -212,6 +212,13 @@ def test_frames_arrive_whole_however_the_stream_is_cut(cuts: list[int]) -> None:
     assert got == sent
 
 
+@pytest.mark.parametrize("size", [0, 1, 2])
+def test_a_frame_shorter_than_its_own_head_cuts_the_connection(server: RtdeServer, size: int) -> None:
+    one = client(server)
+    one.say(struct.pack(">HB", size, ord("V")) + bytes(10))
+    assert one.cut
+
+
 def _rtde(controller: Controller) -> Connection:
     return RtdeConnection(RtdeServer(controller, Connections(controller)))
 
