@@ -30,7 +30,7 @@ WORKER_DEADLINE = 40.0
 
 _IMPATIENT = {
     "RAY_NUM_REDIS_GET_RETRIES": "3",
-    "RAY_GCS_SERVER_REQUEST_TIMEOUT_SECONDS": "10",
+    "RAY_gcs_server_request_timeout_seconds": "10",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
 }
 """Ray's own patience is minutes."""
@@ -159,19 +159,29 @@ def _look_around(address: str) -> dict[str, Any]:
         ray.init(address=address, namespace="decant", logging_level=logging.CRITICAL, log_to_driver=False)
     except Exception as error:
         return {"error": _why(error)}
-    nodes = [_facts(node) for node in ray.nodes() if node["Alive"]]
+    nodes = _living()
     asked = [_ask_versions(node.id) for node in nodes]
     ray.wait(asked, num_returns=len(asked), timeout=WORKER_DEADLINE)
-    found = [_with_versions(node, ref) for node, ref in zip(nodes, asked, strict=True)]
+    still = {node.id for node in _living()}  # Ray needs a while to see that a node is dead
+    found = [_with_versions(node, ref) for node, ref in zip(nodes, asked, strict=True) if node.id in still]
     answer = {"nodes": [dataclasses.asdict(node) for node in found], "available": ray.available_resources()}
     ray.shutdown()
     return answer
 
 
-def _facts(node: dict[str, Any]) -> NodeFacts:
-    total = node["Resources"]
-    host = f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
-    return NodeFacts(node["NodeID"], host, int(total.get("CPU", 0.0)), total)
+def _living() -> list[NodeFacts]:
+    import ray
+
+    return [
+        NodeFacts(
+            node["NodeID"],
+            f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})",
+            int(node["Resources"].get("CPU", 0.0)),
+            node["Resources"],
+        )
+        for node in ray.nodes()
+        if node["Alive"]
+    ]
 
 
 def _ask_versions(node: str) -> Any:
