@@ -8,6 +8,12 @@ from actors.virtual_ur.models import Joints
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.values import Pose, number, numbers, show
 
+SLOWEST, FASTEST = 1e-6, 1e4
+"""Rates are taken as at least and at most this [rad/s], [m/s²] …: neither ever matters to an arm."""
+
+LONGEST = 1e7
+"""Times are taken as at most this [s]."""
+
 
 def six(value: Any) -> Joints:
     """Six numbers, of a list or a pose."""
@@ -30,6 +36,11 @@ def positive(value: Any, name: str) -> float:
     if result <= 0.0:
         raise ScriptError(f"{name} must be positive, not {show(value)}")
     return result
+
+
+def rate(value: Any, name: str) -> float:
+    """A speed, an acceleration or a deceleration: positive, and within what can be computed with."""
+    return min(max(positive(value, name), SLOWEST), FASTEST)
 
 
 def whole(value: Any, low: int, high: int, name: str) -> int:

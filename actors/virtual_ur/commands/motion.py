@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from actors.virtual_ur.commands.arguments import is_pose, positive, six
+from actors.virtual_ur.commands.arguments import LONGEST, is_pose, positive, rate, six
 from actors.virtual_ur.models import Joints
 from actors.virtual_ur.motion.actions import Action
 from actors.virtual_ur.motion.lines import JointLine, Line, ToolLine, UnreachableError
@@ -71,8 +71,10 @@ class Motion:
     def movej(self, q: Any, a: Any = 1.4, v: Any = 1.05, t: Any = 0, r: Any = 0) -> Steps:
         """To joint positions or a pose, straight in joint space."""
         target = self._inverse(frame_of(six(q))) if is_pose(q) else six(q)
-        self._allowed(target)
-        return self._follow(lambda start: JointLine(self._robot.arm, start, target), a, v, t, r)
+        while beyond := self._controller.safety.configuration.joints_violation(target):
+            self._controller.protective_stop(f"the target is not allowed: {beyond}")
+            yield  # until somebody lets the program go on, which won't help
+        yield from self._follow(lambda start: JointLine(self._robot.arm, start, target), a, v, t, r)
 
     def movel(self, pose: Any, a: Any = 1.2, v: Any = 0.25, t: Any = 0, r: Any = 0) -> Steps:
         """To a pose or joint positions, the tool straight in space."""
@@ -82,8 +84,9 @@ class Motion:
         return self._follow(lambda start: ToolLine(arm, arm.frame(start), target), a, v, t, r)
 
     def _follow(self, line: Callable[[Joints], Line], a: Any, v: Any, t: Any, r: Any) -> Steps:
-        speed, acceleration = positive(v, "speed"), positive(a, "acceleration")
-        duration, radius = max(number(t), 0.0), max(number(r), 0.0)
+        speed, acceleration = rate(v, "speed"), rate(a, "acceleration")
+        duration, radius = min(number(t), LONGEST), max(number(r), 0.0)
+        duration = max(duration, self._controller.dt) if duration > 0.0 else 0.0
         thread = self._take()
         done = False
         try:
@@ -103,12 +106,14 @@ class Motion:
         self, q: Any, a: Any = 0, v: Any = 0, t: Any = 0.002, lookahead_time: Any = 0.1, gain: Any = 300
     ) -> Steps:
         """Towards joint positions for a time; to be called again and again."""
-        target, lookahead, strength = six(q), positive(lookahead_time, "lookahead_time"), positive(gain, "gain")
+        target = six(q)
+        lookahead = min(max(positive(lookahead_time, "lookahead_time"), 0.03), 0.2)  # as the manual limits them
+        strength = min(max(positive(gain, "gain"), 100.0), 2000.0)
         return self._hold(self._cycles(t), lambda: self._mover.servo(target, lookahead, strength))
 
     def servoc(self, pose: Any, a: Any = 1.2, v: Any = 0.25, r: Any = 0) -> Steps:
         """Towards a pose at the tool's speed, braking in time; to be called again and again."""
-        target, speed, acceleration = frame_of(six(pose)), positive(v, "speed"), positive(a, "acceleration")
+        target, speed, acceleration = frame_of(six(pose)), rate(v, "speed"), rate(a, "acceleration")
 
         def aim() -> None:
             here = self._robot.arm.frame(self._mover.q)
@@ -125,7 +130,7 @@ class Motion:
 
     def speedj(self, qd: Any, a: Any = 1.4, t: Any = None) -> Steps:
         """Keep joint speeds for a time; without one, until they are reached."""
-        target, acceleration = six(qd), positive(a, "acceleration")
+        target, acceleration = six(qd), rate(a, "acceleration")
         return self._hold(
             self._cycles(t),
             lambda: self._mover.joint_speeds(target, acceleration),
@@ -134,8 +139,8 @@ class Motion:
 
     def speedl(self, xd: Any, a: Any = 1.2, t: Any = None, aRot: Any = None) -> Steps:
         """Keep a velocity of the tool for a time; without one, until it is reached."""
-        target, acceleration = six(xd), positive(a, "acceleration")
-        turning = acceleration if aRot is None else positive(aRot, "aRot")
+        target, acceleration = six(xd), rate(a, "acceleration")
+        turning = acceleration if aRot is None else rate(aRot, "aRot")
         return self._hold(
             self._cycles(t),
             lambda: self._mover.tool_speed(self._robot.arm, target, acceleration, turning),
@@ -146,7 +151,7 @@ class Motion:
         )
 
     def _cycles(self, t: Any) -> int:
-        return 0 if t is None else max(1, round(number(t) / self._controller.dt))
+        return 0 if t is None else max(1, round(min(number(t), LONGEST) / self._controller.dt))
 
     def _hold(self, cycles: int, command: Callable[[], None], reached: Callable[[], bool] = lambda: True) -> Steps:
         thread = self._take()
@@ -174,7 +179,7 @@ class Motion:
         return self._stop(lambda rate: self._mover.stop_tool(self._robot.arm, rate), a)
 
     def _stop(self, begin: Callable[[float], Action], a: Any) -> Steps:
-        deceleration = positive(a, "deceleration")
+        deceleration = rate(a, "deceleration")
         thread = self._take()
         try:
             stop = begin(deceleration)
@@ -191,7 +196,7 @@ class Motion:
 
     def sleep(self, t: Any) -> Steps:
         """Wait [s]."""
-        for _ in range(max(1, round(min(number(t), 1e7) / self._controller.dt))):
+        for _ in range(max(1, round(min(number(t), LONGEST) / self._controller.dt))):
             yield
 
     # ---- what they share
@@ -216,11 +221,6 @@ class Motion:
             return self._robot.arm.joints(frame, self._mover.q)
         except UnreachableError as error:
             raise ScriptError(f"inverse kinematics found no solution: {error}") from None
-
-    def _allowed(self, q: Joints) -> None:
-        beyond = self._controller.safety.configuration.joints_violation(q)
-        if beyond is not None:
-            self._controller.protective_stop(f"the target is not allowed: {beyond}")
 
 
 def _refuse(name: str) -> Callable[..., None]:

@@ -73,7 +73,6 @@ class Path:
         self.released = False
 
     def _start(self, line: Line) -> Line:
-        self._line, self._prelude = line, None
         way = line.length - self._from
         speed = min(self._speed, line.speed_limit(self._limits))
         into = self._blend_distance(line, way) if self._radius > 0.0 else 0.0
@@ -82,6 +81,7 @@ class Path:
             self._main = Profile.timed(way, self._duration, self._acceleration)
         # What happens if nothing follows: braking within the blend's radius.
         self._tail = Profile(into, self._main.end, self._acceleration, self._main.end)
+        self._line, self._prelude = line, None
         return line
 
     def _round(self, before: Path, q: Joints) -> Line | None:
@@ -228,6 +228,7 @@ class ToolSpeed:
         """Set a new target."""
         self.target, self.acceleration, self.turning = tuple(target), acceleration, turning
         self._stops = not any(self.target)
+        self._ceiling: float | None = None
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """See `Action.step`."""
@@ -244,11 +245,9 @@ class ToolSpeed:
         rotation, (x, y, z) = self._frame
         turned = multiply(rotation_matrix((v[3] * dt, v[4] * dt, v[5] * dt)), rotation)
         self._frame = (turned, (x + v[0] * dt, y + v[1] * dt, z + v[2] * dt))
-        try:
-            return self._arm.joints(self._frame, q)
-        except UnreachableError:
-            if not self._stops:
-                raise
-            # A stop must succeed anywhere: at the edge of its reach the arm stops in joint space.
-            self._frame = None
-            return JointSpeed((0.0,) * 6, 10.0).step(q, qd, dt)
+        there = self._arm.joints(self._frame, q)
+        if self._stops and self._ceiling is None:
+            self._ceiling = 1.2 * max(abs(v) for v in qd)
+        if self._ceiling is not None and max(abs(b - a) for a, b in zip(q, there, strict=True)) > self._ceiling * dt:
+            raise UnreachableError("near a singularity a straight stop would make a joint faster")
+        return there

@@ -199,14 +199,14 @@ class Mover:
                 self._action = action = self._braking()
         try:
             q = action.step(self.q, self.qd, dt * self.rate if isinstance(action, Path) else dt)
-            if not _is_stop(action):
-                self._check(q, dt)
-        except UnreachableError as error:
+            self._check(q, dt)
+        except (UnreachableError, ViolationError) as error:
+            # Out of reach, near a singularity, out of range: whatever it was, the arm brakes in joint space. For a stop
+            # that is all there is to do.
             self._break_off(dt)
+            if _is_stop(action):
+                return
             raise ViolationError(str(error)) from None
-        except ViolationError:
-            self._break_off(dt)
-            raise
         self._advance(q, dt)
         if action.finished:
             self._action = None
@@ -224,7 +224,7 @@ class Mover:
     def _check(self, q: Joints, dt: float) -> None:
         for i in range(6):
             speed = abs(q[i] - self.q[i]) / dt
-            if speed > _SPEED_MARGIN * self.joint_speed[i]:
+            if not speed <= _SPEED_MARGIN * self.joint_speed[i]:  # so that what is no number is caught too
                 raise ViolationError(
                     f"joint {i} would turn at {degrees(speed):.0f} deg/s; "
                     f"its limit is {degrees(self.joint_speed[i]):.0f} deg/s"

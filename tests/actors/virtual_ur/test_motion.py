@@ -161,11 +161,26 @@ def test_speedl_moves_the_tool_straight(bench: Bench) -> None:
     assert points[-1, 1] == pytest.approx(0.5 * 0.1 * 0.2 + 0.1 * 0.8 + 0.5 * 0.1 * 0.1, rel=0.02)
 
 
+def test_speedl_towards_rest_is_a_soft_stop(bench: Bench) -> None:
+    bench.run("speedl([0, 0.1, 0, 0, 0, 0], a=0.5, t=1.0)\nspeedl([0, 0, 0, 0, 0, 0], a=0.5, t=0.5)")
+    assert np.abs(np.diff(bench.tool_speeds)).max() < 0.52 * DT
+    assert bench.tool_speeds[-1] == 0.0
+
+
 @pytest.mark.parametrize(("stop", "rate"), [("stopj", 2.0), ("stopj", 0.5)])
 def test_a_stop_takes_as_long_as_its_deceleration_says(bench: Bench, stop: str, rate: float) -> None:
     took = bench.run(f"speedj([0, 0, 0, 0, 0, 0.5], a=10, t=0.2)\n{stop}({rate})")
     assert took == pytest.approx(0.2 + 0.5 / rate, abs=5 * DT)
     assert bench.speeds[-1, 5] == pytest.approx(0.0, abs=rate * DT)
+
+
+def test_a_tool_stop_where_the_arm_is_stretched_out_brakes_the_joints_instead(bench: Bench) -> None:
+    # On the way to the last reachable point the elbow has to turn ever faster to keep the tool on a straight line.
+    bench.start("movej([0, 0, 0, 0, 0, 0], a=1, v=1, r=0.125)\nstopl(1.0)")
+    bench.tick(4.0)
+    assert np.abs(bench.speeds).max() < 1.25
+    assert np.abs(bench.speeds[-1]).max() == 0.0
+    assert bench.controller.safety.mode is SafetyMode.NORMAL
 
 
 def test_killing_the_thread_that_moves_stops_the_arm_softly(bench: Bench) -> None:
