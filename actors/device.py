@@ -11,11 +11,16 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
-from actors.protocols import LaboratoryError
+from actors.cluster.place import Place
+from actors.protocols import BenchLostError, LaboratoryError
 
 
 class DeviceLostError(LaboratoryError):
     """The device's process died during a call, or doesn't answer: nobody knows how far the call came."""
+
+
+class MachineLostError(DeviceLostError, BenchLostError):
+    """The device's machine is gone, so a new process won't do."""
 
 
 class Device(Protocol):
@@ -36,7 +41,7 @@ class Device(Protocol):
             urgent: don't queue behind other calls.
 
         Raises:
-            DeviceLostError: its process died, or the deadline passed.
+            DeviceLostError: its process died, or the deadline passed; MachineLostError: with its machine.
             LaboratoryError: whatever of this kind the method raises.
         """
         ...
@@ -85,11 +90,12 @@ class RayDevice:
         name: what people call it.
         cls: the object's class, importable by workers.
         args: arguments of its constructor.
+        place: the node of a cluster that it must run on.
     """
 
-    def __init__(self, name: str, cls: type[Any], *args: Any) -> None:
+    def __init__(self, name: str, cls: type[Any], *args: Any, place: Place | None = None) -> None:
         self.name = name
-        self._class, self._args = cls, args
+        self._class, self._args, self._place = cls, args, place
         self._actor: Any = None
         self._lost = False
         self._start()
@@ -97,8 +103,9 @@ class RayDevice:
     def _start(self) -> None:
         import ray
 
+        placement = {} if self._place is None else self._place.options
         actor_class = ray.remote(
-            num_cpus=0, max_restarts=0, max_task_retries=0, concurrency_groups={"work": 1, "control": 2}
+            num_cpus=0, max_restarts=0, max_task_retries=0, concurrency_groups={"work": 1, "control": 2}, **placement
         )(self._class)
         self._actor = actor_class.remote(*self._args)
         self._lost = False
@@ -118,16 +125,22 @@ class RayDevice:
             self._lost = True
             with contextlib.suppress(Exception):
                 ray.kill(self._actor)
+            await self._check_machine(method)
             raise DeviceLostError(f"{self.name}: no answer to '{method}' within {deadline:g} s")
         try:
             return future.result()
         except ray.exceptions.RayActorError as error:
             self._lost = True
+            await self._check_machine(method)
             raise DeviceLostError(f"{self.name}: its process died during '{method}'") from error
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, LaboratoryError | ValueError):
                 raise error.cause from None
             raise LaboratoryError(f"{self.name}: '{method}' failed: {error.cause!r}") from error
+
+    async def _check_machine(self, method: str) -> None:
+        if self._place is not None and await self._place.is_gone():
+            raise MachineLostError(f"{self.name}: its machine {self._place.node.host} was lost during '{method}'")
 
     async def revive(self) -> bool:
         """See `Device.revive`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from actors.arm.virtual_arm import VirtualArm
 from actors.balance.virtual_balance import BalanceSettings, VirtualBalance
@@ -12,10 +12,38 @@ from actors.bench.bench import VirtualBench
 from actors.bench.spec import VirtualBenchSpec
 from actors.device import Device, LocalDevice
 from actors.optimizer.actor import DeviceOptimizer, Proposer
-from actors.protocols import Bench, Laboratory, LaboratoryError, Optimizer, SimulatorPool
+from actors.protocols import (
+    Bench,
+    BenchLostError,
+    Laboratory,
+    LaboratoryError,
+    Notice,
+    Optimizer,
+    SimulatorPool,
+)
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.worker import Simulator, pour_simulator
 from actors.spec import LaboratorySpec
+
+if TYPE_CHECKING:
+    from actors.cluster.site import Site
+    from actors.simulation.pool import RaySimulatorPool
+
+
+def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
+    """Whether what a laboratory needs from outside this machine is there. Starts nothing that stays.
+
+    Args:
+        spec: where to run.
+        need_bench: whether pours will be asked for.
+
+    Raises:
+        LaboratoryError: with what is wrong and what would be right.
+    """
+    if spec.ray is not None and not spec.in_process:
+        from actors.cluster.probe import check_cluster
+
+        check_cluster(spec.ray, need_bench=need_bench)
 
 
 def open_laboratory(
@@ -64,6 +92,18 @@ class _Rooms:
         self._devices: list[Device] = []
         self._optimizer: Optimizer | None = None
         self._bench: Bench | None = None
+        self._bench_problem: str | None = None
+        self._notices: list[Notice] = []
+        self._hear: Callable[[Notice], None] = self._notices.append
+
+    def listen(self, hear: Callable[[Notice], None]) -> None:
+        """See `Telling.listen`."""
+        self._hear = hear
+        while self._notices:
+            hear(self._notices.pop(0))
+
+    def _tell(self, notice: Notice) -> None:
+        self._hear(notice)
 
     @property
     def simulators(self) -> SimulatorPool:
@@ -74,7 +114,13 @@ class _Rooms:
 
     @property
     def bench(self) -> Bench | None:
-        """The bench, if one was needed."""
+        """The bench, if one was needed.
+
+        Raises:
+            BenchLostError: its machine is gone.
+        """
+        if self._bench_problem is not None:
+            raise BenchLostError(self._bench_problem)
         return self._bench
 
     @property
@@ -126,10 +172,10 @@ class InProcessLaboratory(_Rooms):
 
 
 class RayLaboratory(_Rooms):
-    """Everything in processes of its own.
+    """Everything in processes of its own: on this machine, or on the machines of a cluster.
 
     Args:
-        spec: size of the pool, memory.
+        spec: size of the pool, memory, the cluster if there is one.
         bench: None where no pours are needed.
         make: makes simulators, in their processes.
     """
@@ -142,6 +188,8 @@ class RayLaboratory(_Rooms):
     ) -> None:
         super().__init__()
         self._spec, self._bench_spec, self._make = spec, bench, make
+        self._site: Site | None = None
+        self._liquid: RaySimulatorPool | None = None
 
     async def __aenter__(self) -> RayLaboratory:
         from actors.ray_runtime import keep_signals, start_ray
@@ -157,6 +205,11 @@ class RayLaboratory(_Rooms):
             raise
         keep_signals()
         try:
+            if self._spec.ray is not None:
+                from actors.cluster.site import Site
+
+                self._site = Site(self._spec.ray, self._tell, self._lose_bench)
+                await self._site.open(need_bench=self._bench_spec is not None)
             self._open_rooms()
         except BaseException:
             await self.__aexit__()
@@ -165,24 +218,59 @@ class RayLaboratory(_Rooms):
 
     def _open_rooms(self) -> None:
         from actors.device import RayDevice
-        from actors.ray_runtime import simulator_count
-        from actors.simulation.pool import RaySimulatorPool
 
-        self._pool = RaySimulatorPool(simulator_count(self._spec), make=self._make)
-        proposer = RayDevice("optimiser", Proposer)
+        here = None if self._site is None else self._site.here
+        self._pool = self._open_pool()
+        proposer = RayDevice("optimiser", Proposer, place=here)
         self._devices.append(proposer)
         self._optimizer = DeviceOptimizer(proposer)
         if self._bench_spec is not None:
-            spec = self._bench_spec
-            arm = RayDevice("arm", VirtualArm, spec.time_scale)
-            balance = RayDevice("balance", VirtualBalance, _balance_settings(spec))
+            spec, place = self._bench_spec, None if self._site is None else self._site.bench
+            arm = RayDevice("arm", VirtualArm, spec.time_scale, place=place)
+            balance = RayDevice("balance", VirtualBalance, _balance_settings(spec), place=place)
             self._devices += [arm, balance]
-            # No core is counted for it: the pool's size is the campaign's choice, and a pour must never wait for it.
-            self._world = RaySimulatorPool(1, make=self._make, cpus=0.0)
-            self._bench = VirtualBench(spec, self._world, arm, balance)
+            self._world = self._liquid = self._open_world()
+            self._bench = VirtualBench(spec, self._liquid, arm, balance)
+
+    def _open_pool(self) -> RaySimulatorPool:
+        from actors.cluster.versions import versions
+        from actors.ray_private import simulator_count
+        from actors.simulation.pool import RaySimulatorPool
+
+        def tell(text: str) -> None:
+            self._tell(Notice("warning", text))
+
+        if self._site is None:
+            return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=tell)
+        pool = RaySimulatorPool(
+            self._spec.simulators or self._site.cpus,
+            make=self._make,
+            placement={"scheduling_strategy": "SPREAD"},
+            expected=versions(),
+            tell=tell,
+        )
+        if not self._spec.simulators:
+            self._site.grown = pool.grow
+        return pool
+
+    def _open_world(self) -> RaySimulatorPool:
+        """The hidden liquid's simulator, beside the arm. No core is counted for it: the pool's size is the campaign's
+        choice, and a pour must never wait for it."""
+        from actors.simulation.pool import RaySimulatorPool
+
+        place = None if self._site is None else self._site.bench
+        return RaySimulatorPool(1, make=self._make, cpus=0.0, placement=None if place is None else place.options)
+
+    def _lose_bench(self, reason: str) -> None:
+        """Its machine is gone: calls to arm and balance find out by themselves, the liquid's simulator would wait."""
+        self._bench_problem = reason
+        if self._liquid is not None:
+            self._liquid.abandon(BenchLostError(reason))
 
     async def __aexit__(self, *exc: object) -> None:
         await self._close_rooms()
+        if self._site is not None:
+            await self._site.close()
         await self._stop_ray()
 
     async def _stop_ray(self) -> None:

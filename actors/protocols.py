@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from sim_engine.outcome import PourMeasurement, PourOutcome
@@ -16,6 +16,10 @@ from sim_engine.task import PourTask, Scene
 
 class LaboratoryError(Exception):
     """Something in the laboratory can't do what was asked; the text is for the person who can mend it."""
+
+
+class BenchLostError(LaboratoryError):
+    """The bench's machine is gone: no pour can be made until it is back. Nobody knows what came of one under way."""
 
 
 class InvalidActionError(LaboratoryError):
@@ -111,6 +115,7 @@ class Bench(Protocol):
         Raises:
             InvalidActionError: refused before anything moved.
             LaboratoryError: it failed after something had moved: what was poured is unknown.
+            BenchLostError: so is the bench; nothing more can be poured.
         """
         ...
 
@@ -120,6 +125,27 @@ class Optimizer(Protocol):
 
     async def suggest(self, problem: SuggestProblem) -> Suggestion:
         """Answer a `SuggestProblem`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that happened to a laboratory, in words for people."""
+
+    level: Literal["info", "warning", "error"]
+    text: str
+
+
+@runtime_checkable
+class Telling(Protocol):
+    """A laboratory that tells what happens to it."""
+
+    def listen(self, hear: Callable[[Notice], None]) -> None:
+        """Be told from now on, and at once what has happened so far.
+
+        Args:
+            hear: called in the event loop; must not raise.
+        """
         ...
 
 
@@ -133,7 +159,11 @@ class Laboratory(Protocol):
 
     @property
     def bench(self) -> Bench | None:
-        """None where a campaign needs no pours (recorded data, planning)."""
+        """None where a campaign needs no pours (recorded data, planning).
+
+        Raises:
+            BenchLostError: its machine is gone.
+        """
         ...
 
     @property

@@ -8,15 +8,29 @@ from actors.bench.spec import VirtualBenchSpec
 
 
 @dataclass(frozen=True)
+class RaySpec:
+    """A Ray cluster that runs already.
+
+    Attributes:
+        address: of its head, host:port.
+        bench_resource: custom resource of the node that arm, balance and bench run on.
+    """
+
+    address: str
+    bench_resource: str = "decant_bench"
+
+
+@dataclass(frozen=True)
 class LaboratorySpec:
     """Where a campaign runs.
 
     Attributes:
-        simulators: size of the pool; 0: one per core.
+        simulators: size of the pool; 0: one per core, of this machine or of the cluster.
         bench: None where the laboratory can't pour.
         mode: 'virtual', the only one yet.
         in_process: everything in threads of one process, without Ray.
-        object_store_mb: Ray's shared memory for results [MiB]; Ray takes no less than 80.
+        object_store_mb: a private Ray's shared memory for results [MiB]; Ray takes no less than 80.
+        ray: the cluster to join; None for a private Ray on this machine.
     """
 
     name: str
@@ -25,3 +39,4 @@ class LaboratorySpec:
     mode: str = "virtual"
     in_process: bool = False
     object_store_mb: int = 160
+    ray: RaySpec | None = None

@@ -1,81 +1,158 @@
-"""CPU seconds of the standard pour: 200 mL from a cup (R 40 mm, H 100 mm) turned about its lip at 30 deg/s to 120 deg.
+"""CPU seconds of the standard pour, alone or beside the fastest peer.
 
-    python benchmarks/pour_speed.py --particles 2000 [--repeats 3] [--json]
+    python benchmarks/pour_speed.py --particles 2000 [--repeats 3] [--core 1] [--json]
+    python benchmarks/pour_speed.py --particles 2000 --peer [RUNS]
 
-Kernels are compiled (or loaded from the cache) by a short pour before anything is measured. One thread. The pour is
-over when nothing can change any more, at most 6 s; all CPU seconds of the process count.
+One thread on one core. Set-up is not counted for either: kernels are compiled (or loaded from the cache) by a short
+pour before anything is measured, and the peer's first step, which samples its walls, is left out. Ours is over when
+nothing can change any more, at most 6 s; the peer always runs for 6 s, so the ratio is given per simulated second as
+well. Runs of both take turns. Outflow, delivery and density of both are measured in the same way.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
+from collections.abc import Iterator
+from typing import Any
 
-from sim_engine.action import DEG, Action
-from sim_engine.fluid.step import ITERATIONS
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import cylinder
-
-SCENE = Scene(
-    "standard pour",
-    cylinder("cup", inner_radius=0.040, inner_height=0.100),
-    cylinder("receiver", inner_radius=0.045, inner_height=0.090),
-    Liquid(mass=0.1996),
+import peer
+from machine import describe, pin, say, show
+from peer import PeerRun
+from standard_pour import (
+    END,
+    LEFT,
+    LEFT_LIMIT,
+    SCENE,
+    TIMES,
+    Measured,
+    check_particles,
+    measure,
+    short_task,
+    standard_action,
 )
 
+from sim_engine.pour import PourSimulator
 
-def standard_action(angular_velocity: float = 30 * DEG, hold_time: float = 2.0) -> Action:
-    """The lip is 110 mm above the receiver's rim and 40 mm behind its axis; no ramp, no return."""
-    return Action(
-        angular_velocity=angular_velocity,
-        x_offset=0.080,
-        height=0.110,
-        max_angle=120 * DEG,
-        angular_acceleration=None,
-        hold_time=hold_time,
-        return_velocity=None,
-    )
+__all__ = ["SCENE", "main", "standard_action"]
+
+
+def turns(ours: int, theirs: int) -> Iterator[str]:
+    """Who is next, 'ours' or 'theirs': as evenly mixed as can be."""
+    done = {"ours": 0, "theirs": 0}
+    total = {"ours": ours, "theirs": theirs}
+    while done != total:
+        name = min((k for k in total if done[k] < total[k]), key=lambda k: (done[k] + 0.5) / total[k])
+        done[name] += 1
+        yield name
+
+
+def of_ours(particles: int, runs: list[Measured]) -> dict[str, Any]:
+    """What came of our runs: medians over the seeds."""
+    middle = sorted(runs, key=lambda run: run.cpu_s)[len(runs) // 2]
+    cpu_s = statistics.median(run.cpu_s for run in runs)
+    rates = [particles * run.iterations / run.cpu_s for run in runs]
+    left = [statistics.mean(values) for values in zip(*(run.left for run in runs), strict=True)]
+    return {
+        "cpu_s": round(cpu_s, 3),
+        "cpu_s_of_each": [round(run.cpu_s, 3) for run in runs],
+        "wall_s": round(statistics.median(run.wall_s for run in runs), 3),
+        "steps": middle.outcome.steps,
+        "iterations": middle.iterations,
+        "iterations_per_step": round(middle.iterations / middle.outcome.steps, 2),
+        "particle_iterations_per_s": round(statistics.median(rates)),
+        "simulated_time_s": round(statistics.median(run.outcome.simulated_time for run in runs), 3),
+        **_physics(left, [run.outcome.received for run in runs], [run.density for run in runs]),
+        "density_error": round(statistics.mean(run.outcome.density_error for run in runs), 4),
+        "repeats": len(runs),
+    }
+
+
+def of_theirs(particles: int, runs: list[PeerRun]) -> dict[str, Any]:
+    """What came of the peer's runs: medians over the seeds."""
+    middle = sorted(runs, key=lambda run: run.cpu_s)[len(runs) // 2]
+    left = [statistics.mean(values) for values in zip(*(run.left for run in runs), strict=True)]
+    cpu_s = statistics.median(run.cpu_s for run in runs)
+    return {
+        "name": f"{peer.NAME} {peer.VERSION}, DFSPH with volume maps",
+        "cpu_s": round(cpu_s, 3),
+        "cpu_s_of_each": [round(run.cpu_s, 3) for run in runs],
+        "steps": middle.steps,
+        "iterations": middle.iterations,
+        "iterations_per_step": round(middle.iterations / middle.steps, 2),
+        "particle_iterations_per_s": round(particles * middle.iterations / middle.cpu_s),
+        "simulated_time_s": END,
+        **_physics(left, [run.delivered for run in runs], [run.density for run in runs]),
+        "repeats": len(runs),
+    }
+
+
+def _physics(left: list[float], received: list[float], densities: list[float]) -> dict[str, Any]:
+    off = [abs(value - reference) for value, reference in zip(left, LEFT, strict=True)]
+    return {
+        "left": {f"{t:g} s": round(value, 3) for t, value in zip(TIMES, left, strict=True)},
+        "left_is_right": all(value <= LEFT_LIMIT for value in off),
+        "delivered": round(statistics.mean(received), 4),
+        "delivered_of_each": [round(value, 4) for value in received],
+        "density_at_rest": round(statistics.mean(densities), 4),
+    }
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=2000)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=_at_least_one, default=3, help="our pours, each with another seed")
+    parser.add_argument(
+        "--peer",
+        type=_at_least_one,
+        nargs="?",
+        const=1,
+        default=0,
+        metavar="RUNS",
+        help=f"also run {peer.NAME} so many times (once if no number follows)",
+    )
+    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
+    particles = check_particles(options.particles)
+    python = None
+    if options.peer:
+        peer.check_particles(particles)
+        python = peer.environment()
+    core = pin(options.core)
 
     simulator = PourSimulator()
-    theta = SimulationParameters(particles=options.particles)
     begun = time.perf_counter()
-    simulator.simulate(PourTask(SCENE, standard_action(180 * DEG, 0.0), theta, 0))
+    simulator.simulate(short_task(particles))
     first = time.perf_counter() - begun
-    rows = []
-    for seed in range(1, options.repeats + 1):
-        begun = time.perf_counter()
-        outcome = simulator.simulate(PourTask(SCENE, standard_action(), theta, seed)).outcome
-        rows.append((outcome.cpu_s, time.perf_counter() - begun, outcome))
-    cpu_s = statistics.median(cpu for cpu, _, _ in rows)
-    outcome = next(o for cpu, _, o in rows if cpu == cpu_s) if options.repeats % 2 else rows[0][2]
-    result = {
-        "particles": options.particles,
-        "cpu_s": round(cpu_s, 3),
-        "wall_s": round(statistics.median(wall for _, wall, _ in rows), 3),
-        "steps": outcome.steps,
-        "iterations_per_step": ITERATIONS,
-        "particle_iterations_per_s": round(options.particles * outcome.steps * ITERATIONS / cpu_s),
-        "simulated_time_s": round(outcome.simulated_time, 3),
-        "density_error": round(outcome.density_error, 4),
-        "received": [round(o.received, 4) for _, _, o in rows],
-        "first_pour_s": round(first, 2),
-        "repeats": options.repeats,
-    }
-    print(json.dumps(result) if options.json else "\n".join(f"{k:26s} {v}" for k, v in result.items()))
+    ours: list[Measured] = []
+    theirs: list[PeerRun] = []
+    for turn in turns(options.repeats, options.peer):
+        if turn == "ours":
+            ours.append(measure(simulator, particles, seed=len(ours) + 1))
+            say(f"ours, seed {len(ours)}: {ours[-1].cpu_s:.2f} CPU s")
+        elif python is not None:
+            say(f"{peer.NAME}, seed {len(theirs) + 1}: running")
+            theirs.append(peer.pour(python, particles, seed=len(theirs) + 1))
+            say(f"{peer.NAME}, seed {len(theirs)}: {theirs[-1].cpu_s:.2f} CPU s")
+    result: dict[str, Any] = {"particles": particles, **of_ours(particles, ours), "first_pour_s": round(first, 2)}
+    if theirs:
+        result["peer"] = of_theirs(particles, theirs)
+        result["ratio"] = round(result["peer"]["cpu_s"] / result["cpu_s"], 2)
+        per_second = result["simulated_time_s"] / END
+        result["ratio_per_simulated_second"] = round(result["ratio"] * per_second, 2)
+    result["core"] = core
+    result["machine"] = describe()
     simulator.close()
+    show(result, options.json)
+
+
+def _at_least_one(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
+    return int(text)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ page is not current. Run from the project's root: python docs/make_tables.py
 
 from __future__ import annotations
 
+import itertools
 import re
 import types
 import typing
@@ -17,14 +18,16 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.config import campaign, laboratory, vessel
+from orchestrator.config import campaign, cluster, laboratory, vessel
 from orchestrator.config.quantities import Quantity
 from orchestrator.config.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.scenes import DEFAULTS, NEEDED
 from orchestrator.config.sections import Section
+from orchestrator.report.physics import kept_records
 from orchestrator.states import State
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquid import SimulationParameters
+from sim_engine.validation import sensitivity
 
 FOLDER = Path(__file__).parent
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -42,6 +45,7 @@ SECTIONS: dict[str, type[Section]] = {
     "vessel": vessel.VesselFile,
     "profile": vessel.ProfileSection,
     "laboratory": laboratory.LaboratoryFile,
+    "ray": cluster.RaySection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
     "pose-error": laboratory.PoseErrorSection,
@@ -107,6 +111,35 @@ def parameters() -> str:
     return _table(("name", "bounds", "default", "meaning"), rows)
 
 
+def effects() -> str:
+    """What each parameter does to the spillage of three pours, as `decant physics sensitivity` measured it last."""
+    found = {(e.parameter, e.pour): e for e in sensitivity.effects(_measured("sensitivity"))}
+    rows = []
+    for name, info in SimulationParameters.info().items():
+        cells = []
+        for pour in sensitivity.POURS:
+            e = found.get((name, pour))
+            cells.append("not measured yet" if e is None else f"{e.effect} over {e.where}: {e.change:+.3f} ± {e.error}")
+        rows.append((f"`{name}`", "" if info.unit == "1" else info.unit, *cells))
+    return _table(("name", "unit", *(f"{pour} pour" for pour in sensitivity.POURS)), rows)
+
+
+def seeds() -> str:
+    """What the defaults spill in these pours, and how much a seed differs from it."""
+    rows = []
+    measured = _measured("sensitivity")
+    for mean, deviation in itertools.pairwise(measured):
+        pour, marked, _ = str(mean["name"]).partition(" pour with the defaults: ")
+        if marked:
+            rows.append((pour, f"{mean['particles']}", f"{mean['value']:.3f}", f"{deviation['value']:.3f}"))
+    return _table(("pour", "particles", "spilled / poured", "standard deviation of a seed"), rows)
+
+
+def _measured(case: str) -> list[dict[str, Any]]:
+    records = kept_records(FOLDER)
+    return list(records[case]["measurements"]) if case in records else []
+
+
 def columns() -> str:
     """Columns of a file of weighed pours."""
     rows = [(f"`{name}`", "g") for name in MASS_COLUMNS] + [("`split`", ", ".join(SPLITS))]
@@ -135,6 +168,8 @@ def section(model: type[Section]) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "actions": actions,
     "parameters": parameters,
+    "effects": effects,
+    "seeds": seeds,
     "columns": columns,
     "states": states,
     **{name: partial(section, model) for name, model in SECTIONS.items()},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from actors.protocols import Laboratory
+from actors.protocols import Laboratory, Notice, Telling
 from orchestrator.errors import RunError
 from orchestrator.events import (
     CampaignClosed,
@@ -160,6 +161,8 @@ class _Run:
             if histories[stage.name].unknown_pours():
                 histories[stage.name] = await self._settle(stage, histories[stage.name])
         async with self._laboratory as laboratory:
+            if isinstance(laboratory, Telling):
+                laboratory.listen(self._hear)
             self._check_bench(laboratory, histories)
             lanes = Lanes(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
             opened = CampaignOpened(
@@ -250,6 +253,12 @@ class _Run:
             raise LaneError(
                 f"the plan is for a {self._plan.laboratory.mode} bench, but the laboratory's is {laboratory.bench.mode}"
             )
+
+    def _hear(self, notice: Notice) -> None:
+        """Something happened to the laboratory: written down, and shown."""
+        with contextlib.suppress(RunError):  # a full disk ends the run with the next write that matters
+            self._journal.append(Kind.NOTE, {"text": notice.text})
+        self._watchers.log(notice.level, notice.text)
 
     def _enter(self, state: State, reason: str = "") -> None:
         if state is self._state:

@@ -130,6 +130,9 @@ def plan(
     receiver: Receiver = None,
     iterations: Annotated[int | None, typer.Option(min=2, help="Iterations of the optimiser.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="In place of the campaign's.")] = None,
+    seeds: Annotated[
+        int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction and its spread.")
+    ] = 5,
     in_process: InProcess = False,
     as_json: Json = False,
 ) -> None:
@@ -146,6 +149,7 @@ def plan(
         receiver=receiver,
         iterations=iterations,
         seed=seed,
+        seeds=seeds,
         in_process=in_process,
         as_json=as_json,
     )
@@ -165,7 +169,10 @@ def simulate(
     ] = None,
     parameters: Parameters = None,
     receiver: Receiver = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the initial positions.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the initial positions; the first of several.")] = 0,
+    seeds: Annotated[
+        int, typer.Option(min=1, max=1000, help="How many seeds: SEED, SEED + 1, … Their spread is told.")
+    ] = 3,
     scene: Annotated[
         str | None,
         typer.Option(help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),
@@ -174,10 +181,11 @@ def simulate(
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
     png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
 ) -> None:
-    """Simulate one pour of a campaign's scene and say where the liquid went.
+    """Simulate one pour of a campaign's scene, with several seeds, and say where the liquid went.
 
     Actions without a unit are in deg, deg/s, deg/s^2, mm and s; what the campaign fixes needs no `--set`. With `--json`
-    fractions are of the load: received + spilled + retained + in_flight + escaped = 1.
+    fractions are of the load: received + spilled + retained + in_flight + escaped = 1; they, the recording and the
+    picture are the first seed's, means and standard deviations of all seeds stand under 'prediction'.
     """
     from orchestrator.commands import single
 
@@ -188,6 +196,7 @@ def simulate(
         parameters=parameters,
         receiver=receiver,
         seed=seed,
+        seeds=seeds,
         scene_name=scene,
         as_json=as_json,
         rrd=rrd,

@@ -8,12 +8,16 @@ from typing import Any, cast
 
 from orchestrator.codec import to_json
 from orchestrator.plan import CampaignPlan
+from sim_engine.liquid import Liquid
 from sim_engine.vessel.spec import MeshShape
 
 _FREE = ("source", "outputs", "resolved", "on_unknown")
 """Fields of a plan that may be changed between two parts of a run."""
 
-_MACHINE = ("simulators", "in_process", "object_store_mb")
+_TOLD = ("surface_tension", "dynamic_viscosity")
+"""Properties of a liquid that decide which warnings are given, and no request."""
+
+_MACHINE = ("simulators", "in_process", "object_store_mb", "ray")
 """Fields of a laboratory that belong to the machine, not to the campaign."""
 
 
@@ -36,6 +40,8 @@ def _by_content(data: Any) -> Any:
         return [_by_content(value) for value in data]
     if not isinstance(data, dict):
         return data
+    if set(data) == set(Liquid.model_fields):
+        return {key: value for key, value in data.items() if key not in _TOLD}
     if data.get("kind") == "mesh" and set(data) == set(MeshShape.model_fields):
         return {**data, "path": hashlib.sha256(Path(data["path"]).read_bytes()).hexdigest()}
     # Where records came from does not matter: they are in the plan.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from actors.protocols import (
     Bench,
+    BenchLostError,
     Frames,
     InvalidActionError,
     Laboratory,
@@ -98,7 +99,8 @@ class Lanes:
             progress: handed to the bench.
 
         Raises:
-            LaneError: there is no bench.
+            LaneError: there is no bench, or it was lost during the pour, whose outcome nobody knows then.
+            BenchLostError: it was lost before.
         """
         bench, scene = self.bench, self._scene(request.scene)
         async with self._real:
@@ -108,6 +110,12 @@ class Lanes:
                     measurement = await bench.pour(scene, request.action, seed=request.seed, progress=progress)
             except InvalidActionError as error:
                 return Failed("invalid_action", str(error))
+            except BenchLostError as error:
+                # No outcome: a person has to look, and there is nothing left to pour with.
+                _raise_if_cancelled()
+                raise LaneError(
+                    f"{error}; what was poured is unknown: see to the bench, then resume the run"
+                ) from error
             except LaboratoryError as error:
                 _raise_if_cancelled()
                 return Failed("pour_failed", str(error))

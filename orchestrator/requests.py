@@ -12,10 +12,17 @@ from sim_engine.outcome import PourMeasurement, PourOutcome
 
 @dataclass(frozen=True)
 class Prediction:
-    """A predicted loss and its standard deviation, in the loss' own unit."""
+    """A predicted loss, in the loss' own unit.
+
+    Attributes:
+        mean: expected loss.
+        deviation: standard deviation of that expectation: how well it is known.
+        scatter: standard deviation of a single pour around it (in simulation: of a single seed); None if unknown.
+    """
 
     mean: float
     deviation: float
+    scatter: float | None = None
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,14 @@ from orchestrator.strategies.deployment_d3 import Hybrid
 from orchestrator.strategies.design import DesignedPours, MeasuredPour
 from orchestrator.strategies.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.repeats import RepeatedSimulation
 from orchestrator.strategies.scorecard import Scorecard
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
 POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
-"""Names of a calibration's stages."""
+DEPLOYMENT, PREDICTION = "deployment:", "prediction:"
+"""Names of a calibration's stages, and what those of receivers begin with."""
 
 _DEPLOYMENTS: dict[str, type[Deployment]] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 
@@ -110,29 +112,57 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
 
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
     """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated)."""
-    receivers = [scene.receiver.name for scene in deployment.scenes]
-    distinct = len(set(receivers)) == len(receivers)
     # Only where simulations go on for as long as a pour takes does the clock decide what is asked for.
     free = deployment.strategy == "D3" and deployment.per_pour is None
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            theta = plan.parameters
-            if CALIBRATION in results:
-                theta = SimulationParameters.model_validate(results[CALIBRATION]["theta"])
-            return _DEPLOYMENTS[deployment.strategy](deployment, scene, theta, seed)
+            return _DEPLOYMENTS[deployment.strategy](deployment, scene, _theta(plan, results), seed)
 
         return build
 
     return [
         StageDefinition(
-            f"deployment:{scene.receiver.name if distinct else scene.name}",
+            DEPLOYMENT + name,
             build_for(scene),
             order="completion" if free else "logical",
             pours=deployment.pours > 0,
         )
-        for scene in deployment.scenes
+        for name, scene in _by_receiver(deployment).items()
     ]
+
+
+def prediction_stages(plan: CampaignPlan, deployment: DeploymentPlan, seeds: int) -> list[StageDefinition]:
+    """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
+
+    Args:
+        seeds: how many, each.
+    """
+
+    def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            values = results[DEPLOYMENT + name].get("action_si")
+            action = None if values is None else scene.action(dict(values))
+            return RepeatedSimulation(scene, action, _theta(plan, results), deployment.loss, seeds, seed)
+
+        return build
+
+    return [
+        StageDefinition(PREDICTION + name, build_for(name, scene)) for name, scene in _by_receiver(deployment).items()
+    ]
+
+
+def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
+    """Scenes by their receivers' names, or by their own where receivers share one."""
+    distinct = len({scene.receiver.name for scene in deployment.scenes}) == len(deployment.scenes)
+    return {scene.receiver.name if distinct else scene.name: scene for scene in deployment.scenes}
+
+
+def _theta(plan: CampaignPlan, results: Results) -> SimulationParameters:
+    """The calibrated θ; the plan's where nothing was calibrated."""
+    if CALIBRATION in results:
+        return SimulationParameters.model_validate(results[CALIBRATION]["theta"])
+    return plan.parameters
 
 
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:

@@ -162,7 +162,7 @@ class Tally:
                 predicted = ""
                 if pour.predicted is not None:
                     unit = unit_of_pour(self.plan, pour)
-                    predicted = unit.text(pour.predicted.mean, pour.predicted.deviation)
+                    predicted = unit.prediction(pour.predicted)
                 self.pour = PourTally(
                     pour.number,
                     event.stage,

@@ -195,14 +195,17 @@ def _rows(grid: Floats, table: Floats, at: Floats) -> Floats:
     return result
 
 
-def _drain(vessel: Vessel, volume: float, times: Floats, tilts: Floats, discharge: float) -> tuple[Floats, Floats]:
-    """Volume still in the vessel (T,) [m³] and outflow (T,) [m³/s], explicit in steps that never overshoot rest."""
+def _drain(
+    vessel: Vessel, volume: float, times: Floats, tilts: Floats, discharge: float
+) -> tuple[Floats, Floats, Floats]:
+    """Volume still in the vessel (T,) [m³], outflow (T,) [m³/s] and head (T,) [m], explicit in steps that never
+    overshoot rest."""
     table = _table(vessel)
     levels = _rows(table.tilts, table.levels, np.abs(tilts)).tolist()
     flows = _rows(table.tilts, table.flows, np.abs(tilts)).tolist()
     last_cell, last_flow = len(table.volumes) - 2, table.flows.shape[1] - 2
     per_volume, steps = (last_cell + 1) / vessel.capacity, np.diff(times, append=times[-1]).tolist()
-    inside, outflow = [0.0] * len(steps), [0.0] * len(steps)
+    inside, outflow, heads = [0.0] * len(steps), [0.0] * len(steps), [0.0] * len(steps)
     v = volume
     for k, dt in enumerate(steps):
         inside[k] = v
@@ -213,6 +216,7 @@ def _drain(vessel: Vessel, volume: float, times: Floats, tilts: Floats, discharg
         head = row[cell] + (place - cell) * slope
         if head <= 0.0:
             continue
+        heads[k] = head
         place = math.sqrt(min(head / table.head, 1.0)) * (last_flow + 1)
         at = min(int(place), last_flow)
         q = flows[k][at] + (place - at) * (flows[k][at + 1] - flows[k][at])
@@ -221,13 +225,56 @@ def _drain(vessel: Vessel, volume: float, times: Floats, tilts: Floats, discharg
         lost = min(discharge * q * dt, above)
         outflow[k] = lost / dt if dt > 0.0 else 0.0
         v -= lost
-    return np.array(inside), np.array(outflow)
+    return np.array(inside), np.array(outflow), np.array(heads)
+
+
+@dataclass(frozen=True)
+class LipFlow:
+    """What passes the lip during a pour, by the tilting-cup equation; all arrays (T,).
+
+    Attributes:
+        times: evenly spaced [s].
+        tilts: at those times [rad].
+        inside: volume still in the vessel [m³].
+        outflow: until the next time [m³/s].
+        heads: free surface above the spill point; 0 while nothing leaves [m].
+    """
+
+    times: Floats
+    tilts: Floats
+    inside: Floats
+    outflow: Floats
+    heads: Floats
+
+
+def lip_flow(vessel: Vessel, volume: float, times: Floats, tilts: Floats, *, discharge: float = DISCHARGE) -> LipFlow:
+    """The tilting-cup equation dV/dt = −q(h(V, θ(t)), θ(t)), in steps of about `TIME_STEP`.
+
+    Args:
+        vessel: the pourer, tipped towards +x.
+        volume: at the first time [m³].
+        times: increasing, shape (T,) [s].
+        tilts: at those times, linear in between, shape (T,) [rad].
+        discharge: coefficient C_d.
+
+    Raises:
+        ValueError: volume outside 0 … capacity, or times that don't increase.
+    """
+    _check_volume(vessel, volume)
+    times, tilts = np.asarray(times, dtype=float), np.asarray(tilts, dtype=float)
+    if times.ndim != 1 or times.shape != tilts.shape or len(times) < 2 or not np.all(np.diff(times) > 0.0):
+        raise ValueError(f"outflow: increasing times and as many tilts, got shapes {times.shape} and {tilts.shape}")
+    fine = np.linspace(times[0], times[-1], 1 + math.ceil((times[-1] - times[0]) / TIME_STEP))
+    if len(fine) < 2:
+        fine = times
+    at = np.interp(fine, times, tilts)
+    return LipFlow(fine, at, *_drain(vessel, volume, fine, at, discharge))
 
 
 def tilting_cup_outflow(
     vessel: Vessel, volume: float, times: Floats, tilts: Floats, *, discharge: float = DISCHARGE
 ) -> Floats:
-    """Poured volume over time of the tilting-cup equation dV/dt = −q(h(V, θ(t)), θ(t)).
+    """Poured volume over time of the tilting-cup equation, see `lip_flow`.
 
     An oracle for simulated pours and a free model of low fidelity.
 
@@ -244,15 +291,8 @@ def tilting_cup_outflow(
     Raises:
         ValueError: volume outside 0 … capacity, or times that don't increase.
     """
-    _check_volume(vessel, volume)
-    times, tilts = np.asarray(times, dtype=float), np.asarray(tilts, dtype=float)
-    if times.ndim != 1 or times.shape != tilts.shape or len(times) < 2 or not np.all(np.diff(times) > 0.0):
-        raise ValueError(f"outflow: increasing times and as many tilts, got shapes {times.shape} and {tilts.shape}")
-    fine = np.linspace(times[0], times[-1], 1 + math.ceil((times[-1] - times[0]) / TIME_STEP))
-    if len(fine) < 2:
-        fine = times
-    inside, _ = _drain(vessel, volume, fine, np.interp(fine, times, tilts), discharge)
-    return np.asarray(np.interp(times, fine, volume - inside), dtype=float)
+    flow = lip_flow(vessel, volume, times, tilts, discharge=discharge)
+    return np.asarray(np.interp(np.asarray(times, dtype=float), flow.times, volume - flow.inside), dtype=float)
 
 
 def predicted_end_of_flow(
@@ -282,6 +322,6 @@ def predicted_end_of_flow(
     if not 0.0 < t_end < math.inf:
         raise ValueError(f"end of flow: t_end must be above 0 s, got {t_end:g} s")
     times = np.linspace(0.0, t_end, int(np.clip(math.ceil(t_end / TIME_STEP), 100, 3000)) + 1)
-    _, flow = _drain(vessel, volume, times, np.asarray(tilt_of_time(times), dtype=float), DISCHARGE)
+    _, flow, _ = _drain(vessel, volume, times, np.asarray(tilt_of_time(times), dtype=float), DISCHARGE)
     flowing = np.flatnonzero(flow > flow_limit)
     return float(times[flowing[-1] + 1]) if flowing.size else 0.0  # the last time has no step after it, so no flow

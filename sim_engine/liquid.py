@@ -29,6 +29,11 @@ class Liquid(BaseModel):
         name: for people.
         mass: loaded mass [kg].
         density: [kg/m³].
+        surface_tension: against air [N/m].
+        dynamic_viscosity: [Pa s].
+
+    Tension and viscosity decide nothing in a simulation (its knobs are θ): from them and the planned flow follows what
+    a simulation can't tell, see `sim_engine.regimes`. The defaults are water's at 20 °C.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -36,6 +41,8 @@ class Liquid(BaseModel):
     name: str = "water"
     mass: float = Field(gt=0.0, le=20.0)
     density: float = Field(default=998.0, gt=100.0, lt=20_000.0)
+    surface_tension: float = Field(default=0.0728, ge=1e-3, le=1.0)
+    dynamic_viscosity: float = Field(default=1.0e-3, ge=1e-5, le=1e3)
 
     @property
     def volume(self) -> float:

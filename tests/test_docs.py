@@ -18,6 +18,12 @@ from orchestrator.commands import common
 from orchestrator.config.load import load_campaign, load_vessel
 from orchestrator.journal import Kind
 from orchestrator.unknown import OperatorNeededError
+from sim_engine import regimes
+from sim_engine.action import DEG, Action
+from sim_engine.lip import EDGE
+from sim_engine.liquid import Liquid
+from sim_engine.task import Scene
+from sim_engine.vessel.build import build_vessel
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "configs").rglob("*.md")])
@@ -152,6 +158,42 @@ def test_numbers_of_the_solver_are_the_code_s() -> None:
     assert (warm, "Three tenths of the multipliers are kept" in page) == (0.3, True)
     assert f"while the mean compression inside is above {100 * tolerance:g} %" in page
     assert (pull, "more than a tenth of a spacing in a step" in page) == (0.1, True)
+
+
+def test_limits_of_what_is_simulated_are_the_code_s() -> None:
+    for name, opening in (("user-guide", "## What is not simulated"), ("how-it-works", "## What is not covered")):
+        page = text_of(ROOT / "docs" / f"{name}.md").partition(opening)[2].partition("\n## ")[0]
+        rows = [row for row in page.splitlines() if row.startswith("|")]
+
+        def of(word: str, rows: list[str] = rows) -> str:
+            return next(row for row in rows if word in row.lower())
+
+        assert f"below {regimes.DRIBBLING_WEBER:g}" in of("dribbling"), name
+        assert f"below {regimes.WETTING_BOND:g}" in of("wetting of the lip" if name == "how-it-works" else "`wetting`")
+        assert f"below {regimes.VISCOUS_REYNOLDS:g}" in of("viscous liquids" if name == "how-it-works" else "`viscous`")
+        assert f"{regimes.PARTICLES_ACROSS:g} particles" in of("stream that is" if name == "how-it-works" else "thin_")
+        radius = (
+            f"{regimes.AIRTIGHT_BOND:g}" if name == "how-it-works" else f"{regimes.AIRTIGHT_BOND**0.5:.2f} capillary"
+        )
+        assert radius in of("airtight")
+        assert f"{100 * EDGE:g} % of what" in page
+
+
+def test_numbers_of_a_pour_on_the_page_are_those_of_the_code() -> None:
+    page = " ".join(text_of(ROOT / "docs" / "how-it-works.md").split())
+    beaker, tumbler = (load_vessel(ROOT / "configs" / "vessels" / f"{name}.yaml") for name in ("beaker", "tumbler"))
+    scene = Scene("page", beaker, tumbler, Liquid(mass=0.1996))
+
+    def told(speed: float, tilt: float) -> regimes.Regimes:
+        action = Action(angular_velocity=speed * DEG, max_angle=tilt * DEG, x_offset=0.1, height=0.1)
+        return regimes.regimes(scene, action, build_vessel(beaker), build_vessel(tumbler), spacing=1e-3)
+
+    lip = told(30, 120).lip
+    assert lip is not None
+    re, we, bo = lip.reynolds, lip.weber, lip.bond
+    assert f"Re {re.smallest:.0f} … {re.largest:.0f}, We {we.smallest:.1f} … {we.largest:.1f}" in page
+    assert f"Bo {bo.smallest:.1f} … {bo.largest:.1f}: inertia and gravity rule" in page
+    assert f"At 15 °/s to 70°, {100 * told(15, 70).not_covered[0].share:.0f} % of what is poured may dribble" in page
 
 
 def test_quickstart_is_what_the_guide_says() -> None:

@@ -14,18 +14,23 @@ ANSWER_DEADLINE = 30.0
 
 
 class DeviceBalance:
-    """`actors.balance.protocol.Balance` over a `Device` that holds a driver such as `VirtualBalance`.
+    """`actors.balance.protocol.Balance` over a `Device` that holds a `SerialBalance` or a `VirtualBalance`.
 
     Args:
         device: of the driver.
         time_scale: bench seconds per wall second, for deadlines; 0 waits for nothing.
+        longest_call: wall time that the driver allows itself [s], see `SerialBalanceSpec.longest_call`; None for a
+            `VirtualBalance`.
     """
 
-    def __init__(self, device: Device, time_scale: float) -> None:
+    def __init__(self, device: Device, time_scale: float = 1.0, *, longest_call: float | None = None) -> None:
         self.device = device
         self._scale = time_scale
+        self._longest_call = longest_call
 
     def _deadline(self, bench_time: float) -> float:
+        if self._longest_call is not None:
+            return ANSWER_DEADLINE + self._longest_call
         return ANSWER_DEADLINE + (2.0 * bench_time / self._scale if self._scale > 0.0 else 0.0)
 
     async def tare(self) -> None:
@@ -48,6 +53,32 @@ class DeviceBalance:
             yield await self.read()
             await asyncio.sleep(interval)
 
+    async def connect(self) -> str:
+        """Balances on serial lines only: open the port, find out what is there; says what was found."""
+        said: str = await self.device.call("connect", deadline=self._deadline(PATIENCE))
+        return said
+
+    async def zero(self) -> None:
+        """Balances on serial lines only: set the zero of the empty balance."""
+        await self.device.call("zero", deadline=self._deadline(PATIENCE))
+
+    async def keep_reference(self) -> None:
+        """Balances on serial lines only: after a lost connection a person confirms that the tare still holds."""
+        await self.device.call("keep_reference", deadline=ANSWER_DEADLINE, urgent=True)
+
+    async def statistics(self) -> dict[str, int]:
+        """Balances on serial lines only: what the line has seen."""
+        counts: dict[str, int] = await self.device.call("statistics", deadline=ANSWER_DEADLINE, urgent=True)
+        return counts
+
+    async def resume(self) -> None:
+        """Balances on serial lines only: let waits last again after `interrupt`."""
+        await self.device.call("resume", deadline=ANSWER_DEADLINE, urgent=True)
+
+    async def release(self) -> None:
+        """Balances on serial lines only: close the port."""
+        await self.device.call("close", deadline=ANSWER_DEADLINE)
+
     async def prepare(self, seed: tuple[int, ...]) -> None:
         """Virtual balances only: empty tray, bench time 0, noise of a new pour."""
         await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
@@ -61,5 +92,5 @@ class DeviceBalance:
         await self.device.call("pass_time", seconds, deadline=self._deadline(seconds))
 
     async def interrupt(self) -> None:
-        """Virtual balances only: end the wait that is under way."""
+        """End the wait that is under way."""
         await self.device.call("interrupt", deadline=ANSWER_DEADLINE, urgent=True)

@@ -12,14 +12,21 @@ class Weight:
     """A reading.
 
     Attributes:
-        mass: net of the tare [kg].
+        mass: net of the tare [kg]; nan where the display shows none (`read` only).
         stable: the balance vouches for it; only stable weights count as measurements.
-        time: bench time of the reading [s].
+        time: of the reading [s]: bench time of a virtual balance in this process, `time.monotonic` of one on a serial
+            line.
+        status: 'stable', 'unstable', 'over range', 'under range', 'busy', 'error', 'silent' or 'lost'.
+        step: of the display [kg]; 0 where it is not known.
+        shown: as the balance sent it, e.g. '12.34 g'.
     """
 
     mass: float
     stable: bool
     time: float
+    status: str = ""
+    step: float = 0.0
+    shown: str = ""
 
 
 class Balance(Protocol):

@@ -3,12 +3,43 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import socket
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from actors.cluster.versions import Versions, versions
 from actors.protocols import SimulationResult
+from actors.simulation.parcel import MeshParcel, unpack
 from actors.simulation.worker import SimulationWorker, Simulator
 from sim_engine.task import PourTask
+
+CONTROL = "control"
+"""Concurrency group of calls that don't queue behind a job."""
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """What a simulator's process says of itself when it is up.
+
+    Attributes:
+        pid: process id.
+        host: the machine's name and address, for people.
+        versions: of what decides its results.
+    """
+
+    pid: int
+    host: str
+    versions: Versions
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A result, and how long the process worked for it [s]."""
+
+    result: SimulationResult
+    seconds: float
 
 
 class SimulatorProcess:
@@ -17,30 +48,52 @@ class SimulatorProcess:
 
     def __init__(self, make: Callable[[], Simulator]) -> None:
         self._worker = SimulationWorker(make)
+        self._recalled: set[int] = set()
 
-    def simulate(self, task: PourTask) -> SimulationResult:
-        """See `SimulationWorker.simulate`; asks Ray whether the caller has cancelled."""
+    def greet(self) -> Greeting:
+        """Answers as soon as the process is up."""
         import ray
 
-        return self._worker.simulate(task, ray.get_runtime_context().is_canceled)
+        return Greeting(os.getpid(), f"{socket.gethostname()} ({ray.util.get_node_ip_address()})", versions())
 
-    def pid(self) -> int:
-        """Process id."""
-        return os.getpid()
+    def simulate(self, number: int, task: PourTask, *parcels: MeshParcel) -> Answer:
+        """See `SimulationWorker.simulate`.
+
+        Args:
+            number: by which the job is recalled; no two have the same.
+            task: as `Packer.pack` made it.
+            parcels: its meshes.
+        """
+        begin = time.monotonic()
+        try:
+            result = self._worker.simulate(unpack(task, parcels), lambda: number in self._recalled)
+        finally:
+            self._recalled.discard(number)
+        return Answer(result, time.monotonic() - begin)
+
+    def recall(self, number: int) -> None:
+        """Nobody waits for that job any more: it ends between two steps, or never begins.
+
+        Called beside a running job. Ray's own cancelling answers the caller at once, but lets a job that waited behind
+        another one run to its end.
+        """
+        self._recalled.add(number)
 
     def close(self) -> None:
         """Write the compiled kernels; a killed process would lose them, and the next one compile again."""
         self._worker.close()
 
 
-def simulator_actor(make: Callable[[], Simulator], *, cpus: float) -> Any:
+def simulator_actor(make: Callable[[], Simulator], *, cpus: float, placement: Mapping[str, Any]) -> Any:
     """Start an actor; returns its handle at once, before the process is up.
 
     Args:
         make: makes the simulator, inside the actor.
         cpus: cores that Ray counts for it.
+        placement: Ray's options that say where it runs.
     """
     import ray
 
-    cls = ray.remote(num_cpus=cpus, max_restarts=0, max_task_retries=0)(SimulatorProcess)
-    return cls.remote(make)
+    groups = {CONTROL: 1}
+    options = {"num_cpus": cpus, "max_restarts": 0, "max_task_retries": 0, "concurrency_groups": groups, **placement}
+    return ray.remote(**options)(SimulatorProcess).remote(make)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from actors.protocols import Frames, InvalidActionError, SimulationError, SimulationResult
-from actors.simulation.actor import simulator_actor
+from actors.cluster.versions import Versions
+from actors.protocols import InvalidActionError, LaboratoryError, SimulationError, SimulationResult
+from actors.simulation.actor import CONTROL, Answer, simulator_actor
+from actors.simulation.crew import Crew
+from actors.simulation.member import Job, Member, Sent
+from actors.simulation.parcel import Packer
+from actors.simulation.results import own
 from actors.simulation.statistics import Account, PoolStatistics
 from actors.simulation.worker import Simulator, pour_simulator
 from sim_engine.task import PourTask
@@ -23,7 +28,7 @@ DEADLINE = 1800.0
 """Longest time for one job on one member [s]: half an hour means dead, not slow."""
 
 START_DEADLINE = 120.0
-"""Longest time for a member's process to start [s]."""
+"""Longest time that jobs wait while no member is up [s]."""
 
 DRAIN_DEADLINE = 10.0
 """Time a cancelled job has to stop [s]; then its member is replaced."""
@@ -31,21 +36,16 @@ DRAIN_DEADLINE = 10.0
 CLOSE_DEADLINE = 10.0
 """Time a member has to write its kernels at the end [s]."""
 
-
-@dataclasses.dataclass(eq=False)
-class _Member:
-    """A simulator actor. A number is used once, so that the dead are not taken for the living."""
-
-    number: int
-    actor: Any
-    up: asyncio.Future[Any]
+AHEAD = 1
+"""Jobs that wait at a busy member, so that it begins the next one without asking."""
 
 
 class RaySimulatorPool:
-    """`SimulatorPool` over Ray actors. Jobs wait for the next idle member in the order in which they came.
+    """`SimulatorPool` over Ray actors. Jobs begin in the order in which they came, as far as members' deaths allow.
 
-    Simulations are idempotent, so a job whose member died is done again by another one. Needs a running Ray
-    (`actors.ray_runtime`), and is made inside an event loop.
+    Each busy member has the next job with it already. Where a member runs out of work while another one still has a
+    job waiting, the job is taken back and given to the idle one. Simulations are idempotent, so a job whose member
+    died is done again by another one. Needs a running Ray (`actors.ray_runtime`), and is made inside an event loop.
 
     Args:
         size: number of members.
@@ -53,6 +53,9 @@ class RaySimulatorPool:
         retries: how often a job is tried again after a death.
         deadline: longest time for one job [s].
         cpus: cores that Ray counts for a member.
+        placement: Ray's options that say where members run.
+        expected: versions that members must have; None where they can't differ.
+        tell: told of losses, in words for people.
     """
 
     def __init__(
@@ -63,169 +66,237 @@ class RaySimulatorPool:
         retries: int = RETRIES,
         deadline: float = DEADLINE,
         cpus: float = 1.0,
+        placement: Mapping[str, Any] | None = None,
+        expected: Versions | None = None,
+        tell: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._make, self._retries, self._deadline, self._cpus = make, retries, deadline, cpus
-        self._idle: asyncio.Queue[_Member] = asyncio.Queue()
-        self._members: dict[int, _Member] = {}
-        self._numbers = 0
-        self._draining: set[asyncio.Task[None]] = set()
+        self._retries, self._deadline = retries, deadline
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[Job] = deque()
+        self._sendings = 0
+        self._packer = Packer()
+        self._meshes: dict[Path, Any] = {}
         self._account = Account(size)
+        self._hopeless: asyncio.TimerHandle | None = None
         self._closed = False
-        for _ in range(size):
-            self._add()
+        start = partial(simulator_actor, make, cpus=cpus, placement=placement or {})
+        self._crew = Crew(size, start, expected=expected, changed=self._dispatch, tell=tell)
 
     @property
     def size(self) -> int:
-        """Number of members."""
-        return self._account.size
+        """Number of members, those included that are waited for."""
+        return self._crew.size
 
     def statistics(self) -> PoolStatistics:
         """What the pool has done so far."""
         return self._account.statistics()
 
+    def grow(self, size: int) -> None:
+        """Have at least so many members from now on."""
+        self._crew.grow(size)
+        self._account.resize(self._crew.size)
+
     async def pids(self) -> list[int]:
-        """Process ids of the members; waits for those that are starting or working."""
-        refs = [member.actor.pid.remote() for member in self._members.values()]
-        return list(await asyncio.gather(*(asyncio.wrap_future(ref.future()) for ref in refs)))
+        """Process ids of the members; waits for those that are starting."""
+        return [greeting.pid for greeting in await self._crew.greeted()]
 
     async def simulate(self, task: PourTask) -> SimulationResult:
-        """See `SimulatorPool.simulate`."""
-        for _ in range(1 + self._retries):
-            if self._closed:
-                raise SimulationError("the pool of simulators is closed")
-            member = await self._idle.get()
-            self._account.begin(member.number)
-            result = await self._run(member, task)
-            if result is not None:
-                return result
-        raise SimulationError(
-            f"{1 + self._retries} simulators died over this job; they may lack memory (particles: "
-            f"{task.parameters.particles})"
-        )
+        """See `SimulatorPool.simulate`.
 
-    async def _run(self, member: _Member, task: PourTask) -> SimulationResult | None:
-        """One attempt; None if the member died."""
-        import ray
+        Raises:
+            LaboratoryError: no simulator is up, and none comes up.
+        """
+        if self._closed:
+            raise SimulationError("the pool of simulators is closed")
+        packed, parcels = self._packer.pack(task)
+        for parcel in parcels:
+            if parcel.key not in self._meshes:
+                import ray
 
-        ref = member.actor.simulate.remote(task)
-        answer = asyncio.wrap_future(ref.future())
+                self._meshes[parcel.key] = ray.put(parcel)
+        job = Job(packed, [self._meshes[parcel.key] for parcel in parcels], self._loop.create_future())
+        self._waiting.append(job)
+        self._dispatch()
         try:
-            waiting = {answer, member.up}
-            await asyncio.wait(waiting, timeout=START_DEADLINE, return_when=asyncio.FIRST_COMPLETED)
-            done, _ = await asyncio.wait({answer}, timeout=self._deadline if member.up.done() else 0.0)
+            return await job.future
         except asyncio.CancelledError:
-            # The member is idle again when it has noticed, not before: the next job must not wait behind a dead one.
-            self._account.cancelled += 1
-            ray.cancel(ref)
-            self._drain(member, answer)
+            self._give_up(job)
             raise
-        if not done:
-            self._replace(member)
-            answer.add_done_callback(_look_away)
-            if not member.up.done():
-                raise SimulationError(f"a simulator's process did not start within {START_DEADLINE:g} s")
-            raise SimulationError(f"no result within {self._deadline:g} s; its simulator was replaced")
-        try:
-            result: SimulationResult = answer.result()
-        except ray.exceptions.RayActorError as error:
-            self._replace(member)
-            if "error raised in its creation task" in str(error):
-                raise SimulationError(f"a simulator's process does not start: {_last_line(error)}") from error
-            return None
-        except ray.exceptions.RayTaskError as error:
-            self._release(member)
-            if isinstance(error.cause, InvalidActionError | SimulationError):
-                raise error.cause from None
-            raise SimulationError(f"the simulator failed: {error.cause!r}") from error
-        except Exception as error:
-            self._release(member)
-            raise SimulationError(f"the simulator's answer was lost: {error}") from error
-        self._release(member)
-        return _own(result)
 
-    def _add(self) -> None:
-        self._numbers += 1
-        actor = simulator_actor(self._make, cpus=self._cpus)
-        up = asyncio.wrap_future(actor.pid.remote().future())
-        up.add_done_callback(_look_away)
-        member = _Member(self._numbers, actor, up)
-        self._members[member.number] = member
-        self._idle.put_nowait(member)
+    def _dispatch(self) -> None:
+        """Give waiting jobs to members; where there are none, share out those that wait at busy members."""
+        while self._waiting and (member := self._next_member()) is not None:
+            self._send(self._waiting.popleft(), member)
+        if not self._waiting:
+            self._level()
+        self._keep_hope()
 
-    def _release(self, member: _Member) -> None:
-        self._account.jobs += 1
-        self._account.end(member.number)
-        self._idle.put_nowait(member)
+    def _next_member(self) -> Member | None:
+        """The one that will come to another job first, as far as anybody knows."""
+        free = [member for member in self._crew.up if len(member.sent) <= AHEAD]
+        return min(free, key=lambda member: (len(member.sent), member.begun), default=None)
 
-    def _replace(self, member: _Member) -> None:
-        """End a member for good; a new one takes its place."""
+    def _level(self) -> None:
+        members = self._crew.up
+        for idle in [member for member in members if not member.sent]:
+            busy = next((member for member in members if member.spare is not None), None)
+            if busy is None or (spare := busy.spare) is None:
+                return
+            _recall(busy, spare)
+            self._send(spare.job, idle)
+
+    def _send(self, job: Job, member: Member) -> None:
+        self._sendings += 1
+        sent = Sent(job, self._sendings)
+        ref = member.actor.simulate.remote(sent.number, job.task, *job.meshes)
+        member.sent.append(sent)
+        if len(member.sent) == 1:
+            self._begin(member)
+        answer = asyncio.wrap_future(ref.future())
+        answer.add_done_callback(partial(self._answered, member, sent))
+
+    def _begin(self, member: Member) -> None:
+        """A member's first job is under way."""
+        self._account.begin(member.number)
+        member.begun = self._loop.time()
+        member.overdue = self._loop.call_later(self._deadline, self._overdue, member)
+
+    def _end(self, member: Member, worked: float | None = None) -> None:
+        member.drop_timer()
+        self._account.end(member.number, worked)
+
+    def _answered(self, member: Member, sent: Sent, answer: asyncio.Future[Answer]) -> None:
         import ray
 
+        error = answer.exception()
+        if member not in self._crew:
+            return  # its jobs are with others
+        if isinstance(error, ray.exceptions.RayActorError):
+            self._lose(member)
+            return
+        was_first = member.sent[0] is sent
+        member.sent.remove(sent)
+        if was_first:
+            self._end(member, None if error is not None else answer.result().seconds)
+            if member.sent:
+                self._begin(member)
+        if not sent.recalled:
+            self._account.jobs += 1
+            _settle(sent.job, answer)
+        self._dispatch()
+
+    def _overdue(self, member: Member) -> None:
+        """The first job has taken too long."""
+        sent = member.sent[0]
+        if not sent.recalled:
+            sent.recalled = True
+            sent.job.fail(SimulationError(f"no result within {self._deadline:g} s; its simulator was replaced"))
+        self._lose(member)
+
+    def _give_up(self, job: Job) -> None:
+        """Nobody waits for it any more."""
+        self._account.cancelled += 1
+        if job in self._waiting:
+            self._waiting.remove(job)
+            return
+        for member in self._crew.up:
+            for sent in member.sent:
+                if sent.job is job and not sent.recalled:
+                    _recall(member, sent)
+                    self._loop.call_later(DRAIN_DEADLINE, self._still_draining, member, sent)
+
+    def _still_draining(self, member: Member, sent: Sent) -> None:
+        if member in self._crew and member.sent and member.sent[0] is sent:
+            self._lose(member)
+
+    def _lose(self, member: Member) -> None:
+        """A member is gone, or has to go: its jobs are for others. The one it was at has cost a life."""
         self._account.deaths += 1
-        self._account.end(member.number)
-        del self._members[member.number]
-        with contextlib.suppress(Exception):
-            ray.kill(member.actor)
-        if not self._closed:
-            self._add()
+        self._end(member)
+        orphans = [sent.job for sent in member.sent if not sent.recalled]
+        if member.sent and not member.sent[0].recalled:
+            first = orphans[0]
+            first.deaths += 1
+            if first.deaths > self._retries:
+                particles = first.task.parameters.particles
+                first.fail(
+                    SimulationError(
+                        f"{first.deaths} simulators died over this job; they may lack memory (particles: {particles})"
+                    )
+                )
+                del orphans[0]
+        self._waiting.extendleft(reversed(orphans))
+        self._crew.lose(member, len(orphans))
+        self._dispatch()
 
-    def _drain(self, member: _Member, answer: asyncio.Future[Any]) -> None:
-        task = asyncio.get_running_loop().create_task(self._drained(member, answer))
-        self._draining.add(task)
-        task.add_done_callback(self._draining.discard)
+    def _keep_hope(self) -> None:
+        """Jobs that wait while no member is up don't wait for ever, and not at all if none is even starting."""
+        if not self._waiting or self._crew.up:
+            if self._hopeless is not None:
+                self._hopeless.cancel()
+                self._hopeless = None
+        elif self._crew.hopeless:
+            self._fail_waiting()
+        elif self._hopeless is None:
+            self._hopeless = self._loop.call_later(START_DEADLINE, self._fail_waiting)
 
-    async def _drained(self, member: _Member, answer: asyncio.Future[Any]) -> None:
-        import ray
+    def _fail_waiting(self) -> None:
+        """This is the laboratory's fault, and says nothing about any simulation."""
+        self._hopeless = None
+        reason = self._crew.problem or (
+            f"no simulator was up for {START_DEADLINE:g} s; is there a free core, and memory, for one?"
+        )
+        while self._waiting:
+            self._waiting.popleft().fail(LaboratoryError(reason))
 
-        done, _ = await asyncio.wait({answer}, timeout=DRAIN_DEADLINE)
-        if not done:
-            answer.add_done_callback(_look_away)
-        if not done or isinstance(answer.exception(), ray.exceptions.RayActorError):
-            self._replace(member)
-        else:
-            self._account.end(member.number)
-            self._idle.put_nowait(member)
+    def abandon(self, error: LaboratoryError) -> None:
+        """All jobs fail: their simulators can't come back.
+
+        Args:
+            error: why.
+        """
+        for member in self._crew.up:
+            self._waiting.extend(sent.job for sent in member.sent if not sent.recalled)
+            for sent in member.sent:
+                sent.recalled = True
+        while self._waiting:
+            self._waiting.popleft().fail(error)
 
     async def close(self) -> None:
-        """Let cancelled jobs end, write the members' compiled kernels, and end their processes."""
-        import ray
-
+        """Write the members' compiled kernels, and end their processes; jobs that are left have no result."""
+        if self._closed:
+            return
         self._closed = True
-        if self._draining:
-            await asyncio.wait(set(self._draining), timeout=DRAIN_DEADLINE + 1.0)
-        members, self._members = list(self._members.values()), {}
-        closing = {asyncio.ensure_future(asyncio.wrap_future(m.actor.close.remote().future())) for m in members}
-        if closing:
-            done, late = await asyncio.wait(closing, timeout=CLOSE_DEADLINE)
-            for answer in done:
-                _look_away(answer)
-            for answer in late:
-                answer.add_done_callback(_look_away)
-        for member in members:
-            with contextlib.suppress(Exception):
-                ray.kill(member.actor)
+        if self._hopeless is not None:
+            self._hopeless.cancel()
+        busy = [member for member in self._crew.up if member.sent]
+        for member in busy:
+            member.drop_timer()
+            for sent in [sent for sent in member.sent if not sent.recalled]:
+                _recall(member, sent)
+                self._waiting.append(sent.job)
+        while self._waiting:
+            self._waiting.popleft().fail(SimulationError("the pool of simulators is closed"))
+        await self._crew.close(CLOSE_DEADLINE + (DRAIN_DEADLINE if busy else 0.0))
 
 
-def _look_away(answer: asyncio.Future[Any]) -> None:
-    """Take note of a late answer, so that asyncio does not complain that nobody did."""
-    if not answer.cancelled():
-        answer.exception()
+def _recall(member: Member, sent: Sent) -> None:
+    """A job that has not begun never will; one that has begun notices between its steps."""
+    sent.recalled = True
+    with contextlib.suppress(Exception):
+        member.actor.recall.options(concurrency_group=CONTROL).remote(sent.number)
 
 
-def _last_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else repr(error)
+def _settle(job: Job, answer: asyncio.Future[Answer]) -> None:
+    """Give a job its result, or the reason why there is none."""
+    import ray
 
-
-def _own(result: SimulationResult) -> SimulationResult:
-    """Copies of the frames: those that came through Ray's object store would hold its memory as long as they live."""
-    if result.frames is None:
-        return result
-    frames = result.frames
-    copied = Frames(
-        times=np.array(frames.times),
-        positions=[np.array(p) for p in frames.positions],
-        states=[np.array(s) for s in frames.states],
-        pourer_poses=np.array(frames.pourer_poses),
-    )
-    return dataclasses.replace(result, frames=copied)
+    error = answer.exception()
+    if error is None:
+        if not job.future.done():
+            job.future.set_result(own(answer.result().result))
+    elif isinstance(error, ray.exceptions.RayTaskError):
+        known = isinstance(error.cause, InvalidActionError | SimulationError)
+        job.fail(error.cause if known else SimulationError(f"the simulator failed: {error.cause!r}"))
+    else:
+        job.fail(SimulationError(f"the simulator's answer was lost: {error}"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -10,6 +11,10 @@ import numpy as np
 from actors.protocols import Frames, InvalidActionError, SimulationError, SimulationResult
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.task import PourTask
+
+LONG_FIRST_JOB = 5.0
+"""CPU seconds of a process' first job above which its kernels may have been compiled for it. Loaded from the cache they
+cost one second; compiled, a dozen."""
 
 
 class JobCancelledError(Exception):
@@ -38,13 +43,22 @@ def pour_simulator() -> Simulator:
 class SimulationWorker:
     """Runs jobs one after the other on one simulator.
 
+    Kernels reach the cache when a simulator is closed. A process may be killed before that, and the next one on its
+    machine would compile them again: so after a long first job the simulator is closed once and made anew with the
+    next job, which costs a second.
+
     Args:
         make: makes the simulator, with the first job: a process that is never used compiles nothing.
+        long_first_job: CPU seconds from which a first job counts as long.
     """
 
-    def __init__(self, make: Callable[[], Simulator] = pour_simulator) -> None:
+    def __init__(
+        self, make: Callable[[], Simulator] = pour_simulator, *, long_first_job: float = LONG_FIRST_JOB
+    ) -> None:
         self._make = make
         self._simulator: Simulator | None = None
+        self._long_first_job = long_first_job
+        self._is_first = True
 
     def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulationResult:
         """Run one pour.
@@ -58,6 +72,9 @@ class SimulationWorker:
             JobCancelledError: `cancelled` said so.
             SimulationError: anything else that the engine raises.
         """
+        if cancelled():
+            raise JobCancelledError  # while it waited behind another job
+        begun = time.process_time()
         try:
             if self._simulator is None:
                 self._simulator = self._make()
@@ -68,7 +85,11 @@ class SimulationWorker:
             raise JobCancelledError from None
         except Exception as error:
             raise SimulationError(f"the simulator failed: {type(error).__name__}: {error}") from error
-        return SimulationResult(run.outcome, _frames(run.frames))
+        result = SimulationResult(run.outcome, _frames(run.frames))
+        if self._is_first and time.process_time() - begun > self._long_first_job:
+            self.close()
+        self._is_first = False
+        return result
 
     def close(self) -> None:
         """End the simulator, if there is one."""

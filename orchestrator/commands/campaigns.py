@@ -12,6 +12,7 @@ from orchestrator.commands.common import (
     Finished,
     RefusalError,
     check_campaign_can_run,
+    check_laboratory_answers,
     print_json,
     read_campaign,
     run_in_front_of_people,
@@ -85,16 +86,19 @@ def plan_pour(
     receiver: Path | None,
     iterations: int | None,
     seed: int | None,
+    seeds: int,
     in_process: bool,
     as_json: bool,
 ) -> None:
-    """D1 for one receiver: the action that the calibrated simulator would pour with."""
-    from orchestrator.stages import deployment_stages
+    """D1 for one receiver: the action that the calibrated simulator would pour with, and what to expect of it."""
+    from orchestrator.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
 
     plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
     check_campaign_can_run(plan)
     assert plan.deployment is not None
-    stages = deployment_stages(plan, plan.deployment)
+    planning = deployment_stages(plan, plan.deployment)
+    stages = [*planning, *prediction_stages(plan, plan.deployment, seeds)]
+    check_laboratory_answers(plan, stages, in_process=in_process)
     directory = _run_directory(plan, resume=False, run_id=None)
     if parameters is None:
         say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
@@ -102,19 +106,25 @@ def plan_pour(
         plan, directory, resume=False, stages=stages, in_process=in_process, again=f"decant plan {path} (plans anew)"
     )
     answers = []
-    for stage in stages:
+    for stage in planning:
         result = finished.result.results[stage.name]
         if "action" not in result:
             raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
+        receiver_name = stage.name.removeprefix(DEPLOYMENT)
+        repeated = finished.result.results[PREDICTION + receiver_name]["over_seeds"]
+        spillage = repeated.get("spillage", {})
         answers.append(
             {
-                "receiver": stage.name.partition(":")[2],
+                "receiver": receiver_name,
                 "action": result["action"],
                 "action_si": result["action_si"],
                 "predicted_loss": result["predicted_loss"],
-                "predicted_spillage": result["predicted_spillage"],
+                "predicted_spillage": spillage.get("mean"),
+                "predicted_spillage_deviation": spillage.get("deviation"),
                 "predicted_deviation": result["predicted_deviation"],
+                "prediction": repeated,
                 "loss": plan.deployment.loss.name,
+                "not_covered": finished.summary["receivers"][result["scene"]]["not_covered"],
             }
         )
     theta = plan.parameters.model_dump()
@@ -178,8 +188,11 @@ def _run(
     in_process: bool,
     stages: list[StageDefinition] | None,
 ) -> Finished:
+    from orchestrator.stages import stages_of
+
     if answer is not None and not resume:
         raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
+    check_laboratory_answers(plan, stages_of(plan) if stages is None else stages, in_process=in_process)
     directory = _run_directory(plan, resume=resume, run_id=run_id)
     again = f"decant {verb} {path} --resume --run {directory.name}"
     finished = run_in_front_of_people(

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 if TYPE_CHECKING:
     from actors.protocols import Laboratory
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
     from orchestrator.unknown import AskOperator
+
+W = TypeVar("W")
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 """Exit codes beside 0 (done) and 3 (a person has to answer; `RunError.exit_code`)."""
@@ -80,6 +82,30 @@ def check_campaign_can_run(plan: CampaignPlan) -> None:
     problems = check_campaign(plan)
     if problems:
         raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+
+
+def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool) -> None:
+    """What the laboratory needs from other machines, before anything starts.
+
+    Args:
+        plan: with its laboratory.
+        stages: that are to run.
+        in_process: everything in this process: nothing is needed.
+
+    Raises:
+        RefusalError: with what is missing, exit code 2.
+    """
+    from actors.laboratory import check_laboratory
+    from actors.protocols import LaboratoryError
+
+    if in_process or plan.laboratory.in_process:
+        return
+    if plan.laboratory.ray is not None:
+        say(f"looking at the Ray cluster at {plan.laboratory.ray.address} …")
+    try:
+        check_laboratory(plan.laboratory, need_bench=any(stage.pours for stage in stages))
+    except LaboratoryError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 def check_output(path: Path | None, option: str, suffix: str) -> None:
@@ -165,6 +191,8 @@ def run_in_front_of_people(
     chosen = tuple(stages_of(plan) if stages is None else stages)
     spec = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
     say(f"run {directory}  ({spec.mode} bench)" if any(s.pours for s in chosen) else f"run {directory}")
+    if not resume:
+        _warn_of_what_is_not_simulated(plan)
     monitor: RerunMonitor | None = None
     try:
         laboratory = open_laboratory(spec, need_bench=any(stage.pours for stage in chosen))
@@ -207,7 +235,26 @@ def _way_on(directory: Path, again: str) -> str:
     return f"\nwhat is done so far is kept: {again}" if begun else "\nnothing had begun"
 
 
+def _warn_of_what_is_not_simulated(plan: CampaignPlan) -> None:
+    """Once at the beginning, of all action spaces."""
+    from orchestrator.report import regimes
+    from orchestrator.report.names import receiver_names
+
+    for line in regimes.lines(_worked_out(regimes.campaign_warnings, plan), receiver_names(plan)):
+        say(line)
+
+
+def _worked_out(work: Callable[..., dict[str, list[W]]], *args: Any) -> dict[str, list[W]]:
+    """Warnings, or none if they can't be worked out: that is no reason to stop anything."""
+    try:
+        return work(*args)
+    except (ValueError, OSError) as error:
+        say(f"note: whether something is not simulated could not be worked out: {error}")
+        return {}
+
+
 def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finished:
+    from orchestrator.report import regimes
     from orchestrator.report.campaign import draw_figures
     from orchestrator.report.summary import print_summary, summarise, write_summary
 
@@ -228,6 +275,8 @@ def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finishe
         recording=recording,
         dropped_events=monitor.dropped if monitor is not None else 0,
         baselines=baselines,
+        not_covered=_worked_out(regimes.campaign_warnings, plan),
+        best_not_covered=_worked_out(regimes.best_action_warnings, plan, result.results),
         totals={
             "simulations": result.simulations,
             "pours": result.pours,

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from sim_engine.validation.suite import Case
 
 
@@ -20,6 +22,7 @@ def physics(
         RefusalError: a case is unknown, the page can't be written there (exit code 2), or a criterion is not met (1).
     """
     from rich.console import Console
+    from rich.progress import Progress
 
     from orchestrator.report import physics as report
     from orchestrator.report.summary import PLAIN_WIDTH
@@ -36,13 +39,18 @@ def physics(
     fingerprint = suite.solver_fingerprint()
     records: dict[str, dict[str, Any]] = {}
     simulator = PourSimulator()
-    effort = suite.Effort(full, pours)
     try:
         for case in cases:
             say(f"{case.name}: {case.title} …")
             image = None
-            with stdout_for_results():
-                result = case.run(simulator, effort)
+            # a bar that has not begun stays invisible: short cases tell nothing of their progress
+            with stdout_for_results(), Progress(console=Console(stderr=True), transient=True) as bars:
+                bar = bars.add_task(case.name, total=None, visible=False)
+
+                def tell(done: int, total: int, bars: Progress = bars, bar: TaskID = bar) -> None:
+                    bars.update(bar, completed=done, total=total, visible=True)
+
+                result = case.run(simulator, suite.Effort(full, pours, tell))
                 if write is not None and result.figure is not None:
                     image = report.draw(result.figure, write / report.IMAGES / f"validation-{case.name}.png")
             records[case.name] = report.case_record(case, result, image, fingerprint)
@@ -65,7 +73,7 @@ def physics(
     failed = sum(not m["passed"] for m in judged)
     if failed:
         raise RefusalError(f"{failed} of {len(judged)} criteria are not met", FAILED)
-    say(f"all {len(judged)} criteria are met")
+    say(f"all {len(judged)} criteria are met" if judged else "nothing was judged")
 
 
 def _chosen(names: list[str]) -> list[Case]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +22,12 @@ from orchestrator.commands.common import (
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
+    from sim_engine.outcome import PourOutcome
+    from sim_engine.pour import PourSimulator, SimulationRun
+    from sim_engine.regimes import Regimes
     from sim_engine.space import Space
-    from sim_engine.task import Scene
+    from sim_engine.spread import Spread
+    from sim_engine.task import PourTask, Scene
 
 
 def simulate(
@@ -32,19 +37,19 @@ def simulate(
     parameters: Path | None,
     receiver: Path | None,
     seed: int,
+    seeds: int,
     scene_name: str | None,
     as_json: bool,
     rrd: Path | None,
     png: Path | None,
 ) -> None:
-    """One pour in the simulator of this process."""
-    from rich.console import Console
-
+    """One pour in the simulator of this process, with several seeds: their mean and spread are the prediction."""
     from orchestrator.config.assignments import assigned_action
     from orchestrator.config.check import check_vessels
     from orchestrator.config.errors import ConfigError, shown_path
     from orchestrator.config.load import load_parameters, load_vessel
     from sim_engine.pour import InvalidSceneError, PourSimulator
+    from sim_engine.spread import spreads
     from sim_engine.task import PourTask
 
     plan = read_campaign(path)
@@ -65,35 +70,85 @@ def simulate(
     problems = check_vessels(scene)
     if problems:
         raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
-    task = PourTask(scene, action, theta, seed, record_rate=20.0 if rrd or png else 0.0)
+    record_rate = 20.0 if rrd or png else 0.0
+    tasks = [PourTask(scene, action, theta, seed + i, record_rate if i == 0 else 0.0) for i in range(seeds)]
     simulator = PourSimulator()
     try:
-        simulator.prepare(task)  # refused before Taichi starts
+        simulator.prepare(tasks[0])  # refused before Taichi starts
     except InvalidSceneError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
-    with (
-        stdout_for_results(),
-        Console(stderr=True).status("simulating (the first pour ever also compiles kernels, about 10 s) …"),
-    ):
-        try:
-            run = simulator.simulate(task)
-        finally:
-            simulator.close()
-    outcome = run.outcome
+    regime = _regimes(tasks[0])
+    runs = _simulated(simulator, tasks)
+    outcomes = [run.outcome for run in runs]
     if rrd is not None or png is not None:
-        _show(task, run, rrd, png)
+        _show(tasks[0], runs[0], rrd, png)
+    over_seeds = spreads(outcomes)
     if as_json:
-        print_json({**outcome.as_json(), "action": action.values(), "theta": theta.model_dump(), "scene": scene.name})
+        prediction = {name: spread.as_json() for name, spread in over_seeds.items()}
+        print_json(
+            {
+                **outcomes[0].as_json(),
+                "action": action.values(),
+                "theta": theta.model_dump(),
+                "scene": scene.name,
+                "prediction": {**prediction, "seeds": [task.seed for task in tasks]},
+                "regimes": None if regime is None else regime.as_json(),
+                "not_covered": [] if regime is None else [one.as_json() for one in regime.not_covered],
+            }
+        )
     else:
         say(f"{scene.name}: {action.display()}")
-        print(
-            f"received {100 * outcome.received:.1f} %  spilled {100 * outcome.spilled:.1f} %  "
-            f"retained {100 * outcome.retained:.1f} %  in flight {100 * outcome.in_flight:.1f} %  "
-            f"escaped {100 * outcome.escaped:.2f} %   ({outcome.particles} particles, "
-            f"{1e3 * outcome.spacing:.2f} mm apart, {outcome.cpu_s:.1f} CPU s)"
-        )
-    if outcome.invalid is not None:
-        raise RefusalError(f"this outcome must not be used: {outcome.invalid}", FAILED)
+        print(told(outcomes, over_seeds))
+    bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
+    if bad:
+        raise RefusalError("\n".join(bad), FAILED)
+
+
+def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulationRun]:
+    """One after the other; Taichi ends with them."""
+    from rich.console import Console
+
+    note = "the first pour ever also compiles kernels, about 10 s"
+    runs = []
+    with stdout_for_results(), Console(stderr=True).status("") as status:
+        try:
+            for i, task in enumerate(tasks, start=1):
+                status.update(f"simulating seed {i} of {len(tasks)} ({note}) …")
+                runs.append(simulator.simulate(task))
+        finally:
+            simulator.close()
+    return runs
+
+
+def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, Spread]) -> str:
+    """The outcomes in one line: mean ± standard deviation of the seeds."""
+    from sim_engine.spread import FRACTIONS
+
+    first = outcomes[0]
+    shown = {name: over_seeds[name].percent(2 if name == "escaped" else 1) for name in FRACTIONS if name in over_seeds}
+    fractions = "  ".join(f"{name.replace('_', ' ')} {text}" for name, text in shown.items())
+    valid = sum(outcome.invalid is None for outcome in outcomes)
+    seeds = (
+        "1 seed, so no spread; --seeds 5 would tell it" if valid == 1 else f"mean ± standard deviation, {valid} seeds"
+    )
+    cpu_s = sum(outcome.cpu_s for outcome in outcomes)
+    particles = f"{first.particles} particles, {1e3 * first.spacing:.2f} mm apart, {cpu_s:.1f} CPU s"
+    return f"{fractions or 'no outcome that could be used'}   ({seeds}; {particles})"
+
+
+def _regimes(task: PourTask) -> Regimes | None:
+    """What the planned pour is like; what the simulator lacks for it is told on stderr."""
+    from orchestrator.report.regimes import numbers_line, regimes_of
+
+    try:
+        found = regimes_of(task.scene, task.action, task.parameters.particles)
+    except (ValueError, OSError) as error:
+        say(f"note: whether something is not simulated could not be worked out: {error}")
+        return None
+    say(f"{numbers_line(found)} (Reynolds, Weber and Bond numbers)")
+    for one in found.not_covered:
+        say(f"not simulated, {one.kind}: {one.text}")
+    return found
 
 
 def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scene, Space]:

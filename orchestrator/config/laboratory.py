@@ -8,6 +8,7 @@ from pydantic import Field, create_model
 
 from actors.bench.spec import VirtualBenchSpec
 from actors.spec import LaboratorySpec
+from orchestrator.config.cluster import RaySection, ray_as_file, resolve_ray
 from orchestrator.config.motion import parameter_quantity, value_as_file
 from orchestrator.config.quantities import Quantity, format_quantity
 from orchestrator.config.sections import Count, Name, Section, Switch
@@ -133,13 +134,16 @@ class LaboratoryFile(Section):
     """What it is made of: 'virtual' moves nothing."""
 
     simulators: Count = 0
-    """Simulators in the pool; 0: one per core."""
+    """Simulators in the pool; 0: one per core, of this machine or of the cluster."""
 
     in_process: Switch = False
     """Run everything in one process (slow, for finding errors)."""
 
     object_store: Annotated[float, Quantity("MB", "160 MB", 80.0, 100_000.0)] = 160.0
-    """Shared memory for simulators' results."""
+    """Shared memory for simulators' results, without a cluster."""
+
+    ray: RaySection | None = None
+    """The Ray cluster to run on; unless given, a private Ray on this machine."""
 
     bench: BenchSection | None = None
     """The virtual bench; without one the laboratory simulates and plans, and can't pour."""
@@ -173,6 +177,7 @@ def resolve_laboratory(section: LaboratoryFile) -> LaboratorySpec | None:
         mode=section.mode,
         in_process=section.in_process,
         object_store_mb=round(section.object_store),
+        ray=resolve_ray(section.ray),
     )
 
 
@@ -184,6 +189,7 @@ def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
         "simulators": spec.simulators,
         "in_process": spec.in_process,
         "object_store": f"{spec.object_store_mb} MB",
+        **({} if spec.ray is None else {"ray": ray_as_file(spec.ray)}),
     }
     if spec.bench is None:
         return table

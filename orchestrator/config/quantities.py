@@ -38,6 +38,8 @@ hour = 3600 * second = h
 rpm = revolution / minute
 hertz = 1 / second = Hz
 newton = kilogram * meter / second ** 2 = N
+pascal = newton / meter ** 2 = Pa
+poise = 0.1 * pascal * second = P
 inch = 0.0254 * meter = in
 liter = 1e-3 * meter ** 3 = l = L
 percent = 0.01 = %
@@ -45,7 +47,8 @@ percent = 0.01 = %
 """What a pouring laboratory needs; a short list loads in milliseconds and has no surprising members."""
 
 FAMILIAR_UNITS = ("mm", "cm", "m", "in", "deg", "rad", "deg/s", "rad/s", "rpm", "deg/s^2", "rad/s^2", "s", "min", "ms",
-                  "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "1/s", "Hz", "MB")  # fmt: skip
+                  "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s", "cP", "1/s", "Hz",
+                  "MB")  # fmt: skip
 
 KINDS = {
     "m": "a length",
@@ -57,6 +60,7 @@ KINDS = {
     "kg/s": "a mass per time",
     "kg/m^3": "a density",
     "N/m": "a surface tension",
+    "Pa*s": "a dynamic viscosity",
     "1/s": "a rate",
     "MB": "an amount of memory",
     "1": "a plain number",

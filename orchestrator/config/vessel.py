@@ -79,6 +79,14 @@ class LiquidFile(Section):
     density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] = 998.0
     """Density; water's at 20 °C unless given."""
 
+    surface_tension: Annotated[float, Quantity("N/m", "72.8 mN/m", lower=1e-3, upper=1.0)] = 0.0728
+    """Surface tension against air; with it and the viscosity Decant warns of what it can't simulate. Water's unless
+    given; the simulator's own knob is the parameter `cohesion`."""
+
+    dynamic_viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] = 1.0e-3
+    """Dynamic viscosity, for the same warnings. Water's unless given; the simulator's own knob is the parameter
+    `viscosity`."""
+
 
 def resolve_vessel(section: VesselFile, place: Place, report: Report) -> VesselSpec | None:
     """The vessel of a file; problems go to the report, and then the answer is None."""
@@ -157,7 +165,15 @@ def missing_file(path: Path) -> str:
 
 def resolve_liquid(section: LiquidFile) -> Liquid | None:
     """The liquid of a file, None if its mass is missing (which is reported already)."""
-    return None if section.mass is None else Liquid(name=section.name, mass=section.mass, density=section.density)
+    if section.mass is None:
+        return None
+    return Liquid(
+        name=section.name,
+        mass=section.mass,
+        density=section.density,
+        surface_tension=section.surface_tension,
+        dynamic_viscosity=section.dynamic_viscosity,
+    )
 
 
 def vessel_as_file(spec: VesselSpec) -> dict[str, object]:
@@ -182,4 +198,6 @@ def liquid_as_file(liquid: Liquid) -> dict[str, object]:
         "name": liquid.name,
         "mass": format_quantity(liquid.mass, "kg", "g"),
         "density": format_quantity(liquid.density, "kg/m^3", "kg/m^3"),
+        "surface_tension": format_quantity(liquid.surface_tension, "N/m", "mN/m"),
+        "dynamic_viscosity": format_quantity(liquid.dynamic_viscosity, "Pa*s", "mPa*s"),
     }

@@ -21,6 +21,9 @@ PAGE_NAME, DATA_NAME, IMAGES = "validation.md", "validation.json", "images"
 SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
 """Factor and name of what people see of an SI unit; others are shown as they are."""
 
+PANELS_ABREAST = 3
+"""More panels than these go into further rows."""
+
 AGAIN = "decant physics --full --write docs"
 
 COLOURS = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST, style.FALLING, style.ESCAPED)
@@ -95,9 +98,15 @@ def draw(figure: Figure, path: Path) -> Path:
         path: of the PNG; its folder is made if needed.
     """
     panels = len(figure.titles)
-    canvas, axes = style.new_figure(1, panels, size=(1.2 + 5.2 * panels, 3.8), squeeze=False)
-    for number, place in enumerate(axes[0]):
-        _panel(place, figure, number)
+    columns = min(panels, PANELS_ABREAST)
+    rows = -(-panels // columns)
+    size = (1.2 + 5.2 * columns, 3.8 * rows)
+    canvas, axes = style.new_figure(rows, columns, size=size, squeeze=False)
+    for number, place in enumerate(axes.flat):
+        if number < panels:
+            _panel(place, figure, number)
+        else:
+            place.set_visible(False)
     return style.save(canvas, path)
 
 
@@ -111,9 +120,16 @@ def _panel(axes: Axes, figure: Figure, number: int) -> None:
                 ms=4, mfc="white", label=series.name, zorder=3,
             )  # fmt: skip
         else:
-            axes.plot(series.x, series.y, color=next(colours), lw=1.4, label=series.name)
-    if figure.log_x:
+            colour = next(colours)
+            axes.plot(series.x, series.y, color=colour, lw=1.4, label=series.name)
+            if series.spread:
+                low, high = ([y + side * s for y, s in zip(series.y, series.spread, strict=True)] for side in (-1, 1))
+                axes.fill_between(series.x, low, high, color=colour, alpha=0.18, lw=0)
+    if figure.log_x if isinstance(figure.log_x, bool) else figure.log_x[number]:
         axes.set_xscale("log")
+        places = sorted({x for s in figure.series if s.panel == number and s.kind == "measured" for x in s.x})
+        axes.set_xticks(places, [f"{x:,g}".replace(",", " ") for x in places])
+        axes.minorticks_off()
     style.dress(axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both")
     axes.legend(fontsize=8, framealpha=0.85, edgecolor="none")
 

@@ -53,6 +53,11 @@ def deployments_of(results: Results) -> dict[str, Result]:
     return {str(r["scene"]): r for r in results.values() if "strategy" in r and "scene" in r}
 
 
+def predictions_of(results: Results) -> dict[str, Mapping[str, Any]]:
+    """What fresh seeds of the recommended actions came to, by scene: quantity → mean, deviation, count."""
+    return {str(r["prediction_of"]): r["over_seeds"] for r in results.values() if "prediction_of" in r}
+
+
 def calibrated_label(evaluation: Result) -> str | None:
     """Under which label an evaluation scored θ*: the one that isn't random."""
     return next((label for label in evaluation["discrepancy"] if not label.startswith("random ")), None)

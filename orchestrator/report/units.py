@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from orchestrator.plan import CampaignPlan
-from orchestrator.requests import Pour
+from orchestrator.requests import Pour, Prediction
 from sim_engine.losses import Loss, normalised_spillage
 from sim_engine.outcome import PourMeasurement
 
@@ -31,6 +31,16 @@ class LossUnit:
         number = f"{self.factor * at_least_nothing(value):.{self.decimals}f}"
         number += f" ± {self.factor * deviation:.{self.decimals}f}"
         return f"{number} {self.unit}"
+
+    def prediction(self, predicted: Prediction) -> str:
+        """'1.2 ± 0.9 %, a pour ± 0.5 %': how well the mean is known, and how much a single pour differs from it."""
+        return self.text(predicted.mean, predicted.deviation) + self.scatter(predicted.scatter)
+
+    def scatter(self, deviation: float | None) -> str:
+        """The end of a prediction: ', a pour ± 0.5 %'; empty if nobody knows."""
+        if deviation is None:
+            return ""
+        return f", a pour ± {self.factor * deviation:.{self.decimals}f} {self.unit}"
 
     @property
     def decimals(self) -> int:

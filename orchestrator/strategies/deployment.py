@@ -154,7 +154,7 @@ class Deployment(ABC):
     def _pour(self, suggestion: Suggestion, point: Point, prediction: Prediction | None) -> None:
         """Queue a pour."""
         values = self._plan.actions.decode(point)
-        noise = (suggestion.hyperparameters or {}).get("noise", 0.0)
+        noise = 0.0 if prediction is None or prediction.scatter is None else prediction.scatter
         trial = PourTrial(self._counted + 1, point, values, prediction, noise)
         self._pours.append(trial)
         action = self._scene.action(values)
@@ -165,13 +165,23 @@ class Deployment(ABC):
         else:
             expected = {"mean": prediction.mean, "sd": prediction.deviation}
             text += f"  predicted {max(prediction.mean, 0.0):.4g} ± {prediction.deviation:.2g}"
+            if prediction.scatter is not None:
+                expected["scatter"] = prediction.scatter
+                text += f", a pour scatters by {prediction.scatter:.2g}"
             self.decisions.append(Decision(text, expected))
 
     def _pour_first(self, suggestion: Suggestion) -> None:
         """Queue a pour of the first suggested point, with the surrogate's prediction where there is one."""
         self._latest_map = suggestion if suggestion.surrogate is not None else self._latest_map
-        known = Prediction(suggestion.means[0], suggestion.deviations[0]) if suggestion.means else None
+        known = None
+        if suggestion.means:
+            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion))
         self._pour(suggestion, suggestion.points[0], known)
+
+    def _scatter(self, suggestion: Suggestion) -> float | None:
+        """Standard deviation of one observation around the surrogate [the loss' unit]: from pour to pour, or in
+        simulation from seed to seed, as fitted; None without a surrogate."""
+        return (suggestion.hyperparameters or {}).get("noise")
 
     def _real(self) -> Data:
         """Observations of the real cost."""
@@ -252,6 +262,7 @@ class Deployment(ABC):
                 "action_si": values,
                 "predicted_loss": self._final.best_mean,
                 "predicted_deviation": self._final.best_deviation,
+                "predicted_scatter": self._scatter(self._final),
                 "hyperparameters": self._final.hyperparameters,
             }
         return result
@@ -266,6 +277,7 @@ class Deployment(ABC):
             "action_si": trial.values,
             "predicted": None if trial.predicted is None else trial.predicted.mean,
             "predicted_deviation": None if trial.predicted is None else trial.predicted.deviation,
+            "predicted_scatter": None if trial.predicted is None else trial.predicted.scatter,
             "loss": trial.cost,
             "spillage": None if weighed is None else normalised_spillage(weighed.fractions),
             "spilled_g": None if weighed is None else weighed.spilled * 1e3,

@@ -10,6 +10,7 @@ from orchestrator.requests import Outcome, Prediction, Request, Simulate, Simula
 from orchestrator.strategies.deployment import MAP_RESOLUTION, Deployment
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
+from sim_engine.spread import Spread
 from sim_engine.task import Scene
 
 
@@ -73,7 +74,13 @@ class OneShotPlanning(Deployment):
         elif self._plan.pours < 1:
             self._finished = True
         else:
-            self._pour(suggestion, suggestion.best_point, Prediction(suggestion.best_mean, suggestion.best_deviation))
+            prediction = Prediction(suggestion.best_mean, suggestion.best_deviation, self._scatter(suggestion))
+            self._pour(suggestion, suggestion.best_point, prediction)
+
+    def _scatter(self, suggestion: Suggestion) -> float | None:
+        """Of a single seed: what is observed here are means of m1 of them."""
+        noise = super()._scatter(suggestion)
+        return None if noise is None else noise * math.sqrt(max(self._plan.simulations_per_iteration, 1))
 
     def progress(self) -> tuple[int, int]:
         """Simulations and pours done, and in all."""
@@ -82,10 +89,15 @@ class OneShotPlanning(Deployment):
         return self._trials.answered + self._counted, max(self._plan.iterations, 1) * repeats + pours
 
     def result(self) -> dict[str, object]:
-        """As every deployment; with the mean r = spilled / poured of the simulations of the recommended action."""
+        """As every deployment; with r = spilled / poured over the simulations of the recommended action.
+
+        These seeds took part in choosing the action; `orchestrator.strategies.repeats` has fresh ones.
+        """
         result = super().result()
         if self._final is not None and self._final.best_point is not None:
             tried = [trial for trial in self._trials.all if trial.point == self._final.best_point]
             known = [r for trial in tried for q in trial.requests if (r := self._spillages.get(q)) is not None]
-            result["predicted_spillage"] = sum(known) / len(known) if known else None
+            spillage = Spread.of(known)
+            result["predicted_spillage"] = None if spillage is None else spillage.mean
+            result["predicted_spillage_deviation"] = None if spillage is None else spillage.deviation
         return result

@@ -93,6 +93,7 @@ class Series:
         x, y: SI.
         kind: how it is drawn: 'measured' curves differ in colour, a 'reference' is black.
         panel: figures of several panels: which one.
+        spread: standard deviation at each point, drawn as a band; empty: none.
     """
 
     name: str
@@ -100,6 +101,7 @@ class Series:
     y: tuple[float, ...]
     kind: Literal["measured", "reference"] = "measured"
     panel: int = 0
+    spread: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,14 +111,14 @@ class Figure:
     Attributes:
         titles, x_labels, y_labels: one of each per panel.
         series: curves.
-        log_x: whether the horizontal axes are logarithmic.
+        log_x: whether the horizontal axes are logarithmic: all of them, or one by one.
     """
 
     titles: tuple[str, ...]
     x_labels: tuple[str, ...]
     y_labels: tuple[str, ...]
     series: tuple[Series, ...]
-    log_x: bool = False
+    log_x: bool | tuple[bool, ...] = False
 
 
 @dataclass(frozen=True)

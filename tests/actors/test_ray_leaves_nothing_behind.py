@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from actors import ray_runtime
+from actors import ray_private, ray_runtime
 from actors.protocols import LaboratoryError
 from actors.spec import LaboratorySpec
 
@@ -145,13 +145,13 @@ def test_clusters_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp
     )
     try:
         holder.stdout.readline()
-        assert ray_runtime.prune_clusters(tmp_path) == [dead]
+        assert ray_private.prune_clusters(tmp_path) == [dead]
         assert not dead.exists()
         assert alive.exists()
     finally:
         holder.kill()
         holder.communicate()
-    assert ray_runtime.prune_clusters(tmp_path) == [alive]
+    assert ray_private.prune_clusters(tmp_path) == [alive]
 
 
 def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(ray_running, monkeypatch):

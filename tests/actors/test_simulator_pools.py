@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import os
 import signal
 import time
@@ -12,7 +13,8 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.protocols import InvalidActionError, SimulationError
+from actors.cluster.versions import versions
+from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.pool import RaySimulatorPool
 
@@ -170,6 +172,81 @@ def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_runni
         await pool.close()
 
     asyncio.run(play())
+
+
+@pytest.mark.ray
+def test_a_simulator_goes_on_with_the_next_job_while_the_program_is_held_up(ray_running, fake, task, tmp_path):
+    log = tmp_path / "log"
+
+    async def play():
+        pool = RaySimulatorPool(1, make=fake(0.3, log))
+        jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(2)]
+        await until(lambda: count(log, "begin") == 1)
+        time.sleep(1.2)  # the event loop stands still
+        ended = count(log, "end")
+        await asyncio.gather(*jobs)
+        await pool.close()
+        return ended
+
+    assert asyncio.run(play()) == 2
+
+
+@pytest.mark.ray
+def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_once(ray_running, fake, task, tmp_path):
+    log = tmp_path / "log"
+
+    async def play():
+        pool = RaySimulatorPool(2, make=fake(4.0, log))
+        await pool.pids()
+        long, other, waiting = (asyncio.create_task(pool.simulate(task(seed=s))) for s in range(3))
+        await until(lambda: count(log, "begin") == 2)
+        other.cancel()  # its simulator becomes idle; the third job was sent behind the first or behind this one
+        begun = time.monotonic()
+        await until(lambda: count(log, "begin") == 3)
+        idle = time.monotonic() - begun
+        assert (await waiting).outcome.seed == 2
+        assert (await long).outcome.seed == 0
+        deaths = pool.statistics().deaths
+        await pool.close()
+        return idle, deaths
+
+    idle, deaths = asyncio.run(play())
+    assert idle < 2.0
+    assert deaths == 0
+    assert count(log, "begin") == 3
+
+
+@pytest.mark.ray
+def test_a_simulator_with_other_code_than_this_machine_s_is_not_used_and_named(ray_running, fake, task):
+    told = []
+
+    async def play():
+        other = dataclasses.replace(versions(), taichi="1.6.0")
+        pool = RaySimulatorPool(1, make=fake(), expected=other, tell=told.append)
+        with pytest.raises(LaboratoryError, match=r"is not like this machine's: Taichi: 1\.7\.4 there, 1\.6\.0 here"):
+            await pool.simulate(task())
+        await pool.close()
+
+    asyncio.run(play())
+    assert len(told) == 1
+
+
+@pytest.mark.ray
+def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path):
+    told, log = [], tmp_path / "log"
+
+    async def play():
+        pool = RaySimulatorPool(1, make=fake(0.5, log), tell=told.append)
+        jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(2)]
+        await until(lambda: count(log, "begin") == 1)
+        os.kill((await pool.pids())[0], signal.SIGKILL)
+        await asyncio.gather(*jobs)
+        await until(lambda: told)
+        await pool.close()
+
+    asyncio.run(play())
+    assert "1 simulator(s) lost" in told[0]
+    assert "2 simulation(s) are repeated" in told[0]
 
 
 @pytest.mark.ray

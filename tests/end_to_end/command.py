@@ -31,10 +31,16 @@ FINISHED = (Kind.FINISHED, Kind.POUR_FINISHED)
 
 
 class Workplace:
-    """A folder with a campaign, and a temporary folder of its own, in which leftovers can be told from others'."""
+    """A folder with a campaign, and a temporary folder of its own, in which leftovers can be told from others'.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: of the campaign.
+        environment: that programs get beside this one's.
+    """
+
+    def __init__(self, folder: Path, environment: dict[str, str] | None = None) -> None:
         self.folder = folder
+        self.environment = environment or {}
         # Short, since Ray puts sockets in it.
         self.temporary = Path(tempfile.mkdtemp(prefix="e", dir="/tmp"))
 
@@ -43,7 +49,7 @@ class Workplace:
         return subprocess.Popen(
             [sys.executable, "-c", "from orchestrator.cli import main; main()", *arguments],
             cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(self.temporary)},
+            env={**os.environ, **self.environment, "PYTHONPATH": str(ROOT), "TMPDIR": str(self.temporary)},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

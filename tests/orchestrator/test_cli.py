@@ -18,7 +18,10 @@ import trimesh
 from typer.testing import CliRunner
 
 from orchestrator.cli import app
+from orchestrator.commands import single
+from sim_engine.spread import spreads
 from tests.end_to_end import small
+from tests.orchestrator import watched
 
 CSV = """\
 angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,split
@@ -160,6 +163,8 @@ BAD_USAGE = {
     "bake small.yaml": "No such command 'bake'",
     "plan small.yaml --iterations 1": "Invalid value for '--iterations'",
     "plan small.yaml --seed -1": "Invalid value for '--seed'",
+    "plan small.yaml --seeds 1": "Invalid value for '--seeds'",
+    f"{SIMULATE} --seeds 0": "Invalid value for '--seeds'",
     f"{SIMULATE} --seed many": "Invalid value for '--seed'",
     "validate": "Missing argument 'files'",
 }
@@ -302,6 +307,38 @@ def test_simulate_prints_one_line_of_json_and_nothing_else(simulated: subprocess
     assert outcome["cpu_s"] > 0.0
 
 
+def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
+    simulated: subprocess.CompletedProcess[str],
+) -> None:
+    outcome = json.loads(simulated.stdout)
+    prediction = outcome["prediction"]
+    assert prediction["seeds"] == [5, 6, 7]
+    assert prediction["received"]["count"] == 3
+    assert prediction["received"]["deviation"] > 0.0
+    assert abs(prediction["received"]["mean"] - outcome["received"]) < 5 * prediction["received"]["deviation"] + 1e-9
+    assert outcome["regimes"]["lip"]["weber"][0] < outcome["regimes"]["lip"]["weber"][1]
+    assert outcome["not_covered"] == []
+    assert "not simulated" not in simulated.stderr
+
+
+def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path) -> None:
+    done = process(
+        "simulate small.yaml --set angular_velocity=20 --set max_angle=75 --set x_offset=70 --seeds 2", inputs
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
+    assert "mean ± standard deviation, 2 seeds" in done.stdout
+    assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
+
+
+def test_one_seed_has_no_spread_and_says_so() -> None:
+    several = [watched.outcome(spilled=s) for s in (0.05, 0.07)]
+    assert "received 92.0 ± 1.4 %  spilled 6.0 ± 1.4 %" in single.told(several, spreads(several))
+    alone = single.told(several[:1], spreads(several[:1]))
+    assert "±" not in alone
+    assert "1 seed, so no spread; --seeds 5 would tell it" in alone
+
+
 def test_simulate_shows_the_pour_as_picture_and_recording(
     simulated: subprocess.CompletedProcess[str], inputs: Path
 ) -> None:
@@ -354,7 +391,7 @@ HELP = {
     "run": ["decant run my.yaml --resume", "Ctrl-C pauses", "runs/ID"],
     "calibrate": ["decant calibrate configs/campaigns/recorded.yaml --json", "theta.json", "N/m"],
     "plan": ["--receiver vase.yaml", "deg/s, mm and s", "Nothing is poured"],
-    "simulate": ["--set x_offset=90   # deg/s and mm", "'angular_velocity=0.7 rad/s'", "in_flight"],
+    "simulate": ["--set x_offset=90   # deg/s and mm", "'angular_velocity=0.7 rad/s'", "in_flight", "--seeds"],
     "validate": ["decant validate configs/campaigns/*.yaml", "units, bounds"],
     "schema": ["decant schema vessel > vessel.json"],
 }

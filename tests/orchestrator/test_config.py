@@ -14,6 +14,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from actors.spec import RaySpec
 from orchestrator.config.assignments import assigned_action, set_action
 from orchestrator.config.check import check_campaign
 from orchestrator.config.errors import ConfigError
@@ -21,6 +22,7 @@ from orchestrator.config.load import load_campaign, load_laboratory, load_parame
 from orchestrator.config.quantities import format_quantity, parse_quantity
 from orchestrator.config.schema import campaign_schema, laboratory_schema, schema_text, vessel_schema
 from orchestrator.config.yaml_source import Document
+from orchestrator.fingerprint import fingerprint
 from sim_engine.action import DEG
 from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.spec import MeshShape
@@ -155,6 +157,42 @@ def test_all_errors_of_a_file_and_of_what_it_names_come_at_once(
     ]
 
 
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("surface_tension: 72", "72 has no unit; write '72 mN/m' if that is what is meant"),
+        ("surface_tension: 72 N/m", "72 N/m is outside 1 … 1000 mN/m"),
+        (
+            "dynamic_viscosity: 1 mN/m",
+            "'1 mN/m' is a surface tension; should be a dynamic viscosity, for example '1 mPa*s'",
+        ),
+        ("dynamic_viscosity: 0 mPa*s", "0 mPa*s is outside 0.01 … 1e+06 mPa*s"),
+        ("viscosity: 1 mPa*s", "liquid.viscosity: unknown key; did you mean 'dynamic_viscosity'?"),
+    ],
+)
+def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, message: str, tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
+    (tmp_path / "campaign.yaml").write_text(text.replace("mass: 200 g", f"mass: 200 g, {written}"), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_campaign(tmp_path / "campaign.yaml")
+    assert message in str(caught.value)
+
+
+def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_after_its_density_was(
+    tmp_path: Path,
+) -> None:
+    """Tension and viscosity decide which warnings are given, and no request."""
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+
+    def printed(addition: str) -> object:
+        path = tmp_path / "campaign.yaml"
+        path.write_text(text.replace("mass: 200 g", f"mass: 200 g{addition}"), encoding="utf-8")
+        return fingerprint(load_campaign(path))
+
+    assert printed("") == printed(", surface_tension: 40 mN/m, dynamic_viscosity: 2 mPa*s")
+    assert printed("") != printed(", density: 900 kg/m^3")
+
+
 def test_error_shows_the_line_and_a_caret_under_the_culprit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "v.yaml").write_text("name: cup\nmesh: cup.stl\nunit: furlong\n")
@@ -193,6 +231,9 @@ def test_loading_a_campaign_starts_nothing_heavy() -> None:
         ("0.2 kg", "kg", 0.2),
         ("1 g/cm³", "kg/m^3", 1000.0),
         ("72 mN/m", "N/m", 0.072),
+        ("84 mPa*s", "Pa*s", 0.084),
+        ("84 cP", "Pa*s", 0.084),
+        ("1.4 Pa s", "Pa*s", 1.4),
         ("3 1/s", "1/s", 3.0),
         ("3 Hz", "1/s", 3.0),
         ("-5 mm", "m", -0.005),
@@ -247,6 +288,23 @@ def test_parameters_as_a_program_or_a_person_writes_them(text: str, tmp_path: Pa
     assert loaded.model_dump() == pytest.approx(expected.model_dump())
 
 
+@pytest.mark.parametrize("address", ["auto", "ray://head:10001", "head", "head:0", "head:70000", ":6379", "a b:6379"])
+def test_an_address_of_a_cluster_that_ray_would_puzzle_over_is_refused(address: str, tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(f"name: far\nmode: virtual\nray: {{address: '{address}'}}\n")
+    with pytest.raises(ConfigError, match=r"lab\.yaml:3:16: ray\.address: .* should be host:port of the cluster's"):
+        load_laboratory(path)
+
+
+def test_a_cluster_needs_an_address_and_its_bench_has_a_usual_name(tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text("name: far\nmode: virtual\nray: {address: '[fd00::1]:6379'}\n")
+    assert load_laboratory(path).ray == RaySpec("[fd00::1]:6379", "decant_bench")
+    path.write_text("name: far\nmode: virtual\nray: {bench_resource: left}\n")
+    with pytest.raises(ConfigError, match="key 'address' is missing"):
+        load_laboratory(path)
+
+
 def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path: Path) -> None:
     vessels = CONFIGS / "vessels"
     text = textwrap.dedent(f"""\
@@ -257,6 +315,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           simulators: 3
           in_process: true
           object_store: 300 MB
+          ray: {{address: "head.local:6379", bench_resource: left_bench}}
           bench:
             liquid: {{particles: 3100, cohesion: 31 mN/m, viscosity: 7 Hz, friction: 0.31}}
             pose_error: {{x: 1.1 mm, y: -2 mm, tilt: 0.7 deg, speed_factor: 1.03}}
@@ -264,7 +323,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
             balance: {{resolution: 0.01 g, noise: 0.2 g, drift: 0.5 g/min, settling_time: 2.5 s}}
             time_scale: 12
             operator_time: 1 min
-        liquid: {{name: oil, mass: 0.15 kg, density: 0.92 g/cm^3}}
+        liquid: {{name: oil, mass: 0.15 kg, density: 0.92 g/cm^3, surface_tension: 32 mN/m, dynamic_viscosity: 84 cP}}
         pourer: {vessels}/beaker.yaml
         motion:
           pivot: {{x: 30 mm, z: 70 mm}}
@@ -311,6 +370,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert dataclasses.astuple(plan.outputs) == (tmp_path / "here", False, False, 4.0, 2)
     lab = plan.laboratory
     assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
+    assert lab.ray == RaySpec("head.local:6379", "left_bench")
     assert (bench.liquid.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
     assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03))
     assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02))
@@ -319,6 +379,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert bench.balance_drift == pytest.approx(0.5e-3 / 60.0)
     scene = calibration.scene
     assert (scene.liquid.name, scene.liquid.mass, scene.liquid.density) == ("oil", 0.15, pytest.approx(920.0))
+    assert (scene.liquid.surface_tension, scene.liquid.dynamic_viscosity) == pytest.approx((0.032, 0.084))
     assert (scene.pivot.kind, scene.pivot.x, scene.pivot.z, scene.hold_cap) == ("point", 0.03, 0.07, 2.0)
     assert scene.fixed == pytest.approx(
         {

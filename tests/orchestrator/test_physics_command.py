@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -95,6 +96,40 @@ def test_cases_are_listed_by_name() -> None:
     result = runner.invoke(app, ["physics", "--list"])
     assert result.exit_code == 0
     assert [line.split()[0] for line in result.stdout.splitlines()] == [case.name for case in suite.CASES]
+
+
+def test_a_long_case_tells_how_far_it_is_and_a_case_without_criteria_is_judged_by_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def work(simulator: object, effort: suite.Effort) -> tuple[list[Measurement], None]:
+        assert effort.progress is not None
+        for done in range(4):
+            effort.progress(done, 3)
+        return [reported("slope", 0.1, particles=500)], None
+
+    monkeypatch.setattr(suite, "CASES", (suite.Case("long", "Long", "It takes its time.", work),))
+    result = runner.invoke(app, ["physics"])
+    assert (result.exit_code, result.stderr.splitlines()[-1]) == (0, "nothing was judged")
+
+
+def test_many_panels_go_into_rows_and_spreads_are_bands(tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    def picture(panels: int, spread: tuple[float, ...] = ()) -> Any:
+        curves = tuple(
+            Series("fast pour", (100.0, 1000.0, 4000.0), (0.1, 0.2, 0.15), panel=panel, spread=spread)
+            for panel in range(panels)
+        )
+        logs = tuple(panel == 0 for panel in range(panels))
+        words = tuple(f"panel {panel}" for panel in range(panels))
+        path = report.draw(Figure(words, words, words, curves, log_x=logs), tmp_path / "figure.png")
+        return imread(path)
+
+    three, four = picture(3), picture(4)
+    assert four.shape[1] == pytest.approx(three.shape[1], rel=0.1)
+    assert four.shape[0] > 1.8 * three.shape[0]
+    plain, banded = picture(1), picture(1, (0.05, 0.05, 0.05))
+    assert banded.mean() < plain.mean() - 0.003  # a band darkens
 
 
 def test_a_fault_of_the_solver_does_not_pass() -> None:

@@ -1,0 +1,37 @@
+"""Kern Communications Protocol: `SI` is answered by `S S     12.34 g`.
+
+It must be switched on in the balance's menu. Sources: Kern KIB-TM-ZB-e-1913 (commands; no question sooner than 100 ms
+after the last), CKE-BA-e-2132 (`S I`, `S +`, `S -`). 9600 baud 8N1 is what such balances are usually met with.
+Limitations: `TA` reads the tare in some manuals and `MM` in others, so neither is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from actors.balance.dialects import status_lines
+from actors.balance.dialects.dialect import LineSettings
+from actors.balance.reading import Reading, Reply
+
+
+@dataclass(frozen=True)
+class _Kcp:
+    name: str = "kcp"
+    title: str = "Kern KCP"
+    lines: tuple[LineSettings, ...] = tuple(LineSettings(baud) for baud in (9600, 19200, 4800, 2400, 1200))
+    gap: float = 0.1
+    query: bytes = b"SI\r\n"
+    tare: bytes = b"T\r\n"
+    zero: bytes | None = b"Z\r\n"
+    cancel: bytes | None = b"@\r\n"
+    acknowledged: bool = True
+
+    def decode(self, line: bytes) -> Reply:
+        return status_lines.decode(line)
+
+    def encode(self, reading: Reading) -> bytes:
+        return status_lines.encode(reading)
+
+
+KCP = _Kcp()
+"""Kern KCP."""

@@ -1,0 +1,90 @@
+"""Older Kern balances: single letters `s`, `w`, `t` without CR LF, answered by lines of fixed width.
+
+| line                    | Kern PCB-BA-e-1315, KDE-T-BA_IA-e-1210 | PCB-BA-e-0712, FKB_A-BA-e-1513, 440-BA-e-1744 |
+|-------------------------|----------------------------------------|-----------------------------------------------|
+| stable                  | 18 bytes: M, sign, 10 of value, blank, 3 of unit | 18                                  |
+| unstable                | 18 bytes, the unit blank               | 15, the unit left out                         |
+| fault                   | 18 bytes: 11 blanks, `Error`           | 14: 7 blanks, `Error`                         |
+
+CR LF are counted in. The drawings of the second column can be read as one byte more (19 and 16), so these widths are
+understood too. A line of any other width has lost characters, and a lost digit would be a wrong weight: it is refused.
+A stable line has a unit, an unstable one has none; that is how they are told apart. `=Overload=` is met in place of a
+value. Such balances must be set to remote control ('rE Cr').
+Limitations: there is no command for zero, and taring is not answered.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from actors.balance.dialects.dialect import END, LineSettings, number_in, text_of
+from actors.balance.reading import FrameError, Reading, Reply, Status
+
+STABLE_WIDTHS = (16, 17)
+"""Characters of a stable line without CR LF."""
+
+UNSTABLE_WIDTHS = (13, 14, 16, 17)
+"""… of an unstable one."""
+
+FAULT_WIDTHS = (12, 16)
+"""… of a fault."""
+
+_LINE = re.compile(r"[ M]?(?P<sign>[ -]?) *(?P<value>[0-9.]+) (?P<unit>[A-Za-z%]{0,4}) *")
+
+
+@dataclass(frozen=True)
+class KernSwt:
+    """The dialect; both layouts are understood, whichever is set.
+
+    Attributes:
+        short: lines of the shorter layout, for `encode`.
+    """
+
+    short: bool = False
+    name: str = "kern-swt"
+    title: str = "older Kern (s/w/t)"
+    lines: tuple[LineSettings, ...] = tuple(LineSettings(baud) for baud in (9600, 4800, 2400, 1200, 19200))
+    gap: float = 0.1
+    query: bytes = b"w"
+    tare: bytes = b"t"
+    zero: bytes | None = None
+    cancel: bytes | None = None
+    acknowledged: bool = False
+
+    def decode(self, line: bytes) -> Reply:
+        """See `Dialect.decode`."""
+        text = text_of(line)
+        if text is None:
+            raise FrameError("not printable ASCII")
+        if text.strip() == "Error" and len(text) in FAULT_WIDTHS:
+            return Reading(Status.ERROR)
+        if text.strip() == "=Overload=":
+            return Reading(Status.OVER)
+        match = _LINE.fullmatch(text)
+        value = number_in(match["sign"].strip() + match["value"]) if match is not None else None
+        if match is None or value is None:
+            raise FrameError("not a weight")
+        widths = STABLE_WIDTHS if match["unit"] else UNSTABLE_WIDTHS
+        if len(text) not in widths:
+            raise FrameError(f"{len(text)} characters; a weight has {' or '.join(map(str, widths))}")
+        return Reading(Status.STABLE if match["unit"] else Status.UNSTABLE, value, match["unit"])
+
+    def encode(self, reading: Reading) -> bytes:
+        """See `Dialect.encode`."""
+        if reading.status in (Status.STABLE, Status.UNSTABLE) and reading.value is not None:
+            sign = "-" if reading.value < 0 else " "
+            head = f" {sign}{abs(reading.value)!s:>10} "
+            stable = reading.status is Status.STABLE
+            text = head + (f"{reading.unit:<3}" if stable else "" if self.short else "   ")
+        elif reading.status is Status.OVER:
+            text = "=Overload=".rjust(16)
+        elif reading.status is Status.ERROR:
+            text = "Error".rjust(12 if self.short else 16)
+        else:
+            raise ValueError(f"no line of this dialect says '{reading.status}'")
+        return text.encode("ascii") + END
+
+
+KERN_SWT = KernSwt()
+"""Older Kern balances."""

@@ -1,0 +1,111 @@
+"""Sartorius Balance Interface: `ESC P` is answered by a line of 16 characters, or 22 with an identification before it.
+
+```
++    123.45 g  CR LF          sign, 9 of value, blank, 3 of unit
+N     +    123.45 g  CR LF    the same after 6 of identification
+```
+The unit is blank while the balance is not at rest. In place of a value stand `High`, `Low`, `H`, `L`, `--`, `Cal.Int.`,
+`Cal.Ext.`, `C`, and `Err 123`; a 22-character line then begins with `Stat`. Digits that the law does not vouch for may
+stand in brackets. A line of another width has lost characters: it is refused.
+
+Sources: Sartorius Quintix manual p. 87, Entris II interface description p. 3 and 4, LE2202S p. 51, CP operating
+instructions p. 55 (1200 baud 7O1 and printing 'at stability' as factory setting of that series).
+Limitations: commands are not answered. Set 'print: manual, without stability' and no automatic printing in the menu: at
+stability, the question is answered only once the balance is at rest; with automatic printing `ESC P` switches that.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from actors.balance.dialects.dialect import END, LineSettings, number_in, text_of
+from actors.balance.reading import FrameError, Reading, Reply, Status
+
+SHORT, LONG = 14, 20
+"""Widths of the two layouts without CR LF."""
+
+_WORDS = {"High": Status.OVER, "H": Status.OVER, "Low": Status.UNDER, "L": Status.UNDER, "--": Status.BUSY,
+          "Cal.Int.": Status.BUSY, "Cal.Ext.": Status.BUSY, "C": Status.BUSY}  # fmt: skip
+_FAULT = re.compile(r"(?:Err|ERR) *(?P<number>[0-9]{1,4})|(?P<word>(?:APP|DIS|PRT)\.ER)")
+_BRACKETS = re.compile(r"\[([0-9]+)\]")
+
+
+@dataclass(frozen=True)
+class Sbi:
+    """The dialect; both layouts are understood, whichever is set.
+
+    Attributes:
+        identified: lines of 22 characters, for `encode`.
+    """
+
+    identified: bool = False
+    name: str = "sbi"
+    title: str = "Sartorius SBI"
+    lines: tuple[LineSettings, ...] = (
+        LineSettings(9600),
+        LineSettings(1200, bits=7, parity="O"),
+        LineSettings(19200),
+        LineSettings(9600, bits=7, parity="O"),
+        LineSettings(1200),
+    )
+    gap: float = 0.1
+    query: bytes = b"\x1bP\r\n"
+    tare: bytes = b"\x1bU\r\n"
+    zero: bytes | None = b"\x1bV\r\n"
+    cancel: bytes | None = None
+    acknowledged: bool = False
+
+    def decode(self, line: bytes) -> Reply:
+        """See `Dialect.decode`."""
+        text = text_of(line)
+        if text is None:
+            raise FrameError("not printable ASCII")
+        if len(text) == LONG:
+            text = text[LONG - SHORT :]
+        if len(text) != SHORT:
+            raise FrameError(f"{len(text)} characters; this dialect's lines have {SHORT} or {LONG}")
+        word = text.strip()
+        if word in _WORDS:
+            return Reading(_WORDS[word], detail=word if word.startswith("C") else "")
+        if (fault := _FAULT.fullmatch(word)) is not None:
+            return Reading(Status.ERROR, detail=f"error {fault['number'] or fault['word']}")
+        return _weight(text)
+
+    def encode(self, reading: Reading) -> bytes:
+        """See `Dialect.encode`."""
+        status = reading.status
+        if status in (Status.STABLE, Status.UNSTABLE) and reading.value is not None:
+            sign = "-" if reading.value < 0 else "+"
+            unit = reading.unit if status is Status.STABLE else ""
+            text, label = f"{sign}{abs(reading.value)!s:>9} {unit:<3}", "N"
+        elif status in _SAID:
+            text, label = _SAID[status].ljust(8).rjust(SHORT), "Stat"
+        elif status is Status.ERROR:
+            text, label = f"   Err {reading.detail.removeprefix('error ') or '54':<7}", "Stat"
+        else:
+            raise ValueError(f"no line of this dialect says '{status}'")
+        return ((f"{label:<6}" if self.identified else "") + text).encode("ascii") + END
+
+
+_SAID = {Status.OVER: "High", Status.UNDER: "Low", Status.BUSY: "--"}
+
+
+def _weight(text: str) -> Reading:
+    """From the 14 characters of a weight."""
+    sign, digits, unit = text[0], _BRACKETS.sub(r"\1", text[1:11]).strip(), text[11:]
+    if sign not in "+- " or not unit.isascii():
+        raise FrameError("not a weight")
+    if "[" in text:  # brackets take the blank's place before the unit
+        digits = digits.strip()
+    number = number_in(digits)
+    name = unit.strip()
+    if number is None or (name and re.fullmatch(r"[A-Za-z%/]{1,3}", name) is None):
+        raise FrameError("not a weight")
+    if sign == "-":
+        number = -number
+    return Reading(Status.STABLE if name else Status.UNSTABLE, number, name)
+
+
+SBI = Sbi()
+"""Sartorius SBI."""

@@ -1,0 +1,357 @@
+"""A balance on a serial line: one driver for all dialects. Plain and blocking; `actors.device` puts it in a process.
+
+Every call has a deadline. What counts has settled (`settling`), and a tare is believed once it is read back. What only
+watches (`read`, `stream`) never fails and never disturbs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+
+from actors.balance.complaints import LOST_REFERENCE, WITHOUT_EFFECT, unsettled
+from actors.balance.display import Display
+from actors.balance.errors import (
+    BalanceError,
+    CommandError,
+    NoConnectionError,
+    OutOfRangeError,
+    ReferenceLostError,
+    UnitError,
+)
+from actors.balance.link import Link
+from actors.balance.protocol import Weight
+from actors.balance.reading import Acknowledgement, Answer, Reading, Status
+from actors.balance.settling import Settled, Settling
+from actors.balance.spec import SerialBalanceSpec
+from actors.balance.wire import Tap
+
+ZERO_STEPS = 2.0
+"""How far from zero a balance may read after taring, in steps of its display (and three times its repeatability)."""
+
+OUT_OF_RANGE_TIME = 3.0
+"""How long over or under range, or a fault, is waited out before it is an error [s of bench time]."""
+
+COMMAND_ATTEMPTS = 3
+"""How often tare or zero is sent before it has failed; nothing is poured meanwhile."""
+
+COMMAND_TIME = 3.0
+"""How long the display may take to follow tare or zero [s of bench time]."""
+
+_RETRY_INTERVAL = 0.5
+
+STRANGE_UNITS = 3
+"""Readings in a row in a unit that is no mass, before that is an error."""
+
+LOSSES = 3
+"""How often the connection may be lost during one weighing."""
+
+
+class SerialBalance:
+    """See the module's text.
+
+    Args:
+        spec: port and settings; nothing is opened before the first call.
+        name: for messages.
+        tap: sees all bytes, for recording.
+    """
+
+    def __init__(self, spec: SerialBalanceSpec, name: str = "balance", tap: Tap | None = None) -> None:
+        self._spec, self._name = spec, name
+        self._rule = spec.settling.scaled(spec.time_scale)
+        self._interrupted = threading.Event()
+        self._lock = threading.RLock()
+        self._link = Link(spec, self._interrupted, tap)
+        self._display = Display(spec.step)
+        self._tared = self._reference_lost = False
+        self._losses = self._strange_units = 0
+
+    # What counts.
+
+    def connect(self) -> str:
+        """Open the port and find out what is not set.
+
+        Returns:
+            What was found, for people.
+
+        Raises:
+            NoConnectionError: no port, or nobody understandable there.
+        """
+        with self._exclusive():
+            self._open()
+        return self.describe()
+
+    def tare(self) -> None:
+        """Wait for rest, count what is on the balance as nothing, and see it do so.
+
+        Raises:
+            BalanceError: not at rest in time, refused, without effect, or lost.
+        """
+        self._open()
+        self._set_reference("tare", self._link.dialect.tare)
+
+    def zero(self) -> None:
+        """Set the zero of the empty balance, and see it do so.
+
+        Raises:
+            BalanceError: as `tare`; or something is on the balance, or the dialect has no such command.
+        """
+        self._open()
+        dialect = self._link.dialect
+        if dialect.zero is None:
+            raise self._error(CommandError, f"{dialect.title} has no command for zero; use its key, or tare instead")
+        self._set_reference("zero", dialect.zero)
+
+    def weigh(self) -> Weight:
+        """Wait until the weight has settled.
+
+        Raises:
+            ReferenceLostError: the connection was lost since the last tare.
+            NotStableError: not settled within the rule's deadline.
+            BalanceError: out of range, another unit, a fault, no answer.
+        """
+        settled, seen = self._settle(reference_needed=True), self._display
+        return Weight(settled.mass, True, settled.time, str(Status.STABLE), seen.step, seen.last.shown)
+
+    # What only watches.
+
+    def read(self) -> Weight:
+        """What the display shows; never fails. While another call waits for an answer, the last reading."""
+        if not self._lock.acquire(timeout=self._spec.answer_time / 4.0):
+            return self._display.last
+        try:
+            if time.monotonic() - self._display.last.time >= 0.9 * self._link.interval:
+                self._glance()
+            return self._display.last
+        finally:
+            self._lock.release()
+
+    def stream(self, interval: float = 0.15) -> Iterator[Weight]:
+        """What the display shows, until `interrupt`.
+
+        Args:
+            interval: from one reading to the next [s of the clock].
+        """
+        while not self._interrupted.is_set():
+            yield self.read()
+            self._interrupted.wait(interval)
+
+    def listen(self, seconds: float) -> None:
+        """Ask nothing, and take in what comes by itself (for recording).
+
+        Args:
+            seconds: for how long.
+
+        Raises:
+            NoConnectionError: the port vanished.
+        """
+        with self._exclusive():
+            self._open()
+            self._link.listen(seconds)
+
+    def statistics(self) -> dict[str, int]:
+        """Lines understood, damaged and stale, unanswered questions, lost connections."""
+        return asdict(self._link.counters)
+
+    def describe(self) -> str:
+        """'Kern KCP on /dev/…, 9600 baud 8N1', as far as it is known."""
+        found = self._link.found
+        if found is None:
+            return f"{self._name} on {self._spec.port}, not yet connected"
+        said = f" ({found.identity})" if found.identity else ""
+        unasked = "; it sends without being asked: switch that off in its menu" if found.unasked else ""
+        return f"{found.dialect.title}{said} on {self._spec.port}, {found.line}{unasked}"
+
+    # Control.
+
+    def keep_reference(self) -> None:
+        """After a lost connection: a person has seen that the balance stayed on and its tare still holds."""
+        self._reference_lost = False
+
+    def interrupt(self) -> None:
+        """End the wait that is under way, and later ones at once, until `resume`."""
+        self._interrupted.set()
+
+    def resume(self) -> None:
+        """Let waits last again."""
+        self._interrupted.clear()
+
+    def close(self) -> None:
+        """Close the port; the next call opens it again."""
+        with self._lock:
+            self._link.close()
+
+    # How.
+
+    def _set_reference(self, name: str, data: bytes) -> None:
+        """Rest, command, and a display near zero afterwards."""
+        said, end = "", time.monotonic() + 2.0 * self._rule.deadline
+        for _ in range(COMMAND_ATTEMPTS):
+            if time.monotonic() > end:
+                break
+            self._settle()
+            said = self._send(name, data)
+            if said:
+                self._interrupted.wait(_RETRY_INTERVAL / self._spec.time_scale)
+                continue
+            settled = self._near_zero()
+            if settled is None:
+                self._tared, self._reference_lost = True, False
+                return
+            said = f"it still shows {self._display.in_grams(settled.mass)}, stable"
+        raise self._error(CommandError, WITHOUT_EFFECT.format(name=name, times=COMMAND_ATTEMPTS, said=said))
+
+    def _send(self, name: str, data: bytes) -> str:
+        """Send a command; '' if it was taken (or nobody says), else why it may be sent again."""
+        try:
+            with self._exclusive():
+                answer = self._link.command(data, 2.0 * COMMAND_TIME / self._spec.time_scale)
+        except NoConnectionError as error:
+            self._wait_for_return(error)
+            return "the connection was lost"
+        except CommandError as error:
+            self._check_interrupted()
+            return str(error)
+        match answer:
+            case None | Acknowledgement(answer=Answer.DONE):
+                return ""
+            case Acknowledgement(answer=Answer.BUSY):
+                return "it says that it is not at rest"
+            case Acknowledgement(answer=Answer.OVER | Answer.UNDER):
+                hint = "take everything off it first" if name == "zero" else "more is on it than it can tare"
+                raise self._error(OutOfRangeError, f"{name} refused, {answer.answer}: {hint}")
+            case Acknowledgement(text=text):
+                raise self._error(CommandError, f"{name} refused: {text or 'it does not say why'}")
+
+    def _near_zero(self) -> Settled | None:
+        """None once the display rests near zero, else where it rests when the time for following is over."""
+        end = time.monotonic() + COMMAND_TIME / self._spec.time_scale
+        while True:
+            settled = self._settle()
+            if abs(settled.mass) <= ZERO_STEPS * self._display.step * (1 + 1e-9) + 3.0 * self._spec.repeatability:
+                return None
+            if time.monotonic() > end:
+                return settled
+
+    def _settle(self, *, reference_needed: bool = False) -> Settled:
+        """Ask until the weight has settled."""
+        settling = Settling(self._rule)
+        deadline = time.monotonic() + self._rule.deadline
+        outside_since: float | None = None
+        seen = Reading(Status.SILENT)
+        while time.monotonic() < deadline:
+            self._check_interrupted()
+            if reference_needed:
+                self._check_reference()
+            exchanged = self._exchange()
+            if exchanged is None:  # connected anew
+                deadline, settling = time.monotonic() + self._rule.deadline, Settling(self._rule)
+                continue
+            reading, moment = exchanged
+            seen = reading if reading.status is not Status.SILENT else seen
+            self._check_unit(reading)
+            if reading.status in (Status.OVER, Status.UNDER, Status.ERROR):
+                outside_since = outside_since or moment
+                if moment - outside_since > OUT_OF_RANGE_TIME / self._spec.time_scale:
+                    break
+            else:
+                outside_since = None
+            stable = reading.status is Status.STABLE
+            settled = settling.feed(reading.mass() if stable else None, moment, self._display.step)
+            if settled is not None:
+                self._losses = 0
+                return settled
+        self._check_interrupted()
+        damaged = self._link.counters.damaged
+        raise self._error(*unsettled(seen, self._display.last.shown, self._spec.settling.deadline, damaged))
+
+    def _exchange(self) -> tuple[Reading, float] | None:
+        """One question and its answer; None after the connection was lost and made again."""
+        try:
+            with self._exclusive():
+                self._link.open()
+                reading, moment = self._link.ask()
+                self._display.note(reading, moment)
+                return reading, moment
+        except NoConnectionError as error:
+            self._wait_for_return(error)
+            return None
+
+    def _glance(self) -> None:
+        """Take one reading if that is quickly done."""
+        if self._link.found is None:
+            return
+        try:
+            reading, moment = self._link.ask()
+        except NoConnectionError:
+            self._note_loss()
+        else:
+            self._display.note(reading, moment)
+
+    def _note_loss(self) -> None:
+        self._reference_lost = self._reference_lost or self._tared
+        self._display.lose()
+
+    def _open(self) -> None:
+        """Open for the first time; a port that isn't there then won't come by waiting."""
+        if self._link.found is not None:
+            return
+        try:
+            with self._exclusive():
+                self._link.open()
+        except NoConnectionError as error:
+            self._check_interrupted()
+            raise self._said(error) from error
+
+    def _wait_for_return(self, error: NoConnectionError) -> None:
+        if self._link.found is None:
+            raise self._said(error) from error
+        self._note_loss()
+        self._losses += 1
+        if self._losses > LOSSES:
+            self._losses = 0
+            raise self._error(NoConnectionError, f"its connection comes and goes ({error}); look at cable and plug")
+        try:
+            with self._exclusive():
+                self._link.reopen(time.monotonic() + self._spec.reconnect_time)
+        except NoConnectionError as gone:
+            self._check_interrupted()
+            raise self._said(gone) from gone
+
+    def _said(self, error: NoConnectionError) -> BalanceError:
+        return self._error(type(error), str(error).removeprefix(f"{self._spec.port}: "))
+
+    def _error(self, kind: type[BalanceError], text: str) -> BalanceError:
+        return kind(f"balance {self._name} ({self._spec.port}): {text}")
+
+    def _check_interrupted(self) -> None:
+        if self._interrupted.is_set():
+            raise self._error(BalanceError, "interrupted")
+
+    def _check_reference(self) -> None:
+        if self._reference_lost:
+            raise self._error(ReferenceLostError, LOST_REFERENCE.format(shown=self._display.last.shown or "nothing"))
+
+    def _check_unit(self, reading: Reading) -> None:
+        """Refuse what is no mass; but a unit that lost a letter on the line is none either, so not at once."""
+        strange = reading.value is not None and bool(reading.unit) and reading.mass() is None
+        self._strange_units = self._strange_units + 1 if strange else 0
+        if self._strange_units >= STRANGE_UNITS:
+            self._strange_units = 0
+            raise self._error(
+                UnitError,
+                f"it shows {reading.value} {reading.unit}, and that is no mass that is understood; switch it to g",
+            )
+
+    @contextlib.contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        """The line for one question or command."""
+        if not self._lock.acquire(timeout=self._rule.deadline + self._spec.reconnect_time):
+            raise self._error(BalanceError, "another call has not ended in time")
+        try:
+            yield
+        finally:
+            self._lock.release()

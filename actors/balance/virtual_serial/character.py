@@ -1,0 +1,172 @@
+"""Who sits at the far end of a virtual line: an emulated balance."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+
+from actors.balance.virtual_balance import Load
+from actors.balance.virtual_serial.faults import FaultyDisplay, spoil
+from actors.balance.virtual_serial.scale import Scale, ScaleSettings
+from actors.balance.virtual_serial.voice import VOICES, Repeat, Waiting, weight_line
+
+REPEAT_INTERVAL = 0.2
+"""From one repeated reading to the next [s of bench time]."""
+
+COMMAND_PATIENCE = 5.0
+"""How long a command waits for rest before the balance gives it up [s of bench time]."""
+
+
+class Character(Protocol):
+    """Hears and speaks; knows no ports."""
+
+    def hear(self, data: bytes, now: float) -> None:
+        """Take in what a client sent."""
+        ...
+
+    def speak(self, now: float) -> bytes:
+        """What is to be said by now."""
+        ...
+
+    def due(self, now: float) -> float | None:
+        """When to ask again though nothing was heard; None: not before."""
+        ...
+
+    def control(self, order: dict[str, Any], now: float) -> dict[str, Any]:
+        """Carry out what the one who holds the strings wants; an answer, JSON-ready.
+
+        Raises:
+            KeyError, TypeError, ValueError: an order that isn't known.
+        """
+        ...
+
+
+class Emulation:
+    """A balance that speaks a dialect.
+
+    Args:
+        dialect: one of `voice.VOICES`.
+        settings: of its scale.
+        time_scale: bench seconds per second of the clock; 0: bench time passes by order only.
+        latency: from question to answer [s of the clock].
+        seed: of its chance.
+    """
+
+    def __init__(
+        self, dialect: str, settings: ScaleSettings, time_scale: float, latency: float, seed: tuple[int, ...]
+    ) -> None:
+        self._voice = VOICES[dialect]()
+        self._scale = Scale(settings, seed)
+        self._display = FaultyDisplay(self._scale)
+        self._time_scale, self._latency = time_scale, latency
+        self._rng = np.random.default_rng((*seed, 7))
+        self._heard = bytearray()
+        self._questions = 0
+        self._waiting: tuple[Waiting, float] | None = None
+        self._repeat_at: float | None = None
+        self._unasked_at: float | None = None
+        self._answers: list[tuple[float, bytes]] = []
+        self._now: float | None = None
+
+    def hear(self, data: bytes, now: float) -> None:
+        """See `Character.hear`."""
+        self._advance(now)
+        if self._display.faults.silent:
+            return
+        self._heard += data
+        for command in self._voice.commands(self._heard):
+            self._questions += 1
+            self._repeat_at = None
+            self._carry_out(command, now)
+
+    def speak(self, now: float) -> bytes:
+        """See `Character.speak`."""
+        self._advance(now)
+        faults = self._display.faults
+        if self._waiting is not None:
+            self._wait_on(now)
+        if self._repeat_at is not None and now >= self._repeat_at:
+            self._repeat_at = now + REPEAT_INTERVAL / (self._time_scale or 1.0)
+            self._answers.append((now, self._weight()))
+        ready = b"".join(line for at, line in self._answers if at <= now)
+        self._answers = [(at, line) for at, line in self._answers if at > now]
+        if faults.unasked > 0.0 and now >= (self._unasked_at or 0.0):
+            self._unasked_at = now + faults.unasked
+            at = len(ready) // 2 if faults.interleaved else len(ready)
+            ready = ready[:at] + self._weight() + ready[at:]
+        return b"" if faults.silent else ready
+
+    def due(self, now: float) -> float | None:
+        """See `Character.due`."""
+        times = [at for at, _ in self._answers]
+        if self._repeat_at is not None:
+            times.append(self._repeat_at)
+        if self._display.faults.unasked > 0.0:
+            times.append(self._unasked_at or now)
+        if self._waiting is not None:
+            times.append(now + 0.01)
+        return min(times, default=None)
+
+    def control(self, order: dict[str, Any], now: float) -> dict[str, Any]:
+        """See `Character.control`."""
+        self._advance(now)
+        match order:
+            case {"do": "put", "times": times, "masses": masses}:
+                self._scale.put(Load(tuple(times), tuple(masses)))
+            case {"do": "prepare", "seed": seed}:
+                self._scale.prepare(tuple(seed))
+                self._waiting = self._repeat_at = None
+            case {"do": "faults", **changes}:
+                self._display.set(changes)
+            case {"do": "advance", "seconds": seconds}:
+                self._scale.advance(float(seconds))
+            case {"do": "power cycle"}:
+                self._scale.power_cycle()
+                self._waiting = self._repeat_at = None
+            case {"do": "state"}:
+                return {
+                    "truth": self._scale.truth,
+                    "shown": str(self._display.reading()),
+                    "time": self._scale.time,
+                    "questions": self._questions,
+                }
+            case _:
+                raise ValueError(f"unknown order {order}")
+        return {}
+
+    def _advance(self, now: float) -> None:
+        if self._now is not None and self._time_scale > 0.0:
+            self._scale.advance(max(now - self._now, 0.0) * self._time_scale)
+        self._now = now
+
+    def _carry_out(self, command: bytes, now: float) -> None:
+        said = self._voice.answer(b"?" if self._display.faults.stranger else command, self._display)
+        if isinstance(said, Repeat):
+            self._repeat_at = now
+        elif isinstance(said, Waiting):
+            patience = COMMAND_PATIENCE / self._time_scale if self._time_scale > 0.0 else math.inf
+            self._waiting = (said, now + patience)
+            self._wait_on(now)
+        else:
+            self._say(said, now)
+
+    def _wait_on(self, now: float) -> None:
+        """Carry out the command that waits for rest, or give it up."""
+        assert self._waiting is not None
+        waiting, until = self._waiting
+        if self._scale.stable and not self._display.faults.restless:
+            self._waiting = None
+            self._say(waiting.done(), now)
+        elif now > until and waiting.expired is not None:
+            self._waiting = None
+            self._say(waiting.expired, now)
+
+    def _say(self, line: bytes, now: float) -> None:
+        if line:
+            faults = self._display.faults
+            self._answers.append((now + self._latency + faults.delay, spoil(line, faults, self._rng)))
+
+    def _weight(self) -> bytes:
+        return weight_line(self._voice.dialect, self._display.reading())

@@ -1,0 +1,199 @@
+"""The strings of a virtual balance on a serial line: it runs in a process of its own and dies with this one."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import subprocess
+import sys
+import tempfile
+import threading
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from actors.balance.virtual_balance import Load
+from actors.balance.virtual_serial.scale import ScaleSettings
+from actors.balance.virtual_serial.voice import VOICES
+from actors.protocols import LaboratoryError
+
+PATIENCE = 10.0
+"""How long its process may take to start, or to answer [s]."""
+
+
+class FarProcess:
+    """A process at the far end of a pseudo-terminal.
+
+    Args:
+        settings: for `server.make_character`.
+        baud: speed of the line; 0: any, and characters take no time.
+
+    Raises:
+        LaboratoryError: it did not start.
+    """
+
+    def __init__(self, settings: dict[str, Any], baud: int) -> None:
+        folder = Path(tempfile.mkdtemp(prefix="decant-balance-"))
+        self.port = str(folder / "balance")
+        """Path of the line, which keeps its name when the plug is pulled and put in again."""
+        self._lock = threading.Lock()
+        text = json.dumps({**settings, "link": self.port, "baud": baud})
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "actors.balance.virtual_serial.server", text],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        self._received = b""
+        try:
+            self._answer()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Id of its process."""
+        return self._process.pid
+
+    def unplug(self) -> None:
+        """Pull the plug: the port is gone."""
+        self.order("unplug")
+
+    def plug(self) -> None:
+        """Put it in again: another device under the same name."""
+        self.order("plug")
+
+    def order(self, what: str, **values: Any) -> dict[str, Any]:
+        """Have something done, and wait until it is.
+
+        Raises:
+            LaboratoryError: it can't, or its process is gone.
+        """
+        with self._lock:
+            try:
+                assert self._process.stdin is not None
+                self._process.stdin.write(json.dumps({"do": what, **values}).encode("ascii") + b"\n")
+                self._process.stdin.flush()
+            except (OSError, ValueError) as error:
+                raise LaboratoryError(f"virtual balance at {self.port}: its process is gone") from error
+            return self._answer()
+
+    def close(self) -> None:
+        """End it. May be called again."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+        try:
+            self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        with contextlib.suppress(OSError):
+            Path(self.port).unlink(missing_ok=True)
+            Path(self.port).parent.rmdir()
+
+    def _answer(self) -> dict[str, Any]:
+        stdout = self._process.stdout
+        assert stdout is not None
+        while b"\n" not in self._received:
+            ready, _, _ = select.select([stdout], [], [], PATIENCE)
+            data = stdout.read1() if ready else b""  # type: ignore[attr-defined]
+            if not data:
+                state = "its process has ended" if ready else f"no answer within {PATIENCE:g} s"
+                raise LaboratoryError(f"virtual balance at {self.port}: {state}")
+            self._received += data
+        line, _, self._received = self._received.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise LaboratoryError(f"virtual balance at {self.port}: {answer['error']}")
+        return answer
+
+
+class VirtualSerialBalance(FarProcess):
+    """A virtual balance, started.
+
+    Use `start`; its `port` is what a driver opens.
+    """
+
+    @classmethod
+    def start(
+        cls,
+        dialect: str = "kcp",
+        *,
+        baud: int = 9600,
+        scale: ScaleSettings | None = None,
+        time_scale: float = 1.0,
+        latency: float = 0.01,
+        seed: tuple[int, ...] = (0,),
+    ) -> VirtualSerialBalance:
+        """Start one, empty.
+
+        Args:
+            dialect: one of `voice.VOICES`.
+            baud: speed of the line; 0: any, and characters take no time.
+            scale: what a data sheet says.
+            time_scale: bench seconds per second of the clock; 0: bench time passes by `advance` only.
+            latency: from question to answer [s of the clock].
+            seed: of noise and of faults.
+
+        Raises:
+            LaboratoryError: it did not start.
+        """
+        if dialect not in VOICES:
+            raise LaboratoryError(f"no virtual balance speaks '{dialect}'; there are {', '.join(VOICES)}")
+        settings = {
+            "dialect": dialect,
+            "scale": asdict(scale or ScaleSettings()),
+            "time_scale": time_scale,
+            "latency": latency,
+            "seed": list(seed),
+        }
+        return cls(settings, baud)
+
+    def put(self, load: Load | float) -> None:
+        """What is on it from now on.
+
+        Args:
+            load: a mass [kg], or masses over bench time.
+        """
+        load = load if isinstance(load, Load) else Load((0.0,), (load,))
+        self.order("put", times=list(load.times), masses=list(load.masses))
+
+    def prepare(self, seed: tuple[int, ...]) -> None:
+        """Empty, bench time 0, no tare, noise of a new pour."""
+        self.order("prepare", seed=list(seed))
+
+    def faults(self, **changes: Any) -> None:
+        """Change faults (see `faults.Faults`); others stay as they are."""
+        self.order("faults", **changes)
+
+    def advance(self, seconds: float) -> None:
+        """Bench time passes, whatever the clock says [s]."""
+        self.order("advance", seconds=seconds)
+
+    def power_cycle(self) -> None:
+        """Switch it off and on: tare gone, what is on it is its new zero. The port stays."""
+        self.order("power cycle")
+
+    def state(self) -> dict[str, Any]:
+        """What is on it truly [kg], what it shows, bench time [s], commands heard."""
+        return self.order("state")
+
+
+class RecordedBalance(FarProcess):
+    """Plays a recording to a client that asks."""
+
+    @classmethod
+    def start(cls, recording: Path, *, speed: float = 1.0) -> RecordedBalance:
+        """Start playing; unasked bytes come at their times, answers after their questions.
+
+        Args:
+            recording: file made by `python -m actors.balance.record`.
+            speed: so much faster than it was.
+
+        Raises:
+            LaboratoryError: it did not start.
+        """
+        return cls({"recording": str(recording), "speed": speed}, baud=0)

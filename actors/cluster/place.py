@@ -1,0 +1,88 @@
+"""Where an actor runs in a cluster, and whether that machine is still there."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+_PATIENCE = 2.0
+"""Longest time for a node's own process to accept a connection [s]."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node as Ray's table has it.
+
+    Attributes:
+        id: Ray's.
+        host: name and address, for people.
+        address, port: of the process that every node has (the raylet).
+        cpus: cores that Ray gives out.
+    """
+
+    id: str
+    host: str
+    address: str
+    port: int
+    cpus: int
+
+
+def living_nodes() -> dict[str, Node]:
+    """Nodes that Ray takes for alive, by id. Blocks for some milliseconds."""
+    import ray
+
+    return {
+        node["NodeID"]: Node(
+            node["NodeID"],
+            f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})",
+            node["NodeManagerAddress"],
+            int(node["NodeManagerPort"]),
+            int(node["Resources"].get("CPU", 0.0)),
+        )
+        for node in ray.nodes()
+        if node["Alive"]
+    }
+
+
+@dataclass(frozen=True)
+class Place:
+    """One node, for actors that may run there only.
+
+    Attributes:
+        node: which.
+        options: what Ray has to be told to put an actor there.
+    """
+
+    node: Node
+    options: Mapping[str, Any]
+
+    async def is_gone(self) -> bool:
+        """Whether the node has died. Ray itself takes fifteen seconds to be sure of that; a dead node's raylet refuses
+        connections at once."""
+        if self.node.id not in await asyncio.to_thread(living_nodes):
+            return True
+        try:
+            _, writer = await asyncio.wait_for(
+                asyncio.open_connection(self.node.address, self.node.port), timeout=_PATIENCE
+            )
+        except ConnectionRefusedError:
+            return True
+        except (OSError, TimeoutError):
+            return False  # a lost packet is no death: Ray decides
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+        return False
+
+
+def this_node() -> Place:
+    """The node that this program is connected to; without it the program can't go on anyway."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    id_ = ray.get_runtime_context().get_node_id()
+    strategy = NodeAffinitySchedulingStrategy(id_, soft=False)
+    return Place(living_nodes()[id_], {"scheduling_strategy": strategy})

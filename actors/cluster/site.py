@@ -1,0 +1,118 @@
+"""A laboratory's ground on a cluster: who simulates, where the bench stands, and what becomes of both."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from actors.cluster.place import Node, Place, living_nodes, this_node
+from actors.protocols import LaboratoryError, Notice
+from actors.spec import RaySpec
+
+LOOK_INTERVAL = 2.0
+"""Time between two looks at the nodes [s]."""
+
+RESERVE_DEADLINE = 20.0
+"""Longest time to get hold of the bench [s]."""
+
+
+@dataclass
+class Site:
+    """The cluster that this program has joined, while it is in it.
+
+    Args:
+        spec: which cluster.
+        tell: told of nodes that come and go.
+        bench_lost: called with the reason when the bench's node has died.
+        grown: called with the number of cores when there are more.
+    """
+
+    spec: RaySpec
+    tell: Callable[[Notice], None]
+    bench_lost: Callable[[str], None]
+    grown: Callable[[int], None] = lambda cpus: None
+    bench: Place | None = None
+    here: Place = field(init=False)
+    _nodes: dict[str, Node] = field(default_factory=dict)
+    _dead: set[str] = field(default_factory=set)
+    _bundle: Any = None
+    _watching: asyncio.Task[None] | None = None
+
+    @property
+    def cpus(self) -> int:
+        """Cores of all nodes."""
+        return sum(node.cpus for node in self._nodes.values())
+
+    async def open(self, *, need_bench: bool) -> None:
+        """Look around, and reserve the bench for this program if it is needed.
+
+        Raises:
+            LaboratoryError: no node has the bench's resource, or another program has it.
+        """
+        self._nodes = await asyncio.to_thread(living_nodes)
+        self.here = await asyncio.to_thread(this_node)
+        if need_bench:
+            self.bench = await self._reserve()
+        self._watching = asyncio.create_task(self._watch())
+        bench = "" if self.bench is None else f"; the bench is on {self.bench.node.host}"
+        nodes = f"{len(self._nodes)} node(s), {self.cpus} core(s)"
+        self.tell(Notice("info", f"on the Ray cluster at {self.spec.address}: {nodes}{bench}"))
+
+    async def close(self) -> None:
+        """Give the bench back."""
+        if self._watching is not None:
+            self._watching.cancel()
+            await asyncio.wait({self._watching})
+        if self._bundle is not None:
+            from ray.util.placement_group import remove_placement_group
+
+            with contextlib.suppress(Exception):
+                await asyncio.to_thread(remove_placement_group, self._bundle)
+
+    async def _reserve(self) -> Place:
+        """All of the bench's resource on one node: a second program can't move the same arm."""
+        from ray.util.placement_group import placement_group, placement_group_table
+        from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+
+        name = self.spec.bench_resource
+        self._bundle = placement_group([{name: 1.0}], strategy="STRICT_PACK")
+        if not await asyncio.to_thread(self._bundle.wait, RESERVE_DEADLINE):
+            raise LaboratoryError(
+                f"Ray cluster at {self.spec.address}: '{name}' can't be had; no node offers it, or another program has "
+                "the bench"
+            )
+        id_ = (await asyncio.to_thread(placement_group_table, self._bundle))["bundles_to_node_id"][0]
+        strategy = PlacementGroupSchedulingStrategy(self._bundle, placement_group_bundle_index=0)
+        return Place(self._nodes[id_], {"scheduling_strategy": strategy})
+
+    async def _watch(self) -> None:
+        """Compare the nodes with those of the last look."""
+        while True:
+            await asyncio.sleep(LOOK_INTERVAL)
+            try:
+                now = await asyncio.to_thread(living_nodes)
+                bench_gone = self.bench is not None and self.bench.node.id in self._nodes and await self.bench.is_gone()
+            except Exception:
+                continue  # the head may be busy; if it is dead, Ray ends this program
+            if bench_gone and self.bench is not None:
+                self._dead.add(self.bench.node.id)  # Ray will list it for a while yet
+            self._compare({id_: node for id_, node in now.items() if id_ not in self._dead})
+
+    def _compare(self, now: dict[str, Node]) -> None:
+        before, self._nodes = self._nodes, now
+        for id_ in before.keys() - now.keys():
+            host = before[id_].host
+            left = f"simulations go on with {self.cpus} core(s) on {len(now)} node(s)"
+            if self.bench is not None and id_ == self.bench.node.id:
+                reason = f"the bench's machine {host} is lost; no pour can be made until it is back"
+                self.tell(Notice("error", f"{reason}; {left}"))
+                self.bench_lost(reason)
+            else:
+                self.tell(Notice("warning", f"machine {host} is lost; {left}"))
+        for id_ in now.keys() - before.keys():
+            self.tell(Notice("info", f"machine {now[id_].host} has joined with {now[id_].cpus} core(s)"))
+        if now.keys() - before.keys():
+            self.grown(self.cpus)

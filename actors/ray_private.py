@@ -1,0 +1,171 @@
+"""A Ray of our own: on this machine only, and with nothing left behind.
+
+It runs with stated memory, without dashboard or usage statistics, on the loopback interface, with a token of its own,
+in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed at the next
+start. `actors.ray_warden` cleans up behind a program that was killed. `actors.ray_runtime` decides when.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import secrets
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import TextIOWrapper
+from pathlib import Path
+
+from actors.protocols import LaboratoryError
+from actors.ray_warden import MARK, end_cluster
+from actors.spec import LaboratorySpec
+
+_LONGEST_FOLDER = 40
+"""Ray puts sockets some 65 characters below its folder, and a socket's path may have 107."""
+
+_TOKEN = secrets.token_hex(32)
+"""Without it nobody else on this machine may talk to our Ray. One per process, since Ray reads it only once."""
+
+
+def simulator_count(spec: LaboratorySpec) -> int:
+    """Size of the pool: as stated, or one per core."""
+    return spec.simulators or os.cpu_count() or 1
+
+
+@dataclass
+class PrivateRay:
+    """What holds it: its folder, the lock on it, and the process that cleans up behind us."""
+
+    folder: Path
+    lock: TextIOWrapper
+    warden: subprocess.Popen[bytes]
+
+    def settings(self) -> dict[str, str]:
+        """What has to be in the environment before Ray starts (`actors.ray_settings`)."""
+        return {
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN_PATH": str(self.folder / "token"),
+            "RAY_USAGE_STATS_ENABLED": "0",
+            "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+            # Makes Ray take 127.0.0.1 for the node's address and listen there only. On Windows and macOS that is its
+            # habit; on Linux it would offer itself to the network.
+            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+        }
+
+
+def _root() -> Path:
+    """Private folder for the clusters of this user."""
+    base = Path(tempfile.gettempdir())
+    name = f"decant-{os.getuid()}"
+    if len(str(base / name)) > _LONGEST_FOLDER - 10:
+        base = Path("/tmp")
+    root = base / name
+    root.mkdir(mode=0o700, exist_ok=True)
+    status = root.lstat()
+    if root.is_symlink() or status.st_uid != os.getuid():
+        raise LaboratoryError(f"{root} belongs to somebody else; remove it or set TMPDIR to a folder of your own")
+    root.chmod(0o700)
+    return root
+
+
+@contextlib.contextmanager
+def _only_one(root: Path) -> Iterator[None]:
+    """One process at a time makes or removes cluster folders."""
+    with (root / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def prune_clusters(root: Path | None = None) -> list[Path]:
+    """Remove the clusters of programs that are gone, with processes that are left of them.
+
+    A living program holds a lock on its cluster's `alive` file; the system drops it whatever way the program ends.
+
+    Returns:
+        The folders removed.
+    """
+    root = root or _root()
+    removed = []
+    for folder in sorted(p for p in root.iterdir() if p.is_dir()):
+        with contextlib.suppress(OSError), (folder / "alive").open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            end_cluster(folder)
+            removed.append(folder)
+    return removed
+
+
+def open_private() -> PrivateRay:
+    """A folder for it, a token, and a warden; nothing of Ray runs yet."""
+    root = _root()
+    with _only_one(root):
+        prune_clusters(root)
+        folder = Path(tempfile.mkdtemp(prefix="", dir=root))
+        lock = (folder / "alive").open("w")
+        fcntl.flock(lock, fcntl.LOCK_EX)
+    token = folder / "token"
+    token.touch(mode=0o600)
+    token.write_text(_TOKEN)
+    warden = subprocess.Popen(
+        [sys.executable, "-m", "actors.ray_warden", str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C in the terminal is not meant for it
+    )
+    return PrivateRay(folder, lock, warden)
+
+
+def close_private(private: PrivateRay) -> None:
+    """End all its processes and remove its folder."""
+    end_cluster(private.folder, patience=15.0)
+    private.lock.close()
+    if private.warden.stdin is not None:
+        private.warden.stdin.close()
+    try:
+        private.warden.wait(timeout=15.0)
+    except subprocess.TimeoutExpired:
+        private.warden.kill()
+        private.warden.wait()
+
+
+def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
+    """Start Ray's processes and connect to them; its settings must be in place. Linux ends them with this thread.
+
+    Raises:
+        LaboratoryError: Ray listens elsewhere than on the loopback interface.
+    """
+    import ray
+
+    os.environ[MARK] = str(private.folder)
+    try:
+        for attempt in range(3):
+            try:
+                ray.init(
+                    address="local",
+                    num_cpus=simulator_count(spec),
+                    num_gpus=0,
+                    object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
+                    include_dashboard=False,
+                    logging_level=logging.ERROR,
+                    log_to_driver=False,
+                    _temp_dir=str(private.folder),
+                    _node_ip_address="127.0.0.1",
+                )
+                break
+            except Exception:
+                # Two programs that start at once may be given the same free port.
+                ray.shutdown()
+                if attempt == 2:
+                    raise
+                time.sleep(1.0 + attempt)
+    finally:
+        # Programs that this one starts later are not Ray's and must not be ended with it.
+        del os.environ[MARK]
+    address = ray.util.get_node_ip_address()
+    if address != "127.0.0.1":
+        raise LaboratoryError(f"Ray listens on {address} instead of this machine only; was it imported too early?")

@@ -1,0 +1,348 @@
+"""The controller: one tick per control cycle runs the program, moves the arm and watches over both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+
+from actors.virtual_ur.exchange import Registers, Signals
+from actors.virtual_ur.messages import Listener, Message
+from actors.virtual_ur.models import HOME, Joints, RobotModel
+from actors.virtual_ur.motion.mover import ViolationError
+from actors.virtual_ur.power import Power, RobotMode
+from actors.virtual_ur.robot import Robot
+from actors.virtual_ur.safety import Safety, SafetyConfiguration, SafetyMode
+from actors.virtual_ur.urscript.errors import ScriptError
+from actors.virtual_ur.urscript.program import Program
+from actors.virtual_ur.watchdogs import Watchdogs
+
+
+class RuntimeState(IntEnum):
+    """Of the program, as RTDE reports it."""
+
+    STOPPING = 0
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+    RESUMING = 5
+
+
+_POWERLESS = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.FAULT)
+"""Modes in which the arm has no power."""
+
+
+Watcher = Callable[[], bool]
+"""Called each cycle until it returns True."""
+
+
+class Controller:
+    """One robot with its controller. Knows no sockets; servers read and write it between ticks.
+
+    Args:
+        model: which robot.
+        frequency: control cycles per second of controller time [Hz].
+        time_scale: controller seconds per wall second; only watchdogs care.
+        mode: of power, to begin with.
+        remote: remote control is on.
+        joints: where the arm stands [rad].
+        configuration: safety limits; the model's own by default.
+
+    Attributes:
+        now: controller time [s].
+        switches: how often somebody switched between remote and local control.
+    """
+
+    def __init__(
+        self,
+        model: RobotModel,
+        *,
+        frequency: float | None = None,
+        time_scale: float = 1.0,
+        mode: RobotMode = RobotMode.RUNNING,
+        remote: bool = True,
+        joints: Joints = HOME,
+        configuration: SafetyConfiguration | None = None,
+    ) -> None:
+        from actors.virtual_ur.commands import commands_of
+
+        self.model = model
+        self.frequency = frequency or model.frequency
+        self.dt = 1.0 / self.frequency
+        self.time_scale = time_scale
+        self.remote = remote
+        self.switches = 0
+        self.now = 0.0
+        self.ticks = 0
+        configuration = configuration or SafetyConfiguration.of(model)
+        self.safety = Safety(configuration)
+        self.power = Power(mode)
+        self.robot = Robot(model, joints, configuration)
+        self.registers = Registers()
+        self.signals = Signals()
+        self.runtime = RuntimeState.STOPPED
+        self.program: Program | None = None
+        self.secondary: list[Program] = []
+        self.running: Program | None = None
+        self.watchdogs = Watchdogs()
+        self.watchers: list[Watcher] = []
+        self.listeners: list[Listener] = []
+        self.popup: str | None = None
+        self.safety_popup = False
+        self._resumes = False
+        self._commands = commands_of(self)
+
+    # ---- telling
+
+    def tell(self, kind: str, text: str, line: int = 0) -> None:
+        """Give a message to all who listen."""
+        message = Message(kind, text.encode("utf-8", "replace").decode("utf-8"), line, self.now)
+        for listener in self.listeners:
+            listener(message)
+
+    # ---- programs
+
+    @property
+    def playing(self) -> bool:
+        """Whether a program runs."""
+        return self.runtime is RuntimeState.PLAYING
+
+    def upload(self, text: str) -> None:
+        """Run a program; one that runs is ended. What can't be run is refused with a message."""
+        try:
+            program = Program(text, self._commands)
+        except ScriptError as error:
+            self.tell("exception", f"compile error: {error.text}", error.line)
+            return
+        if program.secondary:
+            self.secondary.append(program)
+            return
+        if not (self.power.running and self.safety.may_move):
+            self.tell("key", f"program {program.name} not started: the robot is not ready")
+            return
+        if self.runtime in (RuntimeState.PAUSED, RuntimeState.PAUSING):
+            # Seen with the manufacturer's simulator: the first upload only ends the program that is held.
+            self.tell("key", f"program {program.name} not started: a paused program was stopped instead")
+            self.stop()
+            return
+        self._drop_program()
+        self.robot.mover.thaw()
+        self.program = program
+        self.runtime = RuntimeState.PLAYING
+        self.tell("key", f"program {program.name} started")
+
+    @property
+    def local(self) -> bool:
+        """Whether commands over the network are refused. CB3 controllers know no such thing."""
+        return self.model.remote_control and not self.remote
+
+    def stop(self) -> None:
+        """End the program; the arm comes to rest."""
+        if self.program is not None:
+            self.tell("key", f"program {self.program.name} stopped")
+        self._drop_program()
+
+    def pause(self) -> bool:
+        """Hold program and arm. Returns whether there was anything to hold."""
+        if not self.playing:
+            return False
+        self.runtime = RuntimeState.PAUSING
+        self.robot.mover.freeze()
+        return True
+
+    def play(self) -> bool:
+        """Go on with a program that is held. Returns whether that is possible."""
+        held = self.program is not None and self.runtime in (RuntimeState.PAUSED, RuntimeState.PAUSING)
+        if not held or not self.safety.may_move or not self.power.running:
+            return False
+        self.robot.mover.thaw()
+        self.runtime = RuntimeState.PLAYING
+        return True
+
+    def _drop_program(self) -> None:
+        self.program = None
+        self.watchdogs.clear()
+        self._resumes = False
+        self.robot.mover.abandon()
+        if self.runtime is not RuntimeState.STOPPED:
+            self.runtime = RuntimeState.STOPPING
+
+    # ---- safety
+
+    def protective_stop(self, reason: str) -> None:
+        """Stop the arm, hold the program; to be unlocked by a person."""
+        self.safety.protective_stop(self.now)
+        self.safety_popup = True
+        self._hold()
+        self._resumes = False
+        self.tell("safety", f"protective stop: {reason}")
+
+    def emergency_stop(self, *, system: bool = False) -> None:
+        """Stop the arm, end the program, switch off."""
+        self.safety.emergency_stop(system=system)
+        self._drop_program()
+        self.robot.mover.freeze()
+        self.tell("safety", "emergency stop")
+
+    def release_emergency_stop(self) -> None:
+        """The button is pulled out; power stays off."""
+        self.safety.release_emergency_stop()
+        self.tell("safety", "emergency stop released")
+
+    def safety_fault(self) -> None:
+        """The safety system fails: stop, off, and only a restart helps."""
+        self.safety.fault = True
+        self._drop_program()
+        self.robot.mover.freeze()
+        self.tell("safety", "fault")
+
+    def configure_safety(self, configuration: SafetyConfiguration) -> None:
+        """Other limits, with another checksum."""
+        self.safety.configuration = configuration
+        self.robot.configure(configuration)
+        self.tell("key", f"safety checksum changed to {configuration.checksum}")
+
+    def set_remote(self, active: bool) -> None:
+        """Somebody switches between remote and local control; a program that came over the network ends."""
+        if self.remote != active:
+            self.stop()
+            self.remote = active
+            self.switches += 1
+
+    def reboot(self) -> None:
+        """As after a power cut: everything but the safety configuration and the remote switch is forgotten."""
+        self.power_off()
+        self.runtime = RuntimeState.STOPPED
+        self.now = 0.0
+        self.robot.forget()
+        self.secondary.clear()
+        self.watchers.clear()
+        self.safety.restart()
+        self.robot.mover.place(self.robot.mover.q)
+        self.robot.mover.slider = 1.0
+        for store in (self.registers.input_int, self.registers.output_int):
+            store[:] = [0] * len(store)
+        for values in (self.registers.input_double, self.registers.output_double):
+            values[:] = [0.0] * len(values)
+        self.signals.digital_out = 0
+
+    def set_safeguard(self, active: bool) -> None:
+        """Someone enters or leaves the guarded area. Without a reset button, as here, the program goes on by itself."""
+        was = self.safety.safeguard
+        self.safety.safeguard = active
+        if active and not was:
+            self._resumes = self.playing
+            self._hold()
+            self.tell("safety", "safeguard stop")
+        elif was and not active and self._resumes:
+            self._resumes = False
+            self.play()
+
+    def _hold(self) -> None:
+        self.robot.mover.freeze()
+        if self.playing:
+            self.runtime = RuntimeState.PAUSING
+
+    def unlock_protective_stop(self) -> str | None:
+        """A person has seen to the cause. Returns why it can't be unlocked yet, or None."""
+        refusal = self.safety.unlock(self.now)
+        if refusal is None:
+            self.safety_popup = False
+            self.tell("safety", "protective stop unlocked")
+        return refusal
+
+    def power_on(self) -> str | None:
+        """Switch on. Returns why not, or None."""
+        if self.safety.mode in _POWERLESS:
+            return "Failed to execute: power on"
+        self.power.on(self.now)
+        return None
+
+    def release_brakes(self) -> str | None:
+        """Release the brakes. Returns why not, or None."""
+        if self.safety.mode in _POWERLESS:
+            return "Failed to execute: brake release"
+        self.power.release_brakes(self.now)
+        return None
+
+    def restart_safety(self) -> None:
+        """After a fault: everything off."""
+        self.power_off()
+        self.safety.restart()
+
+    def power_off(self) -> None:
+        """Brakes close, the program ends."""
+        self._drop_program()
+        self.power.off()
+
+    # ---- time
+
+    def tick(self) -> None:
+        """One control cycle."""
+        self.ticks += 1
+        self.now += self.dt
+        self.power.step(self.now)
+        for watcher in list(self.watchers):
+            if watcher() and watcher in self.watchers:  # what it does may have cleared the list
+                self.watchers.remove(watcher)
+        if self.runtime is RuntimeState.PLAYING:
+            due = self.watchdogs.step(self.dt / self.time_scale)
+            if due is not None:
+                self._bite(*due)
+            else:
+                self._run()
+        if self.secondary:
+            self._run_secondary()
+        try:
+            self.robot.step(self.now, self.dt)
+        except (ViolationError, ValueError, ArithmeticError) as violation:
+            # Whatever can't be computed must not move: the mover keeps its last targets and brakes.
+            self.robot.mover.freeze()
+            if self.safety.may_move:
+                self.protective_stop(str(violation))
+        if self.runtime in (RuntimeState.STOPPING, RuntimeState.PAUSING) and not self._in_motion():
+            self.runtime = RuntimeState.STOPPED if self.runtime is RuntimeState.STOPPING else RuntimeState.PAUSED
+        if not self.safety.may_move:
+            self._after_stop()
+
+    def _bite(self, action: str, why: str) -> None:
+        self.tell("key", why)
+        if action == "pause":
+            self.pause()
+        else:
+            self.stop()
+
+    def _in_motion(self) -> bool:
+        return any(abs(v) > 1e-6 for v in self.robot.mover.qd)
+
+    def _after_stop(self) -> None:
+        if self.safety.mode in _POWERLESS and self.power.powered and not self._in_motion():
+            self.power.off()
+
+    def _run(self) -> None:
+        program = self.program
+        if program is None:
+            return
+        self.running = program
+        try:
+            goes_on = program.tick()
+        except ScriptError as error:
+            self.tell("exception", error.text, error.line)
+            goes_on = False
+        finally:
+            self.running = None
+        if not goes_on and self.program is program:
+            self.stop()
+
+    def _run_secondary(self) -> None:
+        alive = []
+        for program in self.secondary:
+            self.running = program
+            try:
+                if program.tick():
+                    alive.append(program)
+            except ScriptError as error:
+                self.tell("exception", error.text, error.line)
+            finally:
+                self.running = None
+        self.secondary = alive

@@ -1,0 +1,1 @@
+"""How the arm moves: profiles in time, lines in space, and the mover that follows them cycle by cycle."""

@@ -1,0 +1,1 @@
+"""URScript: read, translated into Python generators, and run one control cycle at a time."""

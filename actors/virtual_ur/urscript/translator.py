@@ -1,0 +1,303 @@
+"""From a tree to Python generators, which give way once per control cycle.
+
+Every name gets a prefix, every constant is written by repr, and the code runs without Python's built-in functions: a
+program can reach nothing but the commands it is given. Only functions that may wait (directly or by what they call)
+become generators; the others stay plain, for they are called hundreds of times a second.
+
+Scopes follow the manual: a name declared `global` anywhere is global wherever it isn't declared `local` or a parameter;
+any other is local to the function that assigns it. Lists and poses are values: they are copied where they are given on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from actors.virtual_ur.urscript.errors import ScriptError
+from actors.virtual_ur.urscript.tree import (
+    Assign,
+    Branch,
+    Call,
+    Evaluate,
+    Expression,
+    Function,
+    Index,
+    Items,
+    Literal,
+    Loop,
+    Name,
+    Operation,
+    Simple,
+    Statement,
+)
+
+_OPERATORS = {"and": "and", "or": "or", "==": "==", "!=": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
+_HELPERS = {"+": "_add", "-": "_sub", "*": "_mul", "/": "_div", "%": "_mod", "xor": "_xor"}
+
+
+class Translation:
+    """Python for one program.
+
+    Args:
+        program: what was read.
+        commands: what a program may call; True for those that wait.
+
+    Attributes:
+        source: Python, defining `main`.
+        lines: for each line of the source, from 0, the program's.
+
+    Raises:
+        ScriptError: an unknown function, a wrong use of one, or a name that is no function.
+    """
+
+    def __init__(self, program: Function, commands: Mapping[str, bool]) -> None:
+        self._commands = commands
+        self._functions = {f.name: f for f in _functions(program.body)}
+        self._globals = _names(s for s in _assignments(program) if s.scope == "global")
+        self._waiting = self._find_waiting()
+        self._out: list[str] = []
+        self.lines: list[int] = []
+        self._line = program.line
+        self._define(program, "main", 0, main=True)
+        self.source = "\n".join(self._out) + "\n"
+
+    # ---- which functions wait
+
+    def _find_waiting(self) -> set[str]:
+        calls = {name: set(_calls(f.body)) for name, f in self._functions.items()}
+        waiting = {name for name, f in self._functions.items() if f.kind == "thread" or _pauses(f.body)}
+        waiting |= {name for name, waits in self._commands.items() if waits and name not in self._functions}
+        while True:
+            more = {name for name, called in calls.items() if called & waiting} - waiting
+            if not more:
+                return waiting
+            waiting |= more
+
+    # ---- statements
+
+    def _emit(self, depth: int, text: str) -> None:
+        self._out.append("    " * depth + text)
+        self.lines.append(self._line)
+
+    def _define(self, function: Function, python_name: str, depth: int, *, main: bool = False) -> None:
+        self._line = function.line
+        parameters = ", ".join(
+            f"v_{name}" + ("" if default is None else f"={self._value(default)}")
+            for name, default in function.parameters
+        )
+        if len({name for name, _ in function.parameters}) < len(function.parameters):
+            raise ScriptError(f"two parameters of '{function.name}' have the same name", function.line)
+        self._emit(depth, f"def {python_name}({parameters}):")
+        own = {name for name, _ in function.parameters}
+        own |= _names(s for s in _assignments(function, nested=False) if s.scope == "local")
+        assigned = _names(_assignments(function, nested=False))
+        shared = sorted((assigned & self._globals) - own)
+        if shared:
+            self._emit(depth + 1, "global " + ", ".join(f"v_{name}" for name in shared))
+        for name, _ in function.parameters:
+            if name in _changed_entries(function):
+                self._emit(depth + 1, f"v_{name} = _copy(v_{name})")
+        for inner in _own_functions(function.body):
+            self._define(inner, f"f_{inner.name}", depth + 1)
+        self._body(function.body, depth + 1)
+        if main or function.name in self._waiting:
+            self._emit(depth + 1, "return")
+            self._emit(depth + 1, "yield")
+
+    def _body(self, statements: tuple[Statement, ...], depth: int) -> None:
+        for statement in statements:
+            if not isinstance(statement, Function):
+                self._line = statement.line
+                self._statement(statement, depth)
+        self._emit(depth, "pass")
+
+    def _statement(self, statement: Statement, depth: int) -> None:
+        match statement:
+            case Assign(Name(name), None):
+                if statement.scope == "local":
+                    self._emit(depth, f"v_{name} = 0")
+            case Assign(target, value) if value is not None:
+                given = self._value(value)
+                if isinstance(value, Name | Index):
+                    given = f"_copy({given})"
+                self._emit(depth, f"{self._target(target)} = {given}")
+            case Evaluate(value):
+                self._emit(depth, self._value(value))
+            case Branch(cases):
+                for number, (condition, body) in enumerate(cases):
+                    if condition is None:
+                        self._emit(depth, "else:")
+                    else:
+                        self._emit(depth, f"{'if' if number == 0 else 'elif'} {self._value(condition)}:")
+                    self._body(body, depth + 1)
+            case Loop(condition, body):
+                self._emit(depth, f"while {self._value(condition)}:")
+                self._emit(depth + 1, "_loop()")
+                self._body(body, depth + 1)
+            case Simple():
+                self._simple(statement, depth)
+
+    def _simple(self, statement: Simple, depth: int) -> None:
+        value = "" if statement.value is None else self._value(statement.value)
+        match statement.word:
+            case "return":
+                returned = f"_copy({value})" if isinstance(statement.value, Name | Index) else value
+                self._emit(depth, f"return {returned}")
+            case "kill":
+                self._emit(depth, f"_kill({value})")
+            case "join":
+                self._emit(depth, f"yield from _join({value})")
+            case "halt":
+                self._emit(depth, "_halt()")
+            case "enter_critical" | "exit_critical":
+                self._emit(depth, f"_{statement.word}()")
+            case word:
+                self._emit(depth, word)
+
+    def _target(self, target: Name | Index) -> str:
+        if isinstance(target, Name):
+            return f"v_{target.name}"
+        return self._entry(target)
+
+    # ---- expressions
+
+    def _value(self, expression: Expression) -> str:
+        match expression:
+            case Literal(value):
+                return f"({value!r})" if isinstance(value, int | float) and not isinstance(value, bool) else repr(value)
+            case Name(name):
+                return f"v_{name}"
+            case Items(items, pose):
+                inner = ", ".join(f"_copy({self._value(i)})" if isinstance(i, Name) else self._value(i) for i in items)
+                return f"_pose([{inner}])" if pose else f"[{inner}]"
+            case Index():
+                return self._entry(expression)
+            case Operation(operator, operands):
+                return self._operation(operator, [self._value(o) for o in operands])
+            case Call():
+                return self._call(expression)
+
+    def _entry(self, index: Index) -> str:
+        text = self._value(index.value)
+        for at in index.at:
+            if isinstance(at, Literal) and type(at.value) is int and at.value >= 0:
+                text += f"[{at.value}]"
+            else:
+                text += f"[_index({self._value(at)})]"
+        return text
+
+    def _operation(self, operator: str, operands: list[str]) -> str:
+        if len(operands) == 1:
+            return f"(not {operands[0]})" if operator == "not" else f"_neg({operands[0]})"
+        if operator in _HELPERS:
+            return f"{_HELPERS[operator]}({operands[0]}, {operands[1]})"
+        return f"({operands[0]} {_OPERATORS[operator]} {operands[1]})"
+
+    def _call(self, call: Call) -> str:
+        function = self._functions.get(call.name)
+        given = [self._value(a) for a in call.arguments]
+        given += [f"{'' if function is None else 'v_'}{name}={self._value(value)}" for name, value in call.named]
+        if call.thread:
+            if function is None or function.kind != "thread":
+                raise ScriptError(f"'{call.name}' is not a thread", call.line)
+            return f"_run({', '.join([f'f_{call.name}', *given])})"
+        if function is None and call.name not in self._commands:
+            raise ScriptError(f"name '{call.name}' is not defined", call.line)
+        if function is not None and function.kind == "thread":
+            raise ScriptError(f"'{call.name}' is a thread: start it with run", call.line)
+        name = f"f_{call.name}" if function is not None else f"c_{call.name}"
+        text = f"{name}({', '.join(given)})"
+        return f"(yield from {text})" if call.name in self._waiting else text
+
+
+# ---- what stands where in a tree
+
+
+def _names(assignments: Iterable[Assign]) -> set[str]:
+    return {s.target.name for s in assignments if isinstance(s.target, Name)}
+
+
+def _inner(statement: Statement) -> Iterator[tuple[Statement, ...]]:
+    match statement:
+        case Branch(cases):
+            for _, body in cases:
+                yield body
+        case Loop(_, body):
+            yield body
+
+
+def _walk(body: tuple[Statement, ...], *, nested: bool = True) -> Iterator[Statement]:
+    for statement in body:
+        yield statement
+        if isinstance(statement, Function):
+            if nested:
+                yield from _walk(statement.body)
+        else:
+            for inner in _inner(statement):
+                yield from _walk(inner, nested=nested)
+
+
+def _functions(body: tuple[Statement, ...]) -> Iterator[Function]:
+    return (s for s in _walk(body) if isinstance(s, Function))
+
+
+def _own_functions(body: tuple[Statement, ...]) -> Iterator[Function]:
+    return (s for s in _walk(body, nested=False) if isinstance(s, Function))
+
+
+def _assignments(function: Function, *, nested: bool = True) -> Iterator[Assign]:
+    return (s for s in _walk(function.body, nested=nested) if isinstance(s, Assign))
+
+
+def _changed_entries(function: Function) -> set[str]:
+    changed = set()
+    for assignment in _assignments(function, nested=False):
+        target: Expression = assignment.target
+        while isinstance(target, Index):
+            target = target.value
+            if isinstance(target, Name):
+                changed.add(target.name)
+    return changed
+
+
+def _pauses(body: tuple[Statement, ...]) -> bool:
+    return any(isinstance(s, Simple) and s.word == "join" for s in _walk(body, nested=False))
+
+
+def _calls(body: tuple[Statement, ...]) -> Iterator[str]:
+    for statement in _walk(body, nested=False):
+        for expression in _expressions(statement):
+            yield from _called(expression)
+
+
+def _expressions(statement: Statement) -> Iterator[Expression]:
+    match statement:
+        case Assign(target, value):
+            yield target
+            if value is not None:
+                yield value
+        case Evaluate(value):
+            yield value
+        case Branch(cases):
+            yield from (condition for condition, _ in cases if condition is not None)
+        case Loop(condition):
+            yield condition
+        case Simple(_, value) if value is not None:
+            yield value
+
+
+def _called(expression: Expression) -> Iterator[str]:
+    match expression:
+        case Call(name, arguments, named, thread):
+            if not thread:
+                yield name
+            for inner in (*arguments, *(value for _, value in named)):
+                yield from _called(inner)
+        case Items(items):
+            for inner in items:
+                yield from _called(inner)
+        case Index(value, at):
+            for inner in (value, *at):
+                yield from _called(inner)
+        case Operation(_, operands):
+            for inner in operands:
+                yield from _called(inner)

@@ -1,0 +1,161 @@
+"""Real-time data exchange (port 30004): frames, field types, recipes.
+
+A frame is `uint16 size, uint8 type, payload`, big-endian, the size including these three bytes.
+
+Source: the manufacturer's RTDE guide; what real clients send was measured.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+REQUEST_PROTOCOL_VERSION = ord("V")
+GET_URCONTROL_VERSION = ord("v")
+TEXT_MESSAGE = ord("M")
+DATA_PACKAGE = ord("U")
+SETUP_OUTPUTS = ord("O")
+SETUP_INPUTS = ord("I")
+START = ord("S")
+PAUSE = ord("P")
+
+HEADER = struct.Struct(">HB")
+
+FORMATS: dict[str, tuple[str, int]] = {
+    "BOOL": ("?", 1),
+    "UINT8": ("B", 1),
+    "UINT32": ("I", 1),
+    "UINT64": ("Q", 1),
+    "INT32": ("i", 1),
+    "DOUBLE": ("d", 1),
+    "VECTOR3D": ("3d", 3),
+    "VECTOR6D": ("6d", 6),
+    "VECTOR6INT32": ("6i", 6),
+    "VECTOR6UINT32": ("6I", 6),
+}
+"""Struct format and number of values by RTDE type."""
+
+
+class FramingError(Exception):
+    """Bytes that can't be a frame: the stream can't be followed any more."""
+
+
+def frame(kind: int, payload: bytes) -> bytes:
+    """One frame."""
+    return HEADER.pack(HEADER.size + len(payload), kind) + payload
+
+
+class Frames:
+    """Cuts a stream into frames."""
+
+    def __init__(self) -> None:
+        self._rest = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Take bytes; give each complete frame's type and payload.
+
+        Raises:
+            FramingError: a size that no frame has.
+        """
+        rest = self._rest
+        rest += data
+        while len(rest) >= HEADER.size:
+            size, kind = HEADER.unpack_from(rest)
+            if size < HEADER.size:
+                raise FramingError(f"a frame of {size} bytes")
+            if len(rest) < size:
+                return
+            payload = bytes(rest[HEADER.size : size])
+            del rest[:size]
+            yield kind, payload
+
+
+def names(payload: bytes) -> list[str]:
+    """Field names, separated by commas; some clients put one behind the last too."""
+    return [name.strip() for name in payload.decode("ascii", "replace").strip(",\0 \n").split(",") if name.strip()]
+
+
+def text_message(protocol: int, message: str, source: str, level: int) -> bytes:
+    """A message for people.
+
+    Args:
+        protocol: 1 or 2.
+        message, source: text.
+        level: 0 exception, 1 error, 2 warning, 3 info.
+    """
+    body, origin = message.encode()[:255], source.encode()[:255]
+    if protocol < 2:
+        return frame(TEXT_MESSAGE, bytes([level]) + body)
+    return frame(TEXT_MESSAGE, bytes([len(body)]) + body + bytes([len(origin)]) + origin + bytes([level]))
+
+
+@dataclass(frozen=True)
+class Field:
+    """A value that can be read.
+
+    Attributes:
+        kind: RTDE type.
+        read: the value, a number or a sequence of the type's length.
+    """
+
+    kind: str
+    read: Callable[[], Any]
+
+
+class OutputRecipe:
+    """What one client is sent.
+
+    Args:
+        number: of the recipe; 0 leaves it out, as protocol 1 does.
+        fields: in order.
+    """
+
+    def __init__(self, number: int, fields: Sequence[Field]) -> None:
+        formats = "".join(FORMATS[field.kind][0] for field in fields)
+        self._struct = struct.Struct(">HB" + ("B" if number else "") + formats)
+        self._head = (self._struct.size, DATA_PACKAGE, *((number,) if number else ()))
+        self._single = [FORMATS[field.kind][1] == 1 for field in fields]
+        self._read = [field.read for field in fields]
+
+    def package(self) -> bytes:
+        """The values now, as a frame."""
+        values = list(self._head)
+        for read, single in zip(self._read, self._single, strict=True):
+            if single:
+                values.append(read())
+            else:
+                values.extend(read())
+        return self._struct.pack(*values)
+
+
+class InputRecipe:
+    """What one client sends.
+
+    Args:
+        fields: names in order.
+        kinds: their RTDE types.
+    """
+
+    def __init__(self, fields: Sequence[str], kinds: Sequence[str]) -> None:
+        self.fields = tuple(fields)
+        self._counts = [FORMATS[kind][1] for kind in kinds]
+        self._struct = struct.Struct(">" + "".join(FORMATS[kind][0] for kind in kinds))
+
+    @property
+    def size(self) -> int:
+        """Bytes of one package, recipe number aside."""
+        return self._struct.size
+
+    def read(self, payload: bytes) -> dict[str, Any] | None:
+        """Values by name; None if there are too few or too many bytes for them."""
+        if len(payload) != self._struct.size:
+            return None
+        values = self._struct.unpack(payload)
+        found: dict[str, Any] = {}
+        place = 0
+        for name, count in zip(self.fields, self._counts, strict=True):
+            found[name] = values[place] if count == 1 else values[place : place + count]
+            place += count
+        return found

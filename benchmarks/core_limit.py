@@ -1,0 +1,100 @@
+"""How fast one core can be at the density constraint, in plain C: what the solver's speed is held against.
+
+    python benchmarks/core_limit.py [--particles 2000] [--core 1] [--json]
+
+Compiles and runs core_limit.c: lists and density iterations on a jittered lattice at rest, without walls, forces,
+sweeps and everything else that makes a pour. Nanoseconds a particle, for two instruction sets, medians of 21
+repetitions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from machine import describe, pin, say, show
+from standard_pour import check_particles
+
+SOURCE = Path(__file__).with_name("core_limit.c")
+MACHINES = {"x86_64": ("x86-64-v3", "native"), "AMD64": ("x86-64-v3", "native")}
+"""What `-march` to try; short loops are often faster with narrower vectors than the processor has."""
+
+KEPT = 8
+"""Steps that a neighbour list may last, at best."""
+
+
+def run(compiler: str, particles: int) -> list[dict[str, Any]]:
+    """Nanoseconds a particle, a row for each instruction set.
+
+    Args:
+        compiler: path.
+        particles: N.
+
+    Raises:
+        SystemExit: it does not compile or run.
+    """
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        program = str(Path(folder) / "core_limit")
+        for march in MACHINES.get(platform.machine(), ("native",)):
+            flags = ["-O3", f"-march={march}", "-ffast-math"]
+            try:
+                subprocess.run([compiler, *flags, str(SOURCE), "-lm", "-o", program], check=True)
+                done = subprocess.run([program, str(particles)], check=True, capture_output=True, text=True)
+            except (OSError, subprocess.CalledProcessError) as problem:
+                raise SystemExit(f"{SOURCE.name} with -march={march}: {problem}") from None
+            names = ("full_lists_ns", "full_iteration_ns", "half_lists_ns", "half_iteration_ns")
+            values = (round(float(text) / particles, 1) for text in done.stdout.split())
+            rows.append({"march": march, **dict(zip(names, values, strict=True))})
+    return rows
+
+
+def limits(rows: Iterable[dict[str, Any]], iterations_per_step: float) -> tuple[float, float]:
+    """Particle-iterations/s that the best of these would make in steps of so many iterations.
+
+    Args:
+        rows: see `run`.
+        iterations_per_step: of the solver that is held against them.
+
+    Returns:
+        With lists built in every step, and with lists kept for `KEPT` steps.
+    """
+
+    def best(steps: int) -> float:
+        times: list[float] = [
+            row[f"{kind}_lists_ns"] / (iterations_per_step * steps) + row[f"{kind}_iteration_ns"]
+            for row in rows
+            for kind in ("full", "half")
+        ]
+        return 1e9 / min(times)
+
+    rows = list(rows)
+    return best(1), best(KEPT)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--particles", type=int, default=2000)
+    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
+    parser.add_argument("--json", action="store_true", help="one line of JSON")
+    options = parser.parse_args()
+    particles = check_particles(options.particles)
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise SystemExit("no C compiler (cc, gcc or clang) is installed; the rest of the benchmarks need none")
+    core = pin(options.core)
+    rows = run(compiler, particles)
+    for row in rows:
+        say(f"{row['march']}: {row['full_iteration_ns']} ns a particle with full lists")
+    show({"particles": particles, "rows": rows, "core": core, "machine": describe()}, options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""Measure all that docs/performance.md tells, and write the page.
+
+    python benchmarks/make_page.py                      the page anew, from what was measured before
+    python benchmarks/make_page.py --measure            all measurements, then the page
+    python benchmarks/make_page.py --measure pour-2000 start-up
+
+Measurements are kept in docs/performance.json, each with its command, machine and moment; those that are not made now
+stay as they are. `docs/performance-tried.md` is written by hand and becomes a section of the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import page_figures
+import page_sections as sections
+from machine import ROOT, run_self, say
+
+BENCHMARKS = Path(__file__).parent
+
+PLAN: dict[str, tuple[str, ...]] = {
+    "pour-2000": ("pour_speed.py", "--particles=2000", "--repeats=5", "--peer=3"),
+    "pour-5000": ("pour_speed.py", "--particles=5000", "--repeats=3", "--peer=1"),
+    "pour-10000": ("pour_speed.py", "--particles=10000", "--repeats=3", "--peer=1"),
+    "scaling": ("scaling.py", "--repeats=1"),
+    "start-up": ("start_up.py",),
+    "profile": ("profile_passes.py",),
+    "core-limit": ("core_limit.py",),
+    "pool": ("pool_speed.py",),
+}
+"""Measurements by name: script and its arguments."""
+
+PAGE, DATA, TRIED = "performance.md", "performance.json", "performance-tried.md"
+
+
+def measure(name: str) -> dict[str, Any]:
+    """Run one measurement.
+
+    Raises:
+        SystemExit: it failed.
+    """
+    script, *arguments = PLAN[name]
+    say(f"{name}: {script} {' '.join(arguments)}")
+    begun = time.monotonic()
+    result = run_self(str(BENCHMARKS / script), *arguments, "--json")
+    say(f"{name}: took {time.monotonic() - begun:.0f} s")
+    return {"command": " ".join(["python", f"benchmarks/{script}", *arguments, "--json"]), "result": result}
+
+
+def page_text(records: dict[str, Any], tried: str) -> str:
+    """The page.
+
+    Args:
+        records: measurements by name, as `measure` returns them.
+        tried: the section that is written by hand, or ''.
+    """
+    pours = pour_records(records)
+    scaling = records.get("scaling")
+    parts = [
+        sections.introduction(),
+        *stale(records),
+        sections.targets(pours),
+        sections.beside_the_peer(pours),
+        sections.passes(records.get("profile"), records.get("core-limit")),
+        sections.cost(scaling),
+        sections.scenes(records.get("scenes")),
+        sections.memory(scaling),
+        sections.start_up(records.get("start-up")),
+        sections.pool(records.get("pool")),
+        sections.gpu(records.get("gpu")),
+    ]
+    if tried.strip():
+        parts.append(re.sub(r"<!--.*?-->\n*", "", tried, flags=re.DOTALL).strip() + "\n")
+    return "\n".join(parts)
+
+
+def pour_records(records: dict[str, Any]) -> list[dict[str, Any]]:
+    """Those of the standard pour, by number of particles."""
+    pours = [record for name, record in records.items() if name.startswith("pour-")]
+    return sorted(pours, key=lambda record: int(record["result"]["particles"]))
+
+
+def stale(records: dict[str, Any]) -> list[str]:
+    """A warning if some measurements were made with another solver than the others."""
+    prints: dict[str, list[str]] = {}
+    for name, record in records.items():
+        if name == "core-limit":  # has no solver in it
+            continue
+        prints.setdefault(record["result"]["machine"].get("fingerprint", "?"), []).append(name)
+    if len(prints) < 2:
+        return []
+    groups = "; ".join(", ".join(names) for names in prints.values())
+    return [f"These groups of figures were not measured with the same sources: {groups}.\n"]
+
+
+def draw(records: dict[str, Any], images: Path) -> None:
+    """The figures for which there are measurements."""
+    pours = pour_records(records)
+    ours = {r["result"]["particles"]: r["result"]["cpu_s"] for r in pours}
+    if "scaling" in records:
+        ours = {row["particles"]: row["cpu_s"] for row in records["scaling"]["result"]["cost"]} | ours
+    theirs = [(r["result"]["particles"], r["result"]["peer"]["cpu_s"]) for r in pours if "peer" in r["result"]]
+    if theirs:
+        page_figures.cost_figure(images / page_figures.COST, list(ours.items()), theirs, sections.TARGETS)
+    if "profile" in records:
+        page_figures.passes_figure(images / page_figures.PASSES, records["profile"]["result"])
+
+
+def write(folder: Path) -> Path:
+    """Write page and figures from the measurements in a folder.
+
+    Raises:
+        SystemExit: there are none, or they can't be read.
+    """
+    try:
+        records = json.loads((folder / DATA).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SystemExit(f"{folder / DATA}: there is no such file; make it with --measure") from None
+    except ValueError as problem:
+        raise SystemExit(f"{folder / DATA}: not JSON: {problem}") from None
+    tried = folder / TRIED
+    text = page_text(records, tried.read_text(encoding="utf-8") if tried.exists() else "")
+    draw(records, folder / "images")
+    (folder / PAGE).write_text(text, encoding="utf-8")
+    return folder / PAGE
+
+
+def keep(folder: Path, name: str, record: dict[str, Any]) -> None:
+    """Put a measurement beside those made before; a later failure then loses nothing."""
+    path = folder / DATA
+    records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    records[name] = record
+    order = {known: place for place, known in enumerate(PLAN)}
+    records = dict(sorted(records.items(), key=lambda item: order.get(item[0], len(order))))
+    path.write_text(json.dumps(records, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Measure what was asked for, write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--measure", nargs="*", metavar="NAME", help=f"which: {', '.join(PLAN)}; all if none is named")
+    parser.add_argument("--folder", type=Path, default=ROOT / "docs", help="where page, data and images are")
+    options = parser.parse_args()
+    names = [] if options.measure is None else options.measure or list(PLAN)
+    for name in names:
+        if name not in PLAN:
+            raise SystemExit(f"--measure {name}: there is no such measurement, only {', '.join(PLAN)}")
+    for name in names:
+        if not (BENCHMARKS / PLAN[name][0]).exists():
+            say(f"{name}: there is no {PLAN[name][0]}; left as it is")
+            continue
+        keep(options.folder, name, measure(name))
+    say(f"written: {write(options.folder)}")
+
+
+if __name__ == "__main__":
+    main()

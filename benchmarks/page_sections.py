@@ -1,0 +1,345 @@
+"""The sections of docs/performance.md, each from the JSON of one benchmark."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import core_limit
+import page_figures
+
+TARGETS = {2_000: (1.5, 0.6), 5_000: (5.0, 2.0), 10_000: (12.0, 5.0)}
+"""Required and aimed-at CPU seconds of the standard pour, by particles."""
+
+PHYSICS = ("left at 2.3 s", "2.7 s", "3.1 s", "", "delivered", "density inside")
+
+Record = Mapping[str, Any]
+"""`command`, and the `result` that it printed."""
+
+
+def introduction() -> str:
+    """What the page is and how it is made anew."""
+    return """# Performance
+
+<!-- written by benchmarks/make_page.py from docs/performance.json and docs/performance-tried.md; edit those -->
+
+What a simulated pour costs, where the time goes, and how that compares with the fastest solver that we know of. All of
+it is measured anew, and this page written, by
+
+```
+python benchmarks/make_page.py --measure
+```
+
+The standard pour: 200 mL in a straight cup (R 40 mm, H 100 mm) turned about its lip at 30 °/s to 120°, over a receiver
+110 mm below; 6 s. CPU seconds are those of the process, on one core, with one thread, kernels compiled, without set-up.
+"""
+
+
+def targets(pours: Sequence[Record]) -> str:
+    """Speed against what was asked for, physics beside it."""
+    if not pours:
+        return missing("Against the targets", "pour_speed.py --particles 2000")
+    rows, physics = [], []
+    for record in pours:
+        r = record["result"]
+        required, aim = TARGETS.get(r["particles"], (None, None))
+        rows.append(
+            (
+                f"{r['particles']:,}",
+                seconds(required),
+                seconds(aim),
+                f"**{seconds(r['cpu_s'])}**",
+                verdict(r["cpu_s"], required, aim),
+                f"{r['steps']:,}",
+                f"{r['iterations_per_step']:.3g}",
+                f"{1e-6 * r['particle_iterations_per_s']:.2g} M",
+            )
+        )
+        physics.append((f"{r['particles']:,}", *_physics(r), f"{100 * r['density_error']:.2g} %"))
+    speed_table = table(
+        ("N", "required", "aim", "CPU s", "", "steps", "iterations a step", "particle-iterations/s"), rows, "rrrrlrrr"
+    )
+    physics_table = table(("N", *PHYSICS, "mean compression"), physics, "rrrrlrrr")
+    about = prose(
+        f"""Medians over seeds. A pour is over when nothing can change any more, which for this one is after
+        {pours[0]["result"]["simulated_time_s"]:.1f} s. Particles that have left the solver still count in
+        particle-iterations."""
+    )
+    return f"""## Against the targets
+
+{speed_table}
+{about}
+
+Speed counts only with the physics right. Other solvers have .92, .64 and .29 left in the pourer at these times and
+within .03 of that is right; density inside is that of Voronoi cells in the tilted cup at 1 s.
+
+{physics_table}
+{settings(pours)}"""
+
+
+def beside_the_peer(pours: Sequence[Record]) -> str:
+    """The peer's figures, measured in the same go."""
+    both = [record for record in pours if "peer" in record["result"]]
+    if not both:
+        return missing("Beside the fastest peer", "pour_speed.py --particles 2000 --peer")
+    rows, physics = [], []
+    for record in both:
+        r, peer = record["result"], record["result"]["peer"]
+        rows.append(
+            (
+                f"{r['particles']:,}",
+                seconds(r["cpu_s"]),
+                seconds(peer["cpu_s"]),
+                f"**{r['ratio']:.3g}**",
+                f"{r['ratio_per_simulated_second']:.3g}",
+                f"{peer['steps']:,}",
+                f"{peer['iterations_per_step']:.3g}",
+                f"{1e-6 * peer['particle_iterations_per_s']:.2g} M",
+            )
+        )
+        physics.append((f"{r['particles']:,}", *_physics(peer)))
+    head = (
+        *("N", "Decant, CPU s", "peer, CPU s", "ratio", "ratio per simulated second"),
+        *("its steps", "its iterations a step", "its particle-iterations/s"),
+    )
+    about = prose(
+        f"""{both[0]["result"]["peer"]["name"]}: on the same core, in the same go, the runs of both taking turns, one
+        thread each, set-up counted for neither. The peer always simulates 6 s; ours stops when nothing can change any
+        more, so the second ratio leaves that advantage out."""
+    )
+    return f"""## Beside the fastest peer
+
+{about}
+
+{table(head, rows, "rrrrrrrr")}
+Its physics, measured as ours:
+
+{table(("N", *PHYSICS), physics, "rrrrlrr")}
+![CPU seconds against the number of particles](images/{page_figures.COST})
+
+{settings(both)}"""
+
+
+def passes(record: Record | None, limit: Record | None) -> str:
+    """The profile, and how far from the core's limit that is."""
+    title = "Where the time goes"
+    if record is None:
+        return missing(title, "profile_passes.py")
+    r = record["result"]
+    moments = page_figures.MOMENTS
+    rows = [
+        (
+            name,
+            *(f"{100 * r[moment]['share'].get(name, 0.0):.1f} %" for moment in moments),
+            f"{r[moments[0]]['calls_per_step'][name]:.2g}",
+        )
+        for name in r[moments[0]]["share"]
+    ]
+    about = prose(
+        f"""The solver's kernel with a clock built into it, around every pass, in one standard pour with
+        {r["particles"]:,} particles. With the clock the pour takes {r["slower"]:.2f} times as long; the passes make up
+        {100 * r["explained"]:.0f} % of what is then measured from outside."""
+    )
+    return f"""## {title}
+
+{about}
+
+{table(("pass", *moments, "calls a step"), rows, "lrrrr")}
+![Share of each pass](images/{page_figures.PASSES})
+
+{_limit(r, limit)}{settings([record, limit] if limit else [record])}"""
+
+
+def _limit(profile: Record, limit: Record | None) -> str:
+    """Distance to what plain C makes of the core."""
+    if limit is None:
+        return ""
+    rate, rows = profile["particle_iterations_per_s"], limit["result"]["rows"]
+    always, kept = core_limit.limits(rows, profile["iterations_per_step"])
+    best = min(rows, key=lambda row: float(row["full_iteration_ns"]))
+    text = f"""The core's limit: plain C needs {best["full_iteration_ns"]:.0f} ns a particle for one density iteration
+    over full neighbour lists ({best["march"]}), {best["half_iteration_ns"]:.0f} ns where every pair is listed once, and
+    {best["half_lists_ns"]:.0f} ns for building such lists, on a lattice at rest and without walls, forces, sweeps and
+    surfaces. With {profile["iterations_per_step"]:.3g} iterations a step that makes {1e-6 * always:.2g} M
+    particle-iterations/s with lists built in every step, {1e-6 * kept:.2g} M with lists kept for {core_limit.KEPT}.
+    The pour makes {1e-6 * rate:.2g} M with all that belongs to it: {100 * rate / always:.0f} % and
+    {100 * rate / kept:.0f} % of that."""
+    return f"{prose(text)}\n\n"
+
+
+def cost(record: Record | None) -> str:
+    """CPU seconds against N."""
+    title = "Cost against the number of particles"
+    if record is None:
+        return missing(title, "scaling.py")
+    r = record["result"]
+    rows = [
+        (
+            f"{row['particles']:,}",
+            seconds(row["cpu_s"]),
+            f"{1e6 * row['cpu_s'] / row['particles']:.0f}",
+            f"{row['steps']:,}",
+            f"{row['iterations']:,}",
+            f"{1e-6 * row['particle_iterations_per_s']:.2g} M",
+        )
+        for row in r["cost"]
+    ]
+    growth = (
+        f"CPU seconds grow as N^{r['exponent']:.2f}: there are more particles, and steps shorten with the spacing."
+        if r["exponent"] is not None
+        else ""
+    )
+    head = ("N", "CPU s", "µs a particle", "steps", "iterations", "particle-iterations/s")
+    return f"""## {title}
+
+{table(head, rows, "rrrrrr")}
+{growth}
+
+{settings([record])}"""
+
+
+def scenes(record: Record | None) -> str:
+    """Pours per minute against the number of scenes in one call."""
+    title = "Number of scenes"
+    if record is None:
+        return f"## {title}\n\nOne call simulates one pour; several at once run in several processes (see below).\n"
+    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
+
+
+def memory(record: Record | None) -> str:
+    """Resident memory."""
+    title = "Memory"
+    if record is None or not record["result"]["memory"]:
+        return missing(title, "scaling.py")
+    parts = ("imports", "taichi", "arrays", "kernels_and_vessels", "pour", "process")
+    rows = [(f"{r['particles']:,}", *(f"{r[f'{part}_mb']:.0f}" for part in parts)) for r in record["result"]["memory"]]
+    head = ("N", "packages", "Taichi", "the solver's arrays", "kernels and vessels", "the pour", "in all [MB]")
+    return f"""## {title}
+
+Resident memory of a process with one simulator, early in a pour, and what it went to [MB].
+
+{table(head, rows, "rrrrrrr")}
+{settings([record])}"""
+
+
+def start_up(record: Record | None) -> str:
+    """First answer of a fresh process."""
+    title = "Start-up"
+    if record is None:
+        return missing(title, "start_up.py")
+    r = record["result"]
+    phases = tuple(r["warm"]["phases"])
+    rows = [
+        (
+            f"{name} cache",
+            f"**{r[name]['answered_s']:.1f}**",
+            *(f"{r[name]['phases'][phase]:.2f}" for phase in phases),
+        )
+        for name in ("warm", "cold")
+    ]
+    word = "met" if r["within_limit"] else "**missed**"
+    about = prose(
+        f"""Seconds from the start of a process to the answer to its first standard pour with {r["particles"]:,}
+        particles, and where they go. Required: {r["limit_s"]:g} s with a warm cache ({word}). The cache has
+        {r["cache_mb"]:g} MB of compiled kernels and vessels' grids."""
+    )
+    return f"""## {title}
+
+{about}
+
+{table(("", "answer after", *phases), rows, "lr" + "r" * len(phases))}
+{settings([record])}"""
+
+
+def pool(record: Record | None) -> str:
+    """What `pool_speed.py` found."""
+    title = "Pool and cluster"
+    if record is None:
+        return missing(title, "pool_speed.py")
+    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
+
+
+def gpu(record: Record | None) -> str:
+    """What a GPU does with batches."""
+    title = "GPU"
+    if record is None:
+        return f"## {title}\n\nNot measured: no GPU was available.\n"
+    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
+
+
+def missing(title: str, command: str) -> str:
+    """A section whose benchmark has not been run."""
+    return f"## {title}\n\nNot measured yet: `python benchmarks/{command} --json`\n"
+
+
+def facts(result: Record) -> str:
+    """Tables of a result of any shape: one of the plain values, one of each list of rows."""
+    plain = {key: value for key, value in result.items() if isinstance(value, str | int | float)}
+    parts = [table(("", ""), [(_words(key), _value(value)) for key, value in plain.items()], "lr")] if plain else []
+    for key, value in result.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            head = tuple(value[0])
+            rows = [tuple(_value(row.get(name)) for name in head) for row in value]
+            parts.append(f"{_words(key)}:\n\n{table(tuple(map(_words, head)), rows, 'r' * len(head))}")
+        elif isinstance(value, dict) and key != "machine":
+            parts.append(f"{_words(key)}:\n\n{facts(value)}")
+    return "\n".join(parts)
+
+
+def settings(records: Sequence[Record]) -> str:
+    """Machine, software, commands, and the moment of each of one or several measurements, small."""
+    machines: dict[str, list[str]] = {}
+    for record in records:
+        m, core = record["result"]["machine"], record["result"].get("core")
+        place = f"{m['processor']}, {m['cores']} cores, {m['system']}, Python {m['python']}, Taichi {m['taichi']}"
+        where = f"core {core}, " if core is not None else ""
+        moment = f"solver {m['solver']}, {m['date']}, {where}load {m['load_average'][0]}"
+        machines.setdefault(place, []).append(f"`{record['command']}` ({moment})")
+    return "<sub>" + "; ".join(f"{place}: {', '.join(made)}" for place, made in machines.items()) + "</sub>\n"
+
+
+def prose(text: str) -> str:
+    """A paragraph in lines of the pages' length."""
+    return textwrap.fill(" ".join(text.split()), 120, break_long_words=False, break_on_hyphens=False)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
+    """Markdown; `align` has an l or r for each column."""
+    marks = {"l": "---", "r": "---:"}
+    lines = ["| " + " | ".join(head) + " |", "|" + "|".join(marks[a] for a in align) + "|"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
+
+
+def seconds(value: float | None) -> str:
+    """CPU seconds as people read them: '0.61', '5.3', '176'."""
+    if value is None:
+        return ""
+    return f"{value:.2f}" if value < 10 else f"{value:.1f}" if value < 100 else f"{value:.0f}"
+
+
+def verdict(cpu_s: float, required: float | None, aim: float | None) -> str:
+    """How a time stands to its targets."""
+    if required is None or aim is None:
+        return ""
+    if cpu_s <= aim:
+        return "aim reached"
+    return "met" if cpu_s <= required else "**missed**"
+
+
+def _physics(result: Record) -> tuple[str, ...]:
+    left = tuple(f"{value:.3f}" for value in result["left"].values())
+    word = "right" if result["left_is_right"] else "**off**"
+    return (*left, word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
+
+
+def _words(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)

@@ -1,0 +1,95 @@
+"""The prediction for one action: the same pour simulated with several fresh seeds."""
+
+from __future__ import annotations
+
+from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
+from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.seeds import SeedStream
+from sim_engine.action import Action
+from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import Loss
+from sim_engine.outcome import PourOutcome
+from sim_engine.spread import Spread, spreads
+from sim_engine.task import Scene
+
+
+class RepeatedSimulation:
+    """Simulate an action again, for a prediction with its spread.
+
+    An action was chosen because its simulations spilled little: part of that was luck. Seeds that took no part in the
+    choice tell what to expect, and how much a single pour differs from it.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        action: Action | None,
+        parameters: SimulationParameters,
+        loss: Loss,
+        count: int,
+        seed: int,
+    ) -> None:
+        """Plan.
+
+        Args:
+            action: None: nothing was found that could be repeated, and nothing is asked for.
+            count: of seeds.
+        """
+        seeds = SeedStream(seed, f"prediction {scene.name}")
+        self._scene = scene
+        self._costing = Costing(loss, scene, parameters)
+        self._unissued: list[Simulate] = []
+        self._open: set[Simulate] = set()
+        self._outcomes: list[PourOutcome] = []
+        self._losses: list[float] = []
+        self._lost = 0
+        self.decisions: list[Decision] = []
+        if action is not None:
+            seeds_of_all = [seeds.next() for _ in range(count)]
+            self._unissued = [Simulate(scene.name, action, parameters, s, "predict") for s in seeds_of_all]
+            self.decisions.append(Decision(f"simulate the planned action with {count} fresh seeds"))
+
+    @property
+    def finished(self) -> bool:
+        """Every simulation has been answered."""
+        return not self._unissued and not self._open
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The next simulations."""
+        now, self._unissued = self._unissued[: slots.simulations], self._unissued[slots.simulations :]
+        self._open.update(now)
+        return list(now)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a simulation.
+
+        Raises:
+            ValueError: it was not asked for.
+        """
+        if not isinstance(request, Simulate) or request not in self._open:
+            raise ValueError(f"this simulation was not asked for, or has been answered already: {request}")
+        self._open.discard(request)
+        cost = self._costing.simulated(outcome)
+        if isinstance(outcome, Simulated) and cost is not None:
+            self._outcomes.append(outcome.outcome)
+            self._losses.append(cost)
+        else:
+            self._lost += 1
+
+    def progress(self) -> tuple[int, int]:
+        """Simulations answered, simulations in all."""
+        answered = len(self._losses) + self._lost
+        return answered, answered + len(self._open) + len(self._unissued)
+
+    def result(self) -> dict[str, object]:
+        """Mean and standard deviation over the seeds: of every fraction, of r = spilled / poured, and of the loss."""
+        over_seeds = spreads(self._outcomes)
+        loss = Spread.of(self._losses)
+        if loss is not None:
+            over_seeds["loss"] = loss
+        return {
+            "prediction_of": self._scene.name,
+            "simulations": self.progress()[0],
+            "simulations_lost": self._lost,
+            "over_seeds": {name: spread.as_json() for name, spread in over_seeds.items()},
+        }

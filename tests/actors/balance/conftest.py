@@ -1,0 +1,90 @@
+"""Virtual balances at the far end of pseudo-terminals, and drivers that open these with the real pyserial."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from typing import Any
+
+import pytest
+
+from actors.balance.dialects import DIALECTS
+from actors.balance.serial_balance import SerialBalance
+from actors.balance.settling import SettlingRule
+from actors.balance.spec import SerialBalanceSpec
+from actors.balance.virtual_serial.faults import Faults
+from actors.balance.virtual_serial.handle import VirtualSerialBalance
+from actors.balance.virtual_serial.scale import ScaleSettings
+
+PACE = 20.0
+"""Bench seconds per second in these tests."""
+
+OF_VOICE = {"kern-swt-short": "kern-swt", "sbi-identified": "sbi", "sbi-at-stability": "sbi"}
+"""Dialects of voices that are not named after theirs."""
+
+
+def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSpec:
+    """Settings that leave nothing to be found out."""
+    spec = SerialBalanceSpec(
+        virtual.port,
+        dialect=dialect,
+        baud=9600,
+        format="8N1",
+        settling=SettlingRule(deadline=10.0),
+        answer_time=0.3,
+        reconnect_time=2.0,
+        time_scale=PACE,
+    )
+    return replace(spec, **changes)
+
+
+@pytest.fixture(scope="session")
+def voices() -> Iterator[Callable[[str], VirtualSerialBalance]]:
+    """One virtual balance of each voice, started when first asked for."""
+    started: dict[str, VirtualSerialBalance] = {}
+
+    def of(voice: str) -> VirtualSerialBalance:
+        if voice not in started:
+            started[voice] = VirtualSerialBalance.start(
+                voice, baud=0, scale=ScaleSettings(settling_time=0.4), time_scale=PACE, latency=0.001
+            )
+        return started[voice]
+
+    yield of
+    for virtual in started.values():
+        virtual.close()
+
+
+@pytest.fixture
+def virtual(voices: Callable[[str], VirtualSerialBalance]) -> Callable[[str], VirtualSerialBalance]:
+    """An empty, healthy virtual balance of a voice."""
+
+    def of(voice: str) -> VirtualSerialBalance:
+        balance = voices(voice)
+        balance.plug()
+        balance.faults(**asdict(Faults()))
+        balance.prepare((1,))
+        return balance
+
+    return of
+
+
+@pytest.fixture
+def driver(virtual: Any) -> Iterator[Callable[..., tuple[VirtualSerialBalance, SerialBalance]]]:
+    """A virtual balance of a voice, and the driver at its other end."""
+    opened: list[SerialBalance] = []
+
+    def of(voice: str, **changes: Any) -> tuple[VirtualSerialBalance, SerialBalance]:
+        far = virtual(voice)
+        opened.append(SerialBalance(spec_for(far, OF_VOICE.get(voice, voice), **changes), "kern-1"))
+        return far, opened[-1]
+
+    yield of
+    for balance in opened:
+        balance.close()
+
+
+@pytest.fixture(params=list(DIALECTS))
+def each_dialect(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    return name

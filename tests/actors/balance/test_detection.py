@@ -1,0 +1,158 @@
+"""Finding out what is at the other end of the line, and saying what was tried where that fails."""
+
+from __future__ import annotations
+
+import re
+import termios
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+
+import pytest
+import serial
+
+from actors.balance.dialects import DIALECTS, LineSettings
+from actors.balance.errors import BalanceError, LineSettingsError, UnknownDialectError
+from actors.balance.serial_balance import SerialBalance
+from actors.balance.settling import SettlingRule
+from actors.balance.spec import SerialBalanceSpec, parse_format
+from actors.balance.virtual_serial.faults import Faults
+from actors.balance.virtual_serial.handle import VirtualSerialBalance
+from actors.balance.wire import port_advice
+
+from .conftest import OF_VOICE, PACE
+
+
+@pytest.fixture
+def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable[..., tuple]]:
+    """A virtual balance and a driver that is told nothing but the port and what is given."""
+    opened: list[SerialBalance] = []
+
+    def of(far: VirtualSerialBalance | str, **settings) -> tuple[VirtualSerialBalance, SerialBalance]:
+        far = virtual(far) if isinstance(far, str) else far
+        spec = SerialBalanceSpec(far.port, time_scale=PACE, settling=SettlingRule(deadline=10.0), **settings)
+        opened.append(SerialBalance(spec, "kern-1"))
+        return far, opened[-1]
+
+    yield of
+    for balance in opened:
+        balance.close()
+
+
+@pytest.mark.parametrize("voice", ["kcp", "kern-swt", "kern-swt-short", "mt-sics", "sbi", "sbi-identified"])
+def test_the_dialect_is_found_out_and_then_used(unknown, voice):
+    far, balance = unknown(voice)
+    said = balance.connect()
+    assert said.startswith(DIALECTS[OF_VOICE.get(voice, voice)].title)
+    far.put(0.2)
+    assert balance.weigh().mass == pytest.approx(0.2, abs=1e-9)
+
+
+def test_finding_out_tares_and_zeroes_nothing(unknown, each_dialect):
+    far, balance = unknown(each_dialect)
+    far.put(0.05)
+    far.advance(5.0)
+    before = far.state()["shown"]
+    balance.connect()
+    assert far.state()["shown"] == before == "50.0 g, stable"
+
+
+@pytest.mark.parametrize(("dialect", "baud"), [("kcp", 19200), ("kern-swt", 4800), ("sbi", 1200)])
+def test_the_speed_is_found_out(unknown, dialect, baud):
+    far = VirtualSerialBalance.start(dialect, baud=baud, time_scale=PACE)
+    try:
+        _, balance = unknown(far, dialect=dialect)
+        assert f"{baud} baud" in balance.connect()
+        assert balance.weigh().mass == 0.0
+    finally:
+        far.close()
+
+
+def test_a_balance_that_prints_by_itself_is_recognised_and_the_operator_told(unknown):
+    far, balance = unknown("kern-swt")
+    far.faults(unasked=0.05)
+    assert "it sends without being asked: switch that off in its menu" in balance.connect()
+
+
+def test_where_nothing_answers_it_is_said_what_was_tried(unknown):
+    far, balance = unknown("kcp", baud=9600, format="8N1")
+    far.faults(silent=True)
+    with pytest.raises(UnknownDialectError) as caught:
+        balance.connect()
+    said = str(caught.value)
+    assert said.startswith(f"balance kern-1 ({far.port}): no balance recognised (looked for Kern KCP, older Kern")
+    assert "Nothing came at all: is the balance switched on" in said
+    assert "9600 baud 8N1: Sartorius SBI → nothing, older Kern (s/w/t) → nothing, Kern KCP, MT-SICS → nothing" in said
+
+
+def test_gibberish_is_said_to_be_a_matter_of_speed_and_parity(unknown):
+    far = VirtualSerialBalance.start("mt-sics", baud=2400, time_scale=PACE)
+    try:
+        far.faults(unasked=0.05)
+        _, balance = unknown(far, baud=9600, format="8N1")
+        with pytest.raises(UnknownDialectError, match="What came is no text: speed or parity differ"):
+            balance.connect()
+    finally:
+        far.close()
+
+
+def test_another_dialect_than_the_one_named_is_shown_as_it_came(unknown):
+    _, balance = unknown("mt-sics", dialect="sbi", baud=9600)
+    with pytest.raises(
+        UnknownDialectError, match=re.escape("looked for Sartorius SBI). It answers, but not in this way")
+    ):
+        balance.connect()
+
+
+def test_a_search_can_be_interrupted(unknown):
+    far, balance = unknown("kcp")
+    far.faults(silent=True)
+    balance.interrupt()
+    started = time.monotonic()
+    with pytest.raises(BalanceError, match="interrupted"):
+        balance.connect()
+    assert time.monotonic() - started < 1.0
+
+
+def test_a_setting_that_the_port_refuses_is_left_out_and_named(unknown, monkeypatch):
+    real = serial.Serial
+
+    def picky(port, baud, **others):
+        if baud == 9600:
+            raise termios.error(22, "Invalid argument")
+        return real(port, baud, **others)
+
+    monkeypatch.setattr(serial, "Serial", picky)
+    _, balance = unknown("kern-swt", dialect="kern-swt", format="8N1")
+    assert "4800 baud" in balance.connect()
+    _, balance = unknown("kern-swt", dialect="kern-swt", baud=9600)
+    with pytest.raises(LineSettingsError, match="can't be set to 9600 baud 8N1"):
+        balance.connect()
+    _, balance = unknown("kern-swt", baud=9600, format="8N1")
+    with pytest.raises(UnknownDialectError, match="9600 baud 8N1: the port can't be set so"):
+        balance.connect()
+
+
+def test_settings_narrow_the_search():
+    every = SerialBalanceSpec("p").candidates()
+    assert every[0] == LineSettings(9600)
+    assert LineSettings(1200, 7, "O") in every
+    assert SerialBalanceSpec("p", dialect="kcp", baud=4800, format="8N1").candidates() == (LineSettings(4800),)
+    assert {c.baud for c in SerialBalanceSpec("p", baud=2400).candidates()} == {2400}
+    assert {c.format for c in SerialBalanceSpec("p", format="7E1").candidates()} == {"7E1"}
+
+
+@pytest.mark.parametrize("text", ["9N1", "8X1", "8N", "8N3", ""])
+def test_a_format_that_is_none_is_refused_with_one_that_is(text):
+    with pytest.raises(ValueError, match="as '8N1' or '7O1'"):
+        parse_format(text)
+
+
+def test_names_that_change_with_the_next_plugging_are_advised_against():
+    assert "use its name under /dev/serial/by-id/" in (port_advice("/dev/ttyUSB0") or "")
+    assert port_advice("/dev/serial/by-id/usb-FTDI_FT232R-if00-port0") is None
+    assert port_advice("/dev/ttyS0") is None
+
+
+def test_faults_are_off_unless_asked_for():
+    assert not any(asdict(Faults()).values())

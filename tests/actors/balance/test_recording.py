@@ -1,0 +1,195 @@
+"""Raw bytes recorded and played. Nothing here was recorded on a real balance: sources say 'virtual' or 'typed'."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import serial
+
+from actors.balance.record import main
+from actors.balance.recording import Event, Recording
+from actors.balance.serial_balance import SerialBalance
+from actors.balance.virtual_serial.handle import RecordedBalance
+
+from .conftest import spec_for
+
+KERN_TYPED = Recording(
+    "typed",
+    (
+        Event(0.00, "out", b"w"),
+        Event(0.05, "in", b"        12"),
+        Event(0.07, "in", b".30    \r\n"),
+        Event(0.20, "out", b"w"),
+        Event(0.25, "in", b"        12.34 g  \r\n"),
+        Event(0.40, "out", b"t"),
+        Event(0.60, "out", b"w"),
+        Event(0.65, "in", b"         0.00 g  \r\n"),
+    ),
+    {"balance": "layout of Kern PCB-BA-e-1315, p. 35"},
+)
+
+
+def test_a_file_holds_every_byte_its_time_and_where_it_comes_from(tmp_path):
+    path = tmp_path / "kern.jsonl"
+    recording = Recording("typed", (*KERN_TYPED.events, Event(1.5, "in", bytes(range(256)))), {"remarks": "größer"})
+    recording.save(path)
+    assert Recording.load(path) == recording
+    assert '"text": "w"' in path.read_text()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "hello\n",
+        '{"decant_serial_recording": 2, "source": "typed"}\n',
+        '{"decant_serial_recording": 1, "source": "somewhere"}\n',
+        '{"decant_serial_recording": 1, "source": "typed"}\n{"t": 0, "dir": "up", "hex": ""}\n',
+        '{"decant_serial_recording": 1, "source": "typed"}\n{"t": 0, "dir": "in", "hex": "5"}\n',
+        "[]\n",
+    ],
+)
+def test_what_is_no_recording_is_refused_with_its_line(tmp_path, text):
+    path = tmp_path / "file.jsonl"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"file\.jsonl:\d: not a recording of a serial line"):
+        Recording.load(path)
+
+
+def test_the_driver_weighs_what_was_recorded(tmp_path):
+    path = tmp_path / "kern.jsonl"
+    KERN_TYPED.save(path)
+    far = RecordedBalance.start(path, speed=20.0)
+    try:
+        driver = SerialBalance(spec_for(far, "kern-swt"))
+        driver.connect()
+        first, second = driver.read(), _later(driver)
+        driver.close()
+    finally:
+        far.close()
+    assert (first.shown, first.stable) == ("12.30", False)
+    assert (second.shown, second.stable) == ("12.34 g", True)
+
+
+def _later(driver: SerialBalance):
+    time.sleep(0.05)
+    return driver.read()
+
+
+def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
+    path = tmp_path / "damaged.jsonl"
+    lines = [b"S S 0.01230 kg", b"S S 0.01230 k", b"S S 12.30 g", *[b"S S 0.01230 kg"] * 6]
+    events = [
+        event
+        for i, line in enumerate(lines)
+        for event in (Event(i, "out", b"SI\r\n"), Event(i + 0.01, "in", line + b"\r\n"))
+    ]
+    Recording("typed", tuple(events)).save(path)
+    far = RecordedBalance.start(path, speed=20.0)
+    try:
+        driver = SerialBalance(spec_for(far, "kcp"))
+        assert driver.weigh().mass == pytest.approx(0.0123)
+        driver.close()
+    finally:
+        far.close()
+
+
+def test_a_late_answer_to_another_command_is_not_taken_for_the_one_awaited(tmp_path):
+    path = tmp_path / "late.jsonl"
+    events = [Event(0.0, "out", b"T\r\n"), Event(0.01, "in", b"Z +\r\n"), Event(0.1, "in", b"T S 350.00 g\r\n")]
+    for i in range(5):
+        events += [Event(1.0 + i, "out", b"SI\r\n"), Event(1.01 + i, "in", b"S S 0.00 g\r\n")]
+    Recording("typed", tuple(events)).save(path)
+    far = RecordedBalance.start(path, speed=20.0)
+    try:
+        driver = SerialBalance(spec_for(far, "kcp"))
+        driver.tare()
+        driver.close()
+    finally:
+        far.close()
+
+
+def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
+    path = tmp_path / "slow.jsonl"
+    Recording("typed", (Event(0.0, "out", b"w"), Event(0.1, "in", b"12"), Event(0.5, "in", b"34"))).save(path)
+    far = RecordedBalance.start(path)
+    try:
+        with serial.Serial(far.port, 9600, timeout=2.0) as port:
+            assert port.in_waiting == 0
+            port.write(b"w")
+            started = time.monotonic()
+            assert port.read(2) == b"12"
+            assert time.monotonic() - started < 0.4
+            assert port.read(2) == b"34"
+            assert time.monotonic() - started >= 0.5
+    finally:
+        far.close()
+
+
+def test_a_question_that_was_never_asked_gets_no_answer_and_the_next_one_does(tmp_path):
+    path = tmp_path / "kern.jsonl"
+    KERN_TYPED.save(path)
+    far = RecordedBalance.start(path, speed=100.0)
+    try:
+        with serial.Serial(far.port, 9600, timeout=0.2) as port:
+            port.write(b"P")
+            assert port.read(1) == b""
+            port.write(b"w")
+            assert port.read_until(b"\n") == b"        12.30    \r\n"
+            assert far.order("state") == {"played": 1, "of": 8}
+    finally:
+        far.close()
+
+
+def test_a_session_with_a_balance_is_recorded_and_played_back_to_the_driver(virtual, tmp_path, capsys):
+    far = virtual("mt-sics")
+    far.put(0.0123)
+    far.advance(10.0)
+    path = tmp_path / "session.jsonl"
+    arguments = f"--port {far.port} --to {path} --dialect mt-sics --baud 9600 --format 8N1 --seconds 1 --source virtual"
+    assert main(arguments.split()) == 0
+    assert "12.3 g" in capsys.readouterr().err
+    recording = Recording.load(path)
+    assert recording.source == "virtual"
+    assert {event.data for event in recording.events if event.direction == "out"} == {b"SI\r\n"}
+    player = RecordedBalance.start(path, speed=20.0)
+    try:
+        driver = SerialBalance(spec_for(player, "mt-sics"))
+        assert driver.weigh().mass == pytest.approx(0.0123)
+        driver.close()
+    finally:
+        player.close()
+
+
+def test_listening_records_what_comes_unasked(virtual, tmp_path):
+    far = virtual("kern-swt")
+    far.faults(unasked=0.05)
+    path = tmp_path / "heard.jsonl"
+    arguments = f"--port {far.port} --to {path} --dialect kern-swt --baud 9600 --format 8N1 --seconds 0.5 --listen"
+    assert main([*arguments.split(), "--source", "virtual"]) == 0
+    events = Recording.load(path).events
+    assert {event.direction for event in events} == {"in"}
+    assert b"".join(event.data for event in events).count(b"\n") >= 3
+
+
+def test_the_recorder_is_a_command_and_says_why_it_can_not(tmp_path):
+    ended = subprocess.run(
+        [sys.executable, "-m", "actors.balance.record", "--port", "/dev/no-balance", "--to", str(tmp_path / "x.jsonl")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ended.returncode == 1
+    assert "/dev/no-balance): there is no such port" in ended.stderr
+
+
+def test_an_existing_recording_is_not_overwritten(tmp_path):
+    path = Path(tmp_path / "kept.jsonl")
+    path.write_text("kept")
+    with pytest.raises(SystemExit):
+        main(["--port", "/dev/no-balance", "--to", str(path)])
+    assert path.read_text() == "kept"

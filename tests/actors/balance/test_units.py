@@ -1,0 +1,62 @@
+"""Units of balances and of people who type."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import pytest
+
+from actors.balance.reading import Reading, Status
+from actors.balance.typed import typed_weight
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "grams"),
+    [
+        ("12.34", "g", 12.34),
+        ("0.01234", "kg", 12.34),
+        ("12340", "mg", 12.34),
+        ("1", "ct", 0.2),
+        ("1", "oz", 28.349523125),
+        ("1", "lb", 453.59237),
+        ("1", "ozt", 31.1034768),
+        ("1.000", "KG", 1000.0),
+    ],
+)
+def test_weights_are_converted_by_the_definitions_of_their_units(value, unit, grams):
+    assert Reading(Status.STABLE, Decimal(value), unit).mass() == pytest.approx(grams / 1e3, rel=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["pcs", "%", "tl", "N"])
+def test_what_is_no_mass_is_not_made_one(unit):
+    assert Reading(Status.STABLE, Decimal("12"), unit).mass() is None
+
+
+def test_step_of_the_display_is_one_of_the_last_digit_sent():
+    assert Reading(Status.STABLE, Decimal("12.30"), "g").step() == pytest.approx(1e-5)
+    assert Reading(Status.STABLE, Decimal("12"), "kg").step() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "mass", "step"),
+    [("203.4 g", 0.2034, 1e-4), (" 203,40g ", 0.2034, 1e-5), ("0.2034 kg", 0.2034, 1e-4), ("−1.5 g", -1.5e-3, 1e-4)],
+)
+def test_typed_weights_are_understood_as_people_type_them(text, mass, step):
+    typed = typed_weight(text)
+    assert typed.mass == pytest.approx(mass)
+    assert typed.step == pytest.approx(step)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("203.4", "has no unit; type '203.4 g'"),
+        ("about 200 g", "not a weight; type a number and a unit"),
+        ("", "not a weight"),
+        ("200 pcs", "'pcs' is no unit of mass"),
+        ("1.234.5 g", "not a weight"),
+    ],
+)
+def test_a_typed_weight_that_could_be_misread_is_asked_for_again(text, said):
+    with pytest.raises(ValueError, match=said):
+        typed_weight(text)

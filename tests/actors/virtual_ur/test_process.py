@@ -1,0 +1,145 @@
+"""The process: how it starts, that it never outlives its parent, and that no bytes on any port bring it down."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from actors.virtual_ur import VirtualController, VirtualControllerError
+
+from .conftest import next_address
+
+PORTS = (30001, 30002, 30003, 30004, 30011, 30012, 29999)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+def gone(pid: int, seconds: float = 5.0) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if not alive(pid):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def greeting(address: str) -> bytes:
+    with socket.create_connection((address, 29999), timeout=5) as connection:
+        return connection.recv(100)
+
+
+def test_it_is_ready_when_it_says_so_and_gone_when_it_is_closed() -> None:
+    controller = VirtualController.start(address=next_address())
+    assert greeting(controller.address).startswith(b"Connected: Universal Robots Dashboard Server")
+    assert controller.alive
+    controller.close()
+    assert not controller.alive
+    with pytest.raises(OSError, match="refused"):
+        greeting(controller.address)
+    controller.close()  # once more does no harm
+
+
+def test_the_arm_begins_where_it_is_told_to() -> None:
+    joints = [0.1, -1.2, 1.3, -1.4, -1.5, 1.6]
+    with VirtualController.start(address=next_address(), joints=joints, state="idle") as controller:
+        state = controller.fault("state")
+    assert state["joints"] == pytest.approx(joints)
+    assert state["robot_mode"] == "IDLE"
+
+
+def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
+    with pytest.raises(VirtualControllerError, match=f"{shared.address}.*is another one running there"):
+        VirtualController.start(address=shared.address)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"address": "0.0.0.0"}, "only loopback"),
+        ({"address": "192.168.0.1"}, "only loopback"),
+        ({"time_scale": 0.0}, "scale"),
+        ({"time_scale": float("nan")}, "scale"),
+        ({"frequency": 1.0}, "Hz"),
+        ({"model": "ur5"}, "ur10"),
+        ({"joints": [0.0, 1.0]}, "six numbers"),
+        ({"joints": [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]}, "joint 5"),
+    ],
+)
+def test_settings_that_make_no_sense_are_told(options: dict[str, object], says: str) -> None:
+    with pytest.raises(VirtualControllerError, match=says):
+        VirtualController.start(**{"address": next_address(), **options})  # type: ignore[arg-type]
+
+
+PARENT = """
+import os, sys, time
+from actors.virtual_ur import VirtualController
+controller = VirtualController.start(address=sys.argv[1])
+if sys.argv[2] == "fork":
+    if os.fork() == 0:  # holds the controller's standard input open
+        time.sleep(20)
+        os._exit(0)
+print(controller.pid, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("how", ["plain", "fork"])
+def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
+    address = next_address()
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, address, how], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        assert alive(pid)
+        parent.kill()
+        parent.wait()
+        assert gone(pid)
+    finally:
+        parent.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(parent.pid, signal.SIGKILL)
+        parent.stdout.close()
+
+
+sizes = st.integers(0, 70_000)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(port=st.sampled_from((*PORTS, 0)), data=st.one_of(st.binary(max_size=200), sizes.map(os.urandom)))
+def test_no_bytes_on_any_port_bring_it_down(shared: VirtualController, port: int, data: bytes) -> None:
+    try:
+        with socket.create_connection((shared.address, port or shared.fault_port), timeout=5) as connection:
+            connection.sendall(data)
+            connection.shutdown(socket.SHUT_WR)
+    except (ConnectionError, OSError):
+        pass  # it may have been cut off
+    assert shared.alive
+    assert greeting(shared.address).startswith(b"Connected")
+
+
+@pytest.mark.parametrize("port", PORTS)
+def test_connections_that_come_and_go_or_never_read_do_no_harm(shared: VirtualController, port: int) -> None:
+    connections = [socket.create_connection((shared.address, port), timeout=5) for _ in range(50)]
+    for connection in connections[::2]:
+        connection.close()
+    assert greeting(shared.address).startswith(b"Connected")
+    for connection in connections[1::2]:
+        connection.close()
+    assert shared.fault("state")["safety_mode"] == "NORMAL"

@@ -1,0 +1,153 @@
+"""No spillage is predicted without its spread over seeds: plans, pours, summaries."""
+
+from __future__ import annotations
+
+import asyncio
+import statistics
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from actors.optimizer.core.propose import propose
+from orchestrator.report.summary import summarise, summary_table
+from orchestrator.report.units import loss_unit
+from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
+from orchestrator.stages import deployment_stages, prediction_stages
+from orchestrator.strategies.deployment_d1 import OneShotPlanning
+from orchestrator.strategies.deployment_d3 import Hybrid
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.tally import Tally
+from sim_engine.losses import Loss
+from tests.orchestrator import watched
+from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan
+from tests.orchestrator.reported import shown
+from tests.orchestrator.toy import ToyLaboratory, run_toy, toy_plan
+from tests.orchestrator.toys import narrow_cup
+
+ACTION = SCENE.action({"angular_velocity": 1.0, "x_offset": 0.1})
+
+
+class Learning:
+    """The real optimiser, in this process."""
+
+    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+        return propose(problem)
+
+
+def learning_laboratory() -> ToyLaboratory:
+    return ToyLaboratory(optimizer=Learning())  # type: ignore[arg-type]
+
+
+def repeated(count: int = 5, seed: int = 3, loss: Loss | None = None) -> RepeatedSimulation:
+    return RepeatedSimulation(SCENE, ACTION, THETA, loss or Loss(), count, seed)
+
+
+def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> None:
+    strategy = repeated(loss=Loss("grams"))
+    assert isinstance(strategy, Strategy)
+    played = Play(narrow_cup)(strategy)
+    assert {(r.action, r.purpose) for r in played.simulations} == {(ACTION, "predict")}
+    assert len({r.seed for r in played.simulations}) == 5
+    spilled = [o.outcome.fractions.spilled for _, o in played.told]  # type: ignore[union-attr]
+    found: Any = strategy.result()["over_seeds"]
+    assert found["spilled"] == pytest.approx(
+        {"mean": statistics.mean(spilled), "deviation": statistics.stdev(spilled), "count": 5}
+    )
+    assert found["loss"]["mean"] == pytest.approx(200.0 * statistics.mean(spilled))
+    assert strategy.progress() == (5, 5)
+    assert Play(narrow_cup)(repeated()).simulations == Play(narrow_cup)(repeated()).simulations
+    assert Play(narrow_cup)(repeated(seed=4)).simulations != played.simulations
+
+
+def test_simulations_that_failed_are_counted_and_left_out_of_the_prediction() -> None:
+    answers = iter([Failed("simulation", "it leaked"), Failed("invalid_action", "cups touch")])
+
+    def answer(request: Request) -> Outcome | None:
+        return next(answers, None)
+
+    strategy = repeated()
+    Play(narrow_cup, answer=answer)(strategy)
+    result: Any = strategy.result()
+    assert (result["simulations"], result["simulations_lost"]) == (5, 2)
+    assert result["over_seeds"]["loss"]["count"] == 3
+
+
+def test_without_a_planned_action_nothing_is_simulated() -> None:
+    strategy = RepeatedSimulation(SCENE, None, THETA, Loss(), 5, 1)
+    assert strategy.finished
+    assert strategy.result()["over_seeds"] == {}
+
+
+def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path) -> None:
+    plan = toy_plan(tmp_path)
+    assert plan.deployment is not None
+    planned = replace(plan.deployment, strategy="D1", pours=0, iterations=4)
+    plan = replace(plan, deployment=planned)
+    stages = [*deployment_stages(plan, planned), *prediction_stages(plan, planned, 3)]
+    result = asyncio.run(run_toy(tmp_path / "run", learning_laboratory(), plan=plan, stages=stages))
+    assert list(result.results) == ["deployment:cup", "prediction:cup"]
+    assert result.simulations == 4 * 2 + 3
+    found = result.results["prediction:cup"]["over_seeds"]
+    assert found["spillage"]["count"] == 3
+    assert found["spillage"]["deviation"] > 0.0
+    summary = summarise(plan, result.results)
+    assert summary["receivers"]["cup"]["prediction"] == found
+    text = " ".join(shown(summary_table(plan, summary)).split())
+    mean, deviation = (100 * found["spillage"][name] for name in ("mean", "deviation"))
+    assert f"cup, best action: spilled / poured {mean:.2f} ± {deviation:.2f} %" in text
+    assert "(mean ± standard deviation, 3 fresh seeds)" in text
+
+
+@pytest.mark.parametrize("strategy", [Hybrid, OneShotPlanning])
+def test_pours_are_predicted_with_how_well_the_mean_is_known_and_how_much_a_pour_scatters(strategy: Any) -> None:
+    played = Play(narrow_cup)(strategy(deployment_plan(strategy=strategy.NAME, pours=3), SCENE, THETA, 1))
+    predictions = [r.predicted for r in played.asked if isinstance(r, Pour)]
+    assert predictions
+    assert all(p is not None and p.scatter is not None and p.scatter > 0.0 for p in predictions)
+
+
+def test_d1_tells_the_scatter_of_one_seed_though_it_averages_several() -> None:
+    """Means of four seeds scatter half as much as a single one."""
+    strategy = OneShotPlanning(
+        deployment_plan(strategy="D1", simulations_per_iteration=4, iterations=8), SCENE, THETA, 1
+    )
+    Play(narrow_cup)(strategy)
+    result: Any = strategy.result()
+    assert result["predicted_scatter"] == pytest.approx(2.0 * result["hyperparameters"]["noise"])
+    assert result["predicted_spillage_deviation"] > 0.0
+    assert result["pours"][0]["predicted_scatter"] == result["predicted_scatter"]
+
+
+def test_the_line_of_a_pour_says_both() -> None:
+    predicted = Prediction(0.008, 0.009, 0.005)
+    assert loss_unit(Loss()).prediction(predicted) == "0.80 ± 0.90 %, a pour ± 0.50 %"
+    assert loss_unit(Loss()).prediction(replace(predicted, scatter=None)) == "0.80 ± 0.90 %"
+    plan = watched.campaign()
+    tally = Tally(plan)
+    for event in watched.events(plan):
+        request = getattr(event, "request", None)
+        known = isinstance(request, Pour)
+        tally(replace(event, request=replace(request, predicted=predicted)) if known else event)  # type: ignore[type-var]
+    assert "predicted 0.80 ± 0.90 %, a pour ± 0.50 %" in (tally.pour_line() or "")
+
+
+def test_the_summary_s_best_expected_loss_has_both(results: dict[str, dict[str, Any]]) -> None:
+    plan = watched.campaign()
+    deployed = {**results["narrow cup"], "predicted_loss": 0.02, "predicted_deviation": 0.01, "predicted_scatter": 0.03}
+    text = shown(summary_table(plan, summarise(plan, {"narrow cup": deployed})))
+    assert "2.00 ± 1.00 %, a pour ± 3.00 %" in text
+    older = {key: value for key, value in deployed.items() if key != "predicted_scatter"}
+    assert "a pour" not in shown(summary_table(plan, summarise(plan, {"narrow cup": older})))
+
+
+def test_what_is_asked_for_is_simulations_of_the_slots_that_are_free() -> None:
+    strategy = repeated(count=3)
+    first = strategy.ask(Slots(2))
+    assert [type(r) for r in first] == [Simulate, Simulate]
+    assert len(strategy.ask(Slots(2))) == 1
+    with pytest.raises(ValueError, match="not asked for"):
+        strategy.tell(replace(first[0], seed=-1), Failed("simulation", ""))  # type: ignore[type-var]

@@ -1,0 +1,157 @@
+"""What a parameter does to the spillage: found in made-up pours whose answer is known, and in a real one."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim_engine.liquid import SimulationParameters
+from sim_engine.outcome import PourOutcome
+from sim_engine.pour import PourSimulator
+from sim_engine.task import PourTask
+from sim_engine.validation import suite
+from sim_engine.validation.sensitivity import (
+    PARTICLES,
+    POURS,
+    Effect,
+    Extent,
+    Sensitivity,
+    analyse,
+    effects,
+    grid,
+    sensitivity,
+)
+
+INFOS = SimulationParameters.info()
+NOISE = 0.01
+
+
+def analysed(curve: Any, *, points: int = 7, seeds: int = 5, noise: float = NOISE, seed: int = 1) -> Sensitivity:
+    """Of a spillage that is a function of the parameter, plus noise from seed to seed."""
+    rng = np.random.default_rng(seed)
+    values = np.linspace(0.0, 1.0, points)
+    samples = [curve(v) + noise * rng.standard_normal(seeds) for v in values]
+    return analyse("friction", "fast", values, samples, 1e-3)
+
+
+@pytest.mark.parametrize("name", INFOS)
+@pytest.mark.parametrize("count", [3, 6, 8])
+def test_a_grid_has_the_default_and_both_ends(name: str, count: int) -> None:
+    info, default = INFOS[name], float(getattr(SimulationParameters(particles=1_000), name))
+    values = grid(info, default, count)
+    ends = PARTICLES if name == "particles" else (info.lower, info.upper)
+    assert (values[0], values[-1]) == ends
+    assert default in values
+    assert len(values) == count
+    assert list(values) == sorted(values)
+    assert all(SimulationParameters.from_values({name: v}) for v in values)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.1, 0.6), st.booleans(), st.integers(0, 10_000))
+def test_a_monotone_effect_is_found_over_the_whole_range_with_its_size_and_slope(
+    size: float, falls: bool, seed: int
+) -> None:
+    sign = -1 if falls else 1
+    found = analysed(lambda v: 0.7 * falls + sign * size * v, seed=seed)
+    assert found.direction == sign
+    assert abs(found.change - sign * size) < 5 * found.change_error
+    assert abs(found.slope - sign * size) < 5 * found.slope_error
+    assert found.upper - found.lower > 0.8
+
+
+def test_where_an_effect_turns_round_its_range_ends() -> None:
+    """Spillage rises up to 2/3 and falls from there."""
+    found = analysed(lambda v: 0.3 - 0.5 * abs(v - 2 / 3), points=10)
+    assert (found.direction, found.lower) == (1, 0.0)
+    assert found.upper == pytest.approx(2 / 3)
+    assert found.change == pytest.approx(0.5 * 2 / 3, abs=0.03)
+
+
+def test_noise_alone_is_no_effect() -> None:
+    found = [analysed(lambda v: 0.2, seed=seed) for seed in range(40)]
+    assert sum(one.direction == 0 for one in found) >= 34  # 95 % of them, but for chance
+    assert all(abs(one.slope) < 5 * one.slope_error for one in found)
+
+
+def test_more_noise_hides_what_less_noise_shows() -> None:
+    assert analysed(lambda v: 0.2 + 0.03 * v, noise=0.002).direction == 1
+    assert analysed(lambda v: 0.2 + 0.03 * v, noise=0.2).direction == 0
+
+
+def test_seeds_that_all_spill_alike_are_no_better_known_than_to_a_particle() -> None:
+    found = analysed(lambda v: 0.1, noise=0.0)
+    assert (found.direction, found.change) == (0, 0.0)
+    assert found.change_error == pytest.approx(math.hypot(1e-3, 1e-3))
+
+
+class MadeUp:
+    """Spills with friction, less with cohesion, and otherwise whatever; leaks where lips are lowered most."""
+
+    def __init__(self) -> None:
+        self.tasks: list[PourTask] = []
+
+    def simulate(self, task: PourTask) -> Any:
+        self.tasks.append(task)
+        theta = task.parameters
+        spilled = 0.2 + 0.3 * theta.friction - 0.5 * theta.cohesion
+        spilled += 0.002 * np.random.default_rng(task.seed).standard_normal()
+        leak = "it leaked" if theta.lip_drop == 2.0 else None
+        o = PourOutcome(
+            1 - spilled, spilled, 0.0, 0.0, 0.0, theta.particles, 0.005, 0.0, 3.0, 1, 0.0, task.seed, invalid=leak
+        )
+        return SimpleNamespace(outcome=o)
+
+
+def test_every_parameter_is_turned_alone_and_the_defaults_are_simulated_once() -> None:
+    made_up, told = MadeUp(), []
+    extent = Extent(1_000, 5, 3, ("slow", "fast"))
+    measurements, figure = sensitivity(made_up, extent, lambda done, total: told.append((done, total)))  # type: ignore[arg-type]
+    base = SimulationParameters(particles=1_000)
+    turned = [{n for n in INFOS if getattr(t.parameters, n) != getattr(base, n)} for t in made_up.tasks]
+    assert max(len(names) for names in turned) == 1
+    assert len(made_up.tasks) == 2 * 3 * (1 + 4 * len(INFOS)) == told[-1][0] == told[-1][1]
+    assert turned.count(set()) == 2 * 3
+    assert {t.action for t in made_up.tasks} == {POURS["slow"], POURS["fast"]}
+    known = {(e.parameter, e.pour): e for e in effects([m.as_json() for m in measurements])}
+    assert len(known) == 2 * len(INFOS)
+    assert known["friction", "slow"].effect == "spillage rises"
+    assert known["friction", "slow"].where == "0 … 1"
+    assert known["friction", "slow"].change == pytest.approx(0.3, abs=0.01)
+    assert known["cohesion", "fast"].effect == "spillage falls"
+    assert known["cohesion", "fast"].where == "0 … 0.2 N/m"
+    assert known["viscosity", "fast"].effect.startswith("no effect")
+    assert known["lip_drop", "fast"].where == "0 … 1.5"  # what leaked does not count
+    assert len(figure.titles) == len(INFOS)
+    assert all(len(s.spread) == len(s.x) for s in figure.series if s.kind == "measured")
+
+
+def test_what_the_defaults_spill_is_told_with_the_deviation_of_its_seeds() -> None:
+    measurements, _ = sensitivity(MadeUp(), Extent(1_000, 3, 4, ("fast",), ("friction",)))  # type: ignore[arg-type]
+    mean, deviation = measurements[:2]
+    assert mean.name == "fast pour with the defaults: spilled / poured"
+    assert mean.value == pytest.approx(0.19, abs=0.01)
+    assert 0.0 < deviation.value < 0.01
+
+
+def test_other_lines_of_a_page_are_no_effects() -> None:
+    rows = [{"name": "height", "value": 1.0}, {"name": "… mean slope, per 1 (± 0.1)", "value": 2.0}]
+    assert effects(rows) == []
+    line = {"name": "friction 0 … 1, fast pour: spillage rises; change (± 0.02)", "value": 0.15}
+    assert effects([line]) == [Effect("friction", "fast", "0 … 1", "spillage rises", 0.15, "0.02")]
+
+
+def test_walls_that_rub_spill_more_in_a_real_pour(simulator: PourSimulator) -> None:
+    measurements, _ = sensitivity(simulator, Extent(300, 3, 2, ("fast",), ("friction",)))
+    (found,) = effects([m.as_json() for m in measurements])
+    assert found.effect == "spillage rises"
+
+
+def test_the_case_is_one_of_the_suite() -> None:
+    assert suite.case("sensitivity").title == "What the parameters do"
