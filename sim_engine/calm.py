@@ -1,4 +1,4 @@
-"""When a simulation has to begin: while liquid only lies level in a slowly turning cup, hydrostatics knows all about it.
+"""When a simulation has to begin: of liquid that lies level in a slowly turning cup hydrostatics knows all.
 
 A slow pour spends half of its time before anything can leave. Simulating that costs as much as the pour and decides
 nothing. So the lattice is laid level into the cup as it is tilted shortly before it may spill, and moves off with it.
@@ -12,10 +12,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_engine.hydrostatics import GRAVITY, level
 from sim_engine.motion import Motion
 from sim_engine.vessel.vessel import Vessel
+
+Floats = NDArray[np.float64]
 
 LEAD = 0.3
 """The simulation begins so long before the level is `FREEBOARD` below the lip [s]."""
@@ -24,7 +27,7 @@ FREEBOARD = 0.12
 """In opening radii: below that, no wave that `CALM` allows reaches the lip."""
 
 CALM = 0.06
-"""Waves may be so high, in opening radii: 2.4 mm in a cup of 40 mm. A straight cup turned at 30 deg/s just about does."""
+"""Waves may be so high, in opening radii: 2.4 mm in a cup of 40 mm, about what turning it at 30 deg/s makes."""
 
 STEP = 0.02
 """Resolution, and what the begin is a multiple of [s]."""
@@ -62,9 +65,7 @@ def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
     if len(times) < 4:
         return 0.0
     tilts = motion.tilt(times)
-    last = _last_below(pourer, volume, tilts)
-    last = min(last, int(np.argmax(np.abs(tilts) > 0.5 * math.pi)) if np.any(np.abs(tilts) > 0.5 * math.pi) else last)
-    begin = last - round(LEAD / STEP)
+    begin = _last_below(pourer, volume, tilts) - round(LEAD / STEP)
     if begin <= 0:
         return 0.0
     speeds, accelerations = _centre(motion, pourer, times[: begin + 2])
@@ -72,11 +73,11 @@ def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
     return float(begin * STEP) if height <= CALM * pourer.opening_radius else 0.0
 
 
-def _last_below(pourer: Vessel, volume: float, tilts: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> int:
-    """Index up to which the level stays below the lip by the freeboard, by bisection over the first rise of the tilt."""
+def _last_below(pourer: Vessel, volume: float, tilts: Floats) -> int:
+    """Index up to which the level stays below the lip by the freeboard: bisection over the first rise of the tilt."""
     limit = -FREEBOARD * pourer.opening_radius
-    rising = int(np.argmax(np.diff(tilts) < -1e-9)) if np.any(np.diff(tilts) < -1e-9) else len(tilts) - 1
-    low, high = 0, rising
+    falls = np.append(np.diff(tilts) < -1e-9, True)
+    low, high = 0, int(np.argmax(falls))
     if level(pourer, volume, float(tilts[0])) > limit:
         return 0
     while high - low > 1:
@@ -88,15 +89,13 @@ def _last_below(pourer: Vessel, volume: float, tilts: np.ndarray[tuple[int, ...]
     return low
 
 
-def liquid_velocity(motion: Motion, pourer: Vessel, time: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def liquid_velocity(motion: Motion, pourer: Vessel, time: float) -> Floats:
     """Velocity of the pourer's middle, shape (3,) [m/s]."""
     places = _middles(motion, pourer, np.array([time, time + 1e-3]))
     return np.asarray((places[1] - places[0]) / 1e-3)
 
 
-def _middles(
-    motion: Motion, pourer: Vessel, times: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _middles(motion: Motion, pourer: Vessel, times: Floats) -> Floats:
     """The point at half height on the pourer's axis over time, shape (T, 3) [m]."""
     poses = motion.sample(times)
     w, x, y, z = poses[:, 3:7].T
@@ -104,10 +103,8 @@ def _middles(
     return np.asarray(poses[:, :3] + 0.5 * (pourer.inner_floor + pourer.rim_height) * axis)
 
 
-def _centre(
-    motion: Motion, pourer: Vessel, times: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]], np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
-    """Speeds [m/s] and accelerations [m/s²] of the pourer's middle; a start from rest is a speed, not an acceleration."""
+def _centre(motion: Motion, pourer: Vessel, times: Floats) -> tuple[Floats, Floats]:
+    """Speeds [m/s] and accelerations [m/s²] of the pourer's middle; a start from rest counts as a speed."""
     places = _middles(motion, pourer, times)
     velocities = np.diff(places, axis=0) / STEP
     accelerations = np.diff(velocities, axis=0) / STEP

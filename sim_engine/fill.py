@@ -56,7 +56,8 @@ def fill(
 
 def _height(places: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
     """Height of places of the vessel's frame in a tilted vessel, up to a constant (N,) [m]."""
-    return places[:, 2] * np.cos(tilt) - places[:, 0] * np.sin(tilt)
+    height: NDArray[np.float64] = places[:, 2] * np.cos(tilt) - places[:, 0] * np.sin(tilt)
+    return height
 
 
 def _lattice(

@@ -266,9 +266,7 @@ class PourSimulator:
             if len(self._planes) >= PLANES_KEPT:
                 self._planes.pop(next(iter(self._planes)))
             self._planes[key] = equivalent_distance(vessel.grid, self._masks[spec], vessel.rim_height, support)
-        return SolidWalls(
-            vessel.grid, self._planes[key], self._masks[spec], vessel.wall_thickness, vessel.rim_height
-        )
+        return SolidWalls(vessel.grid, self._planes[key], self._masks[spec], vessel.wall_thickness, vessel.rim_height)
 
     def close(self) -> None:
         """End Taichi; compiled kernels are kept for the next process."""

@@ -21,6 +21,7 @@ from sim_engine.fluid.state import SUPPORT, VESSELS
 PACKING = 1.023
 """Kernel sum of a relaxed bulk of spacing d over its continuum value, measured on a cup at rest."""
 
+
 @ti.func
 def measure_first(f: ti.template(), s):
     """Density of all particles and, for the whole step, what their constraints' gradients amount to."""

@@ -3,6 +3,7 @@
 import contextlib
 import io
 from collections.abc import Sequence
+from typing import Generic, TypeVar
 
 import numpy as np
 import taichi as ti
@@ -69,9 +70,8 @@ class FluidEngine:
         if self.room_for([len(s.positions) for s in setups]) < len(setups):
             raise ValueError(f"{len(setups)} scenes do not fit into one load")
         f = self.state
-        values = _Pool()
-        planes = _Pool()
-        insides = _Pool()
+        values, planes = _Pool[np.float32](), _Pool[np.float32]()
+        insides = _Pool[np.uint8]()
         begin, row = 0, 0
         for s, setup in enumerate(setups):
             count, d = len(setup.positions), setup.spacing
@@ -209,15 +209,18 @@ class FluidEngine:
         return float(self.state.compression[scene]) / max(self.steps(scene), 1)
 
 
-class _Pool:
+T = TypeVar("T", np.float32, np.uint8)
+
+
+class _Pool(Generic[T]):
     """Arrays side by side, each object once."""
 
     def __init__(self) -> None:
-        self._parts: list[NDArray[np.generic]] = []
+        self._parts: list[NDArray[T]] = []
         self._offsets: dict[int, int] = {}
         self._size = 0
 
-    def add(self, part: NDArray[np.generic], known_as: NDArray[np.generic] | None = None) -> int:
+    def add(self, part: NDArray[T], known_as: object = None) -> int:
         """Offset of an array in the pool. Two arrays that are `known_as` the same object are the same."""
         key = id(part if known_as is None else known_as)
         if key not in self._offsets:
@@ -226,7 +229,7 @@ class _Pool:
             self._size += part.size
         return self._offsets[key]
 
-    def array(self) -> NDArray[np.generic]:
+    def array(self) -> NDArray[T]:
         """All of them."""
         return np.ascontiguousarray(np.concatenate(self._parts))
 

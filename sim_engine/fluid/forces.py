@@ -11,7 +11,6 @@ import math
 import taichi as ti
 
 from sim_engine.fluid.kernels import attraction, weight
-from sim_engine.fluid.density import PACKING
 from sim_engine.fluid.state import SUPPORT
 
 LONGEST_WAIT = 0.01

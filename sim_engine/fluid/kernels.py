@@ -56,12 +56,11 @@ ATTRACTION_MOMENT = 64.0 * math.factorial(7) * math.factorial(3) / math.factoria
 """∫₀¹ attraction(q) q⁴ dq, for the scaling of cohesion to a tension."""
 
 
-
 def cohesion_acceleration(tension: float, density: float, spacing: float, support: float) -> float:
     """Peak acceleration of one pair [m/s²] that gives a liquid of that spacing a surface tension.
 
-    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for the amplitude of the
-    pair force f.
+    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for the amplitude
+    of the pair force f.
 
     Args:
         tension: σ [N/m].

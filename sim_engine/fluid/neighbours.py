@@ -96,4 +96,3 @@ def rebuild(f: ti.template(), s, skin):
             entries = f.list_begin[s]
     f.rebuilds[s] += 1
     f.stale[s] = 0
-

@@ -3,7 +3,7 @@
 import taichi as ti
 
 SUPPORT = 2.2
-"""Kernel support h over spacing d. At 2.0 a liquid at rest was a crystal that waves found too stiff (sloshing 6 % fast)."""
+"""Kernel support h over spacing d. At 2.0 liquid at rest was a crystal, too stiff for waves (sloshing 6 % fast)."""
 
 VESSELS = 2
 """Pourer (0) and receiver (1)."""
@@ -29,8 +29,8 @@ class FluidState:
         x, x0, v: position, position before the step [m], velocity [m/s].
         pressure, dp: accumulated density multiplier and its last change [m²].
         density: ρ/ρ₀.
-        phi, normal: distance of the equivalent plane of each vessel's walls [m] at the last look, linearised in between;
-            its gradient. Between steps phi is the signed distance.
+        phi, normal: distance of the equivalent plane of each vessel's walls [m] at the last look, linearised in
+            between; its gradient. Between steps phi is the signed distance.
         push: normal displacement given by each wall in this step [m].
         home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
         gradient, squares: Σ∇W and what the constraint's gradients amount to, Σ|∇C|².

@@ -29,8 +29,8 @@ TOLERANCE = 0.015
 MOST_ITERATIONS = 30
 """… but never more than so many."""
 SKIN = 0.03
-"""Neighbour lists reach that many spacings beyond the support. A skin of 0.3 made lists last for three steps while liquid
-is calm, and half as long again: every pass over them paid for it."""
+"""Neighbour lists reach that many spacings beyond the support. A skin of 0.3 made lists last for three steps of calm
+liquid, and half as long again: every pass over them paid for it."""
 SMOOTHEST, ROUGHEST = 0.7, 3.7
 """Eigenvalues of the iteration matrix between which Chebyshev's polynomials damp: ROUGHEST is the largest that occurs
 (dense packing, h = 2.2 d); a smaller SMOOTHEST gives longer strides, and noise at rest."""
@@ -119,14 +119,12 @@ class Stepper:
 
     @ti.func
     def look_at_walls(self, s, planes: ti.template()):
-        """Distance and normal of both vessels' equivalent planes at every moving particle, for the iterations to linearise."""
+        """Distance and normal of both vessels' equivalent planes at all moving particles, to be linearised."""
         f = self.state
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             x = f.x[i]
             for b in range(VESSELS):
-                look = distance_and_gradient(
-                    f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False)
-                )
+                look = distance_and_gradient(f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False))
                 f.phi[i][b] = look[3]
                 n = f.turn[s, b] @ ti.Vector([look[0], look[1], look[2]])
                 for c in ti.static(range(3)):
@@ -134,8 +132,11 @@ class Stepper:
 
     @ti.func
     def apply(self, s):
-        """Move by the displacements found; linearised wall contact. `CONTACT` is kept at the step's end only: held to it in
-        every iteration, the ring of particles in a corner never came to rest."""
+        """Move by the displacements found; linearised wall contact.
+
+        `CONTACT` is kept at the step's end only: held to it in every iteration, the ring of particles in a corner never
+        came to rest.
+        """
         f = self.state
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             x = f.x[i] + f.dx[i]

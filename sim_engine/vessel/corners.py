@@ -1,9 +1,10 @@
 """How solid a wall looks from inside a vessel: the distance of the plane that would be as solid.
 
-The density constraint sees a wall as the kernel's integral over a half-space at the wall's signed distance. In a concave
-corner there is more solid than that: particles were pressed into it until they touched both walls, and jumped between
-them as the nearer one changed. Here the kernel is integrated over all that is not cavity, and turned into the distance of
-a plane with the same integral, which has no such jumps. Walls count as infinitely thick, whatever lies behind them.
+The density constraint sees a wall as the kernel's integral over a half-space at the wall's signed distance. In a
+concave corner there is more solid than that: particles were pressed into it until they touched both walls, and jumped
+between them as the nearer one changed. At an edge there is less: a hole in a floor seemed narrower than it is. Here the
+kernel is integrated over all that is not cavity, and turned into the distance of a plane with the same integral, which
+has no such jumps. Walls count as infinitely thick, whatever lies behind them.
 
 Source: after Bender et al. 2019 (volume maps); the detour by an equivalent plane is ours.
 """
@@ -34,8 +35,8 @@ def equivalent_distance(
     Args:
         grid: signed distance and cavity.
         inside: 1 at nodes in the cavity, continued into the wall up to its middle.
-        rim_height: of the lip in the vessel's frame [m]. Within one to two supports of it, and outside the cavity, it is
-            the signed distance: there the wall ends, or is seen from the other side.
+        rim_height: of the lip in the vessel's frame [m]. Within one to two supports of it, and outside the cavity,
+            the result is the signed distance: there the wall ends, or is seen from the other side.
         support: h of the kernel [m].
 
     Returns:
