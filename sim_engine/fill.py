@@ -17,14 +17,17 @@ def spacing(volume: float, particles: int) -> float:
     return float((volume / particles) ** (1.0 / 3.0))
 
 
-def fill(vessel: Vessel, volume: float, particles: int, seed: int, wall_distance: float = 0.5) -> NDArray[np.float32]:
+def fill(
+    vessel: Vessel, volume: float, particles: int, seed: int, wall_distance: float = 0.5, tilt: float = 0.0
+) -> NDArray[np.float32]:
     """Positions of exactly `particles` particles of volume V/N each.
 
     Args:
-        vessel: upright.
+        vessel: filled from below.
         volume: of the liquid [m³].
         particles: N.
         wall_distance: lattice points keep about that many spacings from solid, as the density constraint will.
+        tilt: of the vessel when it is filled, towards +x [rad].
         seed: shifts the lattice, jitters it, and chooses among the places of the topmost layer.
 
     Returns:
@@ -41,7 +44,7 @@ def fill(vessel: Vessel, volume: float, particles: int, seed: int, wall_distance
         for squeeze in (1.0, 0.98, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84):
             places = _lattice(vessel, d, d * squeeze, wall_distance, top, rng)
             if len(places) >= particles:
-                order = np.lexsort((rng.random(len(places)), np.round(places[:, 2] / (d * squeeze))))
+                order = np.lexsort((rng.random(len(places)), np.round(_height(places, tilt) / (d * squeeze))))
                 chosen = places[order[:particles]]
                 chosen += rng.uniform(-JITTER, JITTER, chosen.shape) * d
                 return chosen.astype(np.float32)
@@ -49,6 +52,12 @@ def fill(vessel: Vessel, volume: float, particles: int, seed: int, wall_distance
         f"{vessel.name}: {1e6 * volume:.4g} mL as {particles} particles do not fit under the rim (it holds "
         f"{1e6 * vessel.capacity:.4g} mL to the brim); pour less, use more particles, or a larger vessel"
     )
+
+
+def _height(places: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
+    """Height of places of the vessel's frame in a tilted vessel, up to a constant (N,) [m]."""
+    height: NDArray[np.float64] = places[:, 2] * np.cos(tilt) - places[:, 0] * np.sin(tilt)
+    return height
 
 
 def _lattice(

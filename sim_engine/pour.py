@@ -6,21 +6,26 @@ Light to import; Taichi starts with the first simulation.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sim_engine.backend import Backend
+from sim_engine.calm import calm_until, liquid_velocity
 from sim_engine.contact import describe_contact, first_contact, rotations
+from sim_engine.course import LONGEST_TAIL, Course, follow, outcome
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fill import fill, spacing
+from sim_engine.fluid.setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.motion import Motion, plan_motion
-from sim_engine.outcome import ESCAPED_LIMIT, ParticleState, PourOutcome
+from sim_engine.outcome import PourOutcome
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.corners import equivalent_distance
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.spec import VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
@@ -38,19 +43,12 @@ __all__ = [
     "check_motion",
 ]
 
-SLICE = 0.02
-"""The solver is called for so much simulated time at once; curve and frames are taken between calls [s]."""
-
 SETTLING = 0.15
 """The lattice may settle so long before the motion begins [s]."""
 
-QUIET = 0.15
-"""With nothing in flight for so long after the motion (or with an empty pourer), the pour is over [s]."""
-
-LONGEST_TAIL = 1.0
-"""The pour ends so long after the motion even if something is still in flight [s]."""
-
 CONTACT_POSES = 121
+
+PLANES_KEPT = 16
 
 
 @dataclass(frozen=True)
@@ -107,11 +105,17 @@ def inside_mask(vessel: Vessel) -> NDArray[np.uint8]:
 
 
 class PourSimulator:
-    """Simulates pours one after the other. One per process: Taichi's arrays are shared."""
+    """Simulates pours, one by one or many in a call. One per process: Taichi's arrays are shared.
 
-    def __init__(self) -> None:
+    Args:
+        backend: 'cpu' or 'cuda'.
+    """
+
+    def __init__(self, backend: Backend = "cpu") -> None:
+        self.backend = backend
         self._vessels: dict[VesselSpec, Vessel] = {}
         self._masks: dict[VesselSpec, NDArray[np.uint8]] = {}
+        self._planes: dict[tuple[VesselSpec, float], NDArray[np.float32]] = {}
 
     def vessel(self, spec: VesselSpec) -> Vessel:
         """A vessel, built once.
@@ -155,48 +159,114 @@ class PourSimulator:
         Raises:
             InvalidSceneError: the pour can't be made.
             SimulationCancelled: `cancelled` said so.
+            BackendError: the backend is not there.
+        """
+        (run,) = self.simulate_many([task], cancelled=cancelled)
+        return run
+
+    def simulate_many(
+        self, tasks: Sequence[PourTask], *, cancelled: Callable[[], bool] | None = None
+    ) -> list[SimulationRun]:
+        """Run many pours, of any actions, θ, vessels and seeds, in one set of kernels.
+
+        On a CPU the pours follow each other; on a GPU they run side by side, as many as there is memory for. Every
+        outcome is the one that the pour has alone.
+
+        Args:
+            tasks: what to simulate.
+            cancelled: polled every `SLICE` of simulated time.
+
+        Returns:
+            As many runs, in the same order.
+
+        Raises:
+            InvalidSceneError: one of the pours can't be made; nothing was simulated.
+            SimulationCancelled: `cancelled` said so.
+            BackendError: the backend is not there.
         """
         from sim_engine.fluid.engine import engine
 
-        motion = self.prepare(task)
-        fluid = engine()
-        self._load(fluid, task, motion)
-        begun = time.process_time()
-        fluid.advance(0.0)
-        course = _run(fluid, task, motion, cancelled)
-        outcome = _outcome(fluid, task, course, time.process_time() - begun)
-        return SimulationRun(outcome, course.recorded(motion))
+        motions = [self.prepare(task) for task in tasks]
+        fluid = engine(self.backend)
+        runs: list[SimulationRun] = []
+        while len(runs) < len(tasks):
+            first = len(runs)
+            end = first + fluid.room_for([task.parameters.particles for task in tasks[first:]])
+            runs += self._batch(fluid, tasks[first:end], motions[first:end], cancelled)
+        return runs
 
-    def _load(self, fluid: FluidEngine, task: PourTask, motion: Motion) -> None:
-        """Put the scene's vessels, motion and liquid into the engine."""
-        from sim_engine.fluid.engine import POSE_STEP
-        from sim_engine.fluid.kernels import cohesion_strength
+    def _batch(
+        self,
+        fluid: FluidEngine,
+        tasks: Sequence[PourTask],
+        motions: Sequence[Motion],
+        cancelled: Callable[[], bool] | None,
+    ) -> list[SimulationRun]:
+        """Pours that fit into one load."""
+        begun = time.process_time()
+        starts = [
+            calm_until(motion, self.vessel(task.scene.pourer), task.scene.liquid.volume)
+            for task, motion in zip(tasks, motions, strict=True)
+        ]
+        fluid.load([self._setup(*one) for one in zip(tasks, motions, starts, strict=True)])
+        loading = (time.process_time() - begun) / len(tasks)
+        courses = [
+            Course(task, motion, start, scene)
+            for scene, (task, motion, start) in enumerate(zip(tasks, motions, starts, strict=True))
+        ]
+        if fluid.backend == "cpu":
+            # One after the other: a scene's arrays stay in the core's cache.
+            for course in courses:
+                follow(fluid, [course], cancelled)
+        else:
+            follow(fluid, courses, cancelled)
+        return [
+            SimulationRun(outcome(fluid, course, loading), recorded_frames(course, motion))
+            for course, motion in zip(courses, motions, strict=True)
+        ]
+
+    def _setup(self, task: PourTask, motion: Motion, start: float) -> SceneSetup:
+        """The scene as the engine takes it, at the time from which it has to be simulated [s]."""
         from sim_engine.fluid.state import SUPPORT
 
         scene, parameters, error = task.scene, task.parameters, task.pose_error or PoseError()
         pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
         d = spacing(scene.liquid.volume, parameters.particles)
-        poses = motion.sample(np.arange(0.0, motion.duration + LONGEST_TAIL + 0.1, POSE_STEP))
+        at_start = np.array([start])
         # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
-        local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed, parameters.wall_distance)
-        (rotation,) = rotations(poses[:1])
-        fluid.load(
-            (local @ rotation.T + poses[0, :3]).astype(np.float32),
+        tilt = float(motion.tilt(at_start)[0]) if start > 0.0 else 0.0
+        local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed, parameters.wall_distance, tilt)
+        (pose,) = motion.sample(at_start)
+        (rotation,) = rotations(pose[None])
+        drift = liquid_velocity(motion, pourer, start) if start > 0.0 else np.zeros(3)
+        return SceneSetup(
+            positions=(local @ rotation.T + pose[:3]).astype(np.float32),
             spacing=d,
-            pair_acceleration=cohesion_strength(parameters.cohesion, d, SUPPORT * d) / (scene.liquid.density * d**3),
+            tension=parameters.cohesion,
+            density=scene.liquid.density,
             viscosity=parameters.viscosity,
             friction=parameters.friction,
             wall_distance=parameters.wall_distance,
             lip_drop=parameters.lip_drop,
-            grids=[pourer.grid, receiver.grid],
-            masks=[self._masks[scene.pourer], self._masks[scene.receiver]],
-            walls=[pourer.wall_thickness, receiver.wall_thickness],
-            rims=[pourer.rim_height, receiver.rim_height],
+            pourer=self._walls(scene.pourer, SUPPORT * d),
+            receiver=self._walls(scene.receiver, SUPPORT * d),
             receiver_at=np.array([error.x, error.y, 0.0]),
             spill_level=receiver.rim_height - d,
-            poses=poses,
-            start_time=-SETTLING,
+            poses=motion.sample(np.arange(0.0, motion.duration + LONGEST_TAIL + 0.1, POSE_STEP)),
+            settling=SETTLING,
+            start=start,
+            drift=(float(drift[0]), float(drift[1]), float(drift[2])),
         )
+
+    def _walls(self, spec: VesselSpec, support: float) -> SolidWalls:
+        """The vessel's; the last few planes are kept, for calibration changes θ again and again."""
+        vessel = self.vessel(spec)
+        key = (spec, support)
+        if key not in self._planes:
+            if len(self._planes) >= PLANES_KEPT:
+                self._planes.pop(next(iter(self._planes)))
+            self._planes[key] = equivalent_distance(vessel.grid, self._masks[spec], vessel.rim_height, support)
+        return SolidWalls(vessel.grid, self._planes[key], self._masks[spec], vessel.wall_thickness, vessel.rim_height)
 
     def close(self) -> None:
         """End Taichi; compiled kernels are kept for the next process."""
@@ -205,93 +275,10 @@ class PourSimulator:
         close_engine()
 
 
-@dataclass
-class _Course:
-    """What was seen of a pour on the way."""
-
-    times: list[float] = field(default_factory=lambda: [0.0])
-    poured: list[float] = field(default_factory=lambda: [0.0])
-    spilled: list[float] = field(default_factory=lambda: [0.0])
-    frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]] = field(default_factory=list)
-
-    def recorded(self, motion: Motion) -> RecordedFrames | None:
-        """The frames, if any were asked for."""
-        if not self.frames:
-            return None
-        times = np.array([t for t, _, _ in self.frames])
-        positions, states = [p for _, p, _ in self.frames], [s for _, _, s in self.frames]
-        return RecordedFrames(times, positions, states, motion.sample(times))
-
-
-def _run(fluid: FluidEngine, task: PourTask, motion: Motion, cancelled: Callable[[], bool] | None) -> _Course:
-    """Advance slice by slice until nothing can change any more, or a fault stops it.
-
-    Raises:
-        SimulationCancelled: `cancelled` said so.
-    """
-    course = _Course()
-    n = task.parameters.particles
-    next_frame = 0.0
-    still_since: float | None = None
-    slices = 0
-    while True:
-        clock = slices * SLICE
-        counts = fluid.census()
-        if task.record_rate > 0.0 and clock >= next_frame:
-            course.frames.append((fluid.time, *fluid.particles()))
-            next_frame += 1.0 / task.record_rate
-        if slices > 0:
-            course.times.append(fluid.time)
-            course.poured.append(1.0 - float(counts[ParticleState.IN_POURER]) / n)
-            course.spilled.append(float(counts[ParticleState.SPILLED]) / n)
-        if fluid.fault is not None or clock >= motion.duration + LONGEST_TAIL:
-            return course
-        # Over when nothing is in flight and nothing can start to fly.
-        still = counts[ParticleState.IN_FLIGHT] == 0
-        still_since = (clock if still_since is None else still_since) if still else None
-        done = clock >= motion.duration or counts[ParticleState.IN_POURER] == 0
-        if still_since is not None and done and clock - still_since >= QUIET:
-            return course
-        if cancelled is not None and cancelled():
-            raise SimulationCancelled
-        slices += 1
-        fluid.advance(slices * SLICE)
-
-
-def _outcome(fluid: FluidEngine, task: PourTask, course: _Course, cpu_s: float) -> PourOutcome:
-    """Count where everybody ended."""
-    n = task.parameters.particles
-    received, spilled, retained, in_flight, escaped = (
-        float(fluid.census()[state]) / n
-        for state in (
-            ParticleState.RECEIVED,
-            ParticleState.SPILLED,
-            ParticleState.IN_POURER,
-            ParticleState.IN_FLIGHT,
-            ParticleState.ESCAPED,
-        )
-    )
-    invalid = fluid.fault
-    if invalid is None and escaped > ESCAPED_LIMIT:
-        invalid = (
-            f"{100 * escaped:.2g} % of the particles crossed vessel walls "
-            f"(at most {100 * ESCAPED_LIMIT:g} % is accepted)"
-        )
-    return PourOutcome(
-        received=received,
-        spilled=spilled,
-        retained=retained,
-        in_flight=in_flight,
-        escaped=escaped,
-        particles=n,
-        spacing=spacing(task.scene.liquid.volume, n),
-        density_error=fluid.mean_compression,
-        simulated_time=fluid.time,
-        steps=fluid.steps,
-        cpu_s=cpu_s,
-        seed=task.seed,
-        curve_times=tuple(course.times),
-        curve_poured=tuple(course.poured),
-        curve_spilled=tuple(course.spilled),
-        invalid=invalid,
-    )
+def recorded_frames(course: Course, motion: Motion) -> RecordedFrames | None:
+    """The frames, if any were asked for."""
+    if not course.frames:
+        return None
+    times = np.array([t for t, _, _ in course.frames])
+    positions, states = [p for _, p, _ in course.frames], [s for _, _, s in course.frames]
+    return RecordedFrames(times, positions, states, motion.sample(times))

@@ -147,14 +147,14 @@ def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:
 
 def test_numbers_of_the_solver_are_the_code_s() -> None:
     sources = "".join(text_of(ROOT / "sim_engine" / "fluid" / f"{name}.py") for name in ("step", "forces"))
-    names = ("CFL", "PACE", "SHORTEST_STEP", "LONGEST_STEP", "SKIN", "SHORT_SKIN", "WARM", "LARGEST_PULL", "TOLERANCE")
-    cfl, pace, shortest, longest, skin, short_skin, warm, pull, tolerance = (
+    names = ("CFL", "PACE", "SHORTEST_STEP", "LONGEST_STEP", "SKIN", "WARM", "LARGEST_PULL", "TOLERANCE")
+    cfl, pace, shortest, longest, skin, warm, pull, tolerance = (
         float(re.findall(rf"^{name} = (\S+)$", sources, re.MULTILINE)[0]) for name in names
     )
     page = " ".join(prose_of(ROOT / "docs" / "how-it-works.md").split())
     assert f"at most {cfl:g} spacings for the fastest particle, at most {pace:g} √(d/g)" in page
     assert f"always {1e3 * shortest:g} to {1e3 * longest:g} ms" in page
-    assert f"{skin:g} spacings, or {short_skin:g} where" in page
+    assert f"which is thin, {skin:g} spacings" in page
     assert (warm, "Three tenths of the multipliers are kept" in page) == (0.3, True)
     assert f"while the mean compression inside is above {100 * tolerance:g} %" in page
     assert (pull, "more than a tenth of a spacing in a step" in page) == (0.1, True)

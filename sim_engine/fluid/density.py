@@ -18,11 +18,8 @@ import taichi as ti
 from sim_engine.fluid.kernels import SIGMA, slope, wall_density, wall_slope, weight
 from sim_engine.fluid.state import SUPPORT, VESSELS
 
-PACKING = 1.032
+PACKING = 1.023
 """Kernel sum of a relaxed bulk of spacing d over its continuum value, measured on a cup at rest."""
-
-RELAXATION = 0.4
-"""Damping of the Jacobi step: for this kernel at h = 2d the iteration matrix reaches about 4; above ½ it diverges."""
 
 
 @ti.func
@@ -31,18 +28,18 @@ def measure_first(f: ti.template(), s):
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
     scale = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING * inv_h * inv_h
-    for i in range(f.moving[s]):
-        f.density[s, i] = 1.0  # W(0) of the particle itself
-        f.gradient[s, i] = ti.Vector([0.0, 0.0, 0.0])
-        f.squares[s, i] = 0.0
-    for i in range(f.moving[s]):
-        xi = f.x[s, i]
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        f.density[i] = 1.0  # W(0) of the particle itself
+        f.gradient[i] = ti.Vector([0.0, 0.0, 0.0])
+        f.squares[i] = 0.0
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        xi = f.x[i]
         rho = ti.cast(0.0, ti.f32)
         total = ti.Vector([0.0, 0.0, 0.0])
         squares = ti.cast(0.0, ti.f32)
-        for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
-            j = f.neighbour[s, k]
-            r = xi - f.x[s, j]
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            j = f.neighbour[k]
+            r = xi - f.x[j]
             r2 = r.dot(r)
             u = ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0)
             w = weight(u)
@@ -51,43 +48,54 @@ def measure_first(f: ti.template(), s):
             rho += w
             total += g * r
             squares += g2
-            f.density[s, j] = f.density[s, j] + w
-            f.gradient[s, j] = f.gradient[s, j] - g * r
-            f.squares[s, j] = f.squares[s, j] + g2
-        f.density[s, i] = f.density[s, i] + rho
-        f.gradient[s, i] = f.gradient[s, i] + total
-        f.squares[s, i] = f.squares[s, i] + squares
-    for i in range(f.moving[s]):
-        total = -scale * f.gradient[s, i]
+            f.density[j] = f.density[j] + w
+            f.gradient[j] = f.gradient[j] - g * r
+            f.squares[j] = f.squares[j] + g2
+        f.density[i] = f.density[i] + rho
+        f.gradient[i] = f.gradient[i] + total
+        f.squares[i] = f.squares[i] + squares
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        total = -scale * f.gradient[i]
         for b in ti.static(range(VESSELS)):
-            q = f.phi[s, i][b] * inv_h - f.wall_shift[s]
+            q = f.phi[i][b] * inv_h - f.wall_shift[s]
             if q < 1.0:
-                n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
+                n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                 total -= wall_slope(q) * inv_h * n
-        f.squares[s, i] = scale * scale * f.squares[s, i] + total.dot(total) + 0.05 * inv_h * inv_h
+        f.squares[i] = scale * scale * f.squares[i] + total.dot(total) + 0.05 * inv_h * inv_h
 
 
 @ti.func
 def measure(f: ti.template(), s):
     """Density of all particles."""
     inv_h = 1.0 / (SUPPORT * f.spacing[s])
-    for i in range(f.moving[s]):
-        f.density[s, i] = 1.0
-    for i in range(f.moving[s]):
-        xi = f.x[s, i]
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        f.density[i] = 1.0
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        xi = f.x[i]
         rho = ti.cast(0.0, ti.f32)
-        for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
-            j = f.neighbour[s, k]
-            r = xi - f.x[s, j]
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            j = f.neighbour[k]
+            r = xi - f.x[j]
             w = weight(ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0))
             rho += w
-            f.density[s, j] = f.density[s, j] + w
-        f.density[s, i] = f.density[s, i] + rho
+            f.density[j] = f.density[j] + w
+        f.density[i] = f.density[i] + rho
 
 
 @ti.func
-def multiply(f: ti.template(), s):
-    """Change of all multipliers, from the measured density and the walls' share.
+def compression(f: ti.template(), s, i, volume, inv_h):
+    """ρ/ρ₀ of a particle with the walls' share, from the sum over its neighbours."""
+    rho = f.density[i] * volume
+    for b in ti.static(range(VESSELS)):
+        q = f.phi[i][b] * inv_h - f.wall_shift[s]
+        if q < 1.0:
+            rho += wall_density(q)
+    return rho
+
+
+@ti.func
+def multiply_first(f: ti.template(), s, rate):
+    """All multipliers after a step's first iteration; they begin with what is kept of the last step's.
 
     Returns:
         Mean of max(ρ/ρ₀ − 1, 0) over the particles that are not at the surface.
@@ -97,21 +105,41 @@ def multiply(f: ti.template(), s):
     volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
     inside = ti.cast(0.0, ti.f32)
     compressed = ti.cast(0.0, ti.f32)
-    for i in range(f.moving[s]):
-        rho = f.density[s, i] * volume
-        for b in ti.static(range(VESSELS)):
-            q = f.phi[s, i][b] * inv_h - f.wall_shift[s]
-            if q < 1.0:
-                rho += wall_density(q)
-        f.density[s, i] = rho
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        rho = compression(f, s, i, volume, inv_h)
+        f.density[i] = rho
         if rho > 0.95:
             inside += 1.0
             compressed += ti.max(rho - 1.0, 0.0)
         # C is dimensionless, its gradients 1/m: multipliers are m².
-        before = f.pressure[s, i]
-        after = ti.max(before + RELAXATION * (rho - 1.0) / f.squares[s, i], 0.0)
-        f.pressure[s, i] = after
-        f.dp[s, i] = after - before
+        after = ti.max(f.pressure[i] + rate * (rho - 1.0) / f.squares[i], 0.0)
+        f.pressure[i] = after
+        f.dp[i] = after
+    return compressed / ti.max(inside, 1.0)
+
+
+@ti.func
+def multiply(f: ti.template(), s, rate, momentum):
+    """Change of all multipliers in a later iteration: by the density, and on by a part of their last change.
+
+    Returns:
+        Mean of max(ρ/ρ₀ − 1, 0) over the particles that are not at the surface.
+    """
+    d = f.spacing[s]
+    inv_h = 1.0 / (SUPPORT * d)
+    volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
+    inside = ti.cast(0.0, ti.f32)
+    compressed = ti.cast(0.0, ti.f32)
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        rho = compression(f, s, i, volume, inv_h)
+        f.density[i] = rho
+        if rho > 0.95:
+            inside += 1.0
+            compressed += ti.max(rho - 1.0, 0.0)
+        before = f.pressure[i]
+        after = ti.max(before + rate * (rho - 1.0) / f.squares[i] + momentum * f.dp[i], 0.0)
+        f.pressure[i] = after
+        f.dp[i] = after - before
     return compressed / ti.max(inside, 1.0)
 
 
@@ -122,27 +150,27 @@ def displace(f: ti.template(), s):
     h = SUPPORT * d
     inv_h = 1.0 / h
     scale = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING * inv_h * inv_h
-    for i in range(f.moving[s]):
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         move = ti.Vector([0.0, 0.0, 0.0])
-        pi = f.dp[s, i]
+        pi = f.dp[i]
         for b in ti.static(range(VESSELS)):
-            q = f.phi[s, i][b] * inv_h - f.wall_shift[s]
+            q = f.phi[i][b] * inv_h - f.wall_shift[s]
             if q < 1.0:
-                n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
+                n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                 # The exact gradient of the wall's share in C: any other does work on a resting liquid and stirs it.
                 push = pi * wall_slope(q) * inv_h
                 move += push * n
-                f.push[s, i][b] = f.push[s, i][b] + push
-        f.dx[s, i] = move
-    for i in range(f.moving[s]):
-        xi = f.x[s, i]
-        pi = f.dp[s, i]
+                f.push[i][b] = f.push[i][b] + push
+        f.dx[i] = move
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        xi = f.x[i]
+        pi = f.dp[i]
         move = ti.Vector([0.0, 0.0, 0.0])
-        for k in range(f.first[s, i], f.first[s, i] + f.count[s, i]):
-            j = f.neighbour[s, k]
-            r = xi - f.x[s, j]
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            j = f.neighbour[k]
+            r = xi - f.x[j]
             u = ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0)
-            m = ((pi + f.dp[s, j]) * slope(u) * scale) * r
+            m = ((pi + f.dp[j]) * slope(u) * scale) * r
             move += m
-            f.dx[s, j] = f.dx[s, j] - m
-        f.dx[s, i] = f.dx[s, i] + move
+            f.dx[j] = f.dx[j] - m
+        f.dx[i] = f.dx[i] + move

@@ -2,200 +2,290 @@
 
 import contextlib
 import io
+from collections.abc import Sequence
+from typing import Generic, TypeVar
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim_engine.backend import BackendError
 from sim_engine.cache import cache_directory
-from sim_engine.fluid.state import SUPPORT, VESSELS, FluidState
-from sim_engine.fluid.step import GRAVITY, LONGEST_STEP, Stepper
+from sim_engine.fluid.forces import forces_interval
+from sim_engine.fluid.kernels import cohesion_acceleration
+from sim_engine.fluid.setup import POSE_STEP, SceneSetup
+from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, SUPPORT, FluidState
+from sim_engine.fluid.step import LONGEST_STEP, Stepper
 from sim_engine.outcome import ParticleState
-from sim_engine.vessel.sdf import SignedDistanceGrid
 
-CAPACITY = 50_000
-"""Particles of a scene; one size for all, so that kernels are compiled once. Memory that is not used is not touched."""
+POOLS = {"cpu": (50_000, 64), "cuda": (2_500_000, 1_024)}
+"""Particles and scenes that a process has room for, by backend; the largest scene has 50,000 particles."""
 
-NATURAL_WALL_DISTANCE = 0.4
+NATURAL_WALL_DISTANCE = 0.44
 """Spacings at which the unshifted wall integral holds liquid off a wall, measured on a cup at rest."""
 
-POSE_STEP = 1e-3
-"""Rows of the pose table are so far apart [s]."""
+FAULTS = {
+    0: None,
+    1: "neighbour lists overflowed: the liquid was compressed beyond any physical density",
+    2: "a particle's velocity left all bounds: the solver diverged",
+}
 
 
 @ti.data_oriented
 class FluidEngine:
-    """One scene's arrays, loaded and advanced from Python. One per process (`engine()`)."""
+    """Scenes' arrays, loaded and advanced from Python. One per process (`engine()`).
 
-    def __init__(self) -> None:
-        # Taichi says on which architecture it starts, on stdout, which is for results alone.
-        with contextlib.redirect_stdout(io.StringIO()):
-            ti.init(
-                arch=ti.cpu,
-                cpu_max_num_threads=1,
-                offline_cache=True,
-                offline_cache_file_path=str(cache_directory() / "kernels"),
-                log_level=ti.ERROR,
-                enable_fallback=False,
-            )
-        self.state = FluidState(1, CAPACITY)
+    Scenes of one load are independent: what one does is bit for bit what it does alone.
+    """
+
+    def __init__(self, backend: str = "cpu") -> None:
+        start(backend)
+        self.backend = backend
+        self.pool, self.most_scenes = POOLS[backend]
+        self.state = FluidState(self.most_scenes, self.pool)
         self.stepper = Stepper(self.state)
-        self._grids = np.zeros(0, np.float32)
-        self._cavities = np.zeros(0, np.uint8)
-        self._poses = np.zeros((1, 2, 7), np.float32)
+        self.scenes = 0
+        self._grids = self._planes = np.zeros(1, np.float32)
+        self._cavities = np.zeros(1, np.uint8)
+        self._poses = np.zeros((1, 7), np.float32)
 
-    def load(
-        self,
-        positions: NDArray[np.float32],
-        *,
-        spacing: float,
-        pair_acceleration: float,
-        viscosity: float,
-        friction: float,
-        wall_distance: float,
-        lip_drop: float,
-        grids: list[SignedDistanceGrid],
-        masks: list[NDArray[np.uint8]],
-        walls: list[float],
-        rims: list[float],
-        receiver_at: NDArray[np.float64],
-        spill_level: float,
-        poses: NDArray[np.float64],
-        start_time: float,
-        gravity: float = GRAVITY,
-        longest_step: float = LONGEST_STEP,
-    ) -> None:
-        """Set up a scene.
+    def room_for(self, counts: Sequence[int]) -> int:
+        """How many of these scenes, given by their numbers of particles, fit into one load: the first so many.
+
+        Raises:
+            ValueError: not even the first does.
+        """
+        sums = np.cumsum(counts)
+        fits = int(np.searchsorted(sums, self.pool, side="right"))
+        if fits == 0:
+            raise ValueError(f"{counts[0]} particles; at most {self.pool}")
+        return min(fits, self.most_scenes)
+
+    def load(self, setups: Sequence[SceneSetup]) -> None:
+        """Set up scenes in place of those there are.
 
         Args:
-            positions: (N, 3) in the world [m].
-            spacing: d [m].
-            pair_acceleration: peak cohesive acceleration of one pair [m/s²].
-            viscosity: XSPH rate [1/s].
-            friction: Coulomb coefficient.
-            wall_distance: where liquid comes to rest before a wall, in spacings.
-            lip_drop: rims are lower for particles by so many spacings, at most `LARGEST_LIP_DROP`.
-            grids, masks, walls, rims: of pourer and receiver; a mask is 1 where a particle counts as inside; thinnest
-                wall [m]; height of the lip in the vessel's frame [m].
-            receiver_at: (3,) [m].
-            spill_level: below it and in no vessel a particle is spilled [m].
-            poses: (T, 7) of the pourer, `POSE_STEP` apart, from time 0 on; before it the first pose holds.
-            start_time: ≤ 0; the time up to 0 lets the lattice settle [s].
-            gravity: downwards [m/s²].
-            longest_step: [s]; gravity, spacing and speeds may shorten it further.
+            setups: as many as fit, see `room_for`.
         """
+        if self.room_for([len(s.positions) for s in setups]) < len(setups):
+            raise ValueError(f"{len(setups)} scenes do not fit into one load")
         f = self.state
-        count = len(positions)
-        if count > f.capacity:
-            raise ValueError(f"{count} particles; at most {f.capacity}")
-        f.particles[0], f.spacing[0] = count, spacing
-        f.attraction[0], f.viscosity[0], f.friction[0] = pair_acceleration, viscosity, friction
-        f.lip_drop[0] = lip_drop
-        f.gravity[0], f.longest_step[0] = gravity, longest_step
-        f.wall_shift[0] = (wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
-        offset = 0
-        for b in range(VESSELS):
-            f.grid_offset[0, b], f.grid_size[0, b] = offset, list(grids[b].values.shape)
-            f.grid_origin[0, b], f.grid_spacing[0, b] = list(grids[b].origin), grids[b].spacing
-            f.wall[0, b], f.rim[0, b] = walls[b], rims[b]
-            offset += grids[b].values.size
-        self._grids = np.concatenate([g.values.ravel() for g in grids]).astype(np.float32, copy=False)
-        self._cavities = np.concatenate([m.ravel() for m in masks]).astype(np.uint8, copy=False)
-        f.origin[0, 1], f.turn[0, 1] = list(receiver_at), np.eye(3, dtype=np.float32)
-        f.spill_level[0] = spill_level
-        self._poses = np.ascontiguousarray(poses[None], dtype=np.float32)
-        f.table_step[0], f.table_length[0] = POSE_STEP, len(poses)
-        f.time[0], f.compression[0] = start_time, 0.0
-        f.steps[0], f.rebuilds[0], f.iterations[0], f.fault[0] = 0, 0, 0, 0
-        self._put(np.ascontiguousarray(positions, dtype=np.float32))
-        self.stepper.begin(self._poses)
+        values, planes = _Pool[np.float32](), _Pool[np.float32]()
+        insides = _Pool[np.uint8]()
+        begin, row = 0, 0
+        for s, setup in enumerate(setups):
+            count, d = len(setup.positions), setup.spacing
+            f.begin[s], f.particles[s], f.spacing[s] = begin, count, d
+            f.list_begin[s] = begin * NEIGHBOURS + s * LIST_RESERVE
+            f.cells_begin[s] = begin * CELLS + s * (LEAST_CELLS + 2)
+            f.cells[s] = count * CELLS + LEAST_CELLS
+            f.attraction[s] = cohesion_acceleration(setup.tension, setup.density, d, SUPPORT * d)
+            f.viscosity[s], f.friction[s], f.lip_drop[s] = setup.viscosity, setup.friction, setup.lip_drop
+            f.waited[s], f.wait[s] = 0.0, forces_interval(setup.viscosity, setup.tension, setup.density, d)
+            f.gravity[s] = setup.gravity
+            f.longest_step[s] = LONGEST_STEP if setup.longest_step is None else setup.longest_step
+            f.wall_shift[s] = (setup.wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
+            for b, walls in enumerate((setup.pourer, setup.receiver)):
+                f.grid_offset[s, b] = values.add(walls.grid.values)
+                f.plane_offset[s, b] = planes.add(walls.plane)
+                insides.add(walls.inside, walls.grid.values)
+                f.grid_size[s, b] = list(walls.grid.values.shape)
+                f.grid_origin[s, b], f.grid_spacing[s, b] = list(walls.grid.origin), walls.grid.spacing
+                f.wall[s, b], f.rim[s, b] = walls.thickness, walls.rim
+            f.origin[s, 1], f.turn[s, 1] = list(setup.receiver_at), np.eye(3, dtype=np.float32)
+            f.spill_level[s] = setup.spill_level
+            f.poses_begin[s], f.table_step[s], f.table_length[s] = row, POSE_STEP, len(setup.poses)
+            f.time[s], f.start[s], f.compression[s] = setup.start - setup.settling, setup.start, 0.0
+            f.drift[s] = list(setup.drift)
+            f.steps[s], f.rebuilds[s], f.iterations[s], f.fault[s] = 0, 0, 0, 0
+            self._put(begin, np.ascontiguousarray(setup.positions, dtype=np.float32))
+            begin += count
+            row += len(setup.poses)
+        self._grids, self._planes, self._cavities = values.array(), planes.array(), insides.array()
+        self._poses = np.concatenate([s.poses for s in setups]).astype(np.float32)
+        self.scenes = len(setups)
+        self.stepper.begin(0, self.scenes, self._poses)
 
     @ti.kernel
-    def _put(self, positions: ti.types.ndarray(dtype=ti.f32, ndim=2)):
+    def _put(self, begin: ti.i32, positions: ti.types.ndarray(dtype=ti.f32, ndim=2)):
         f = self.state
         ti.loop_config(serialize=True)
-        for i in range(positions.shape[0]):
-            x = ti.Vector([positions[i, 0], positions[i, 1], positions[i, 2]])
-            f.x[0, i] = x
-            f.x0[0, i] = x
-            f.x_listed[0, i] = x
-            f.v[0, i] = ti.Vector([0.0, 0.0, 0.0])
-            f.pressure[0, i] = 0.0
-            f.density[0, i] = 1.0
-            f.phi[0, i] = ti.Vector([0.0, 0.0])
-            f.push[0, i] = ti.Vector([0.0, 0.0])
-            f.home[0, i] = 0
-            f.name[0, i] = i
-            f.count[0, i] = 0
-            f.first[0, i] = 0
+        for k in range(positions.shape[0]):
+            i = begin + k
+            x = ti.Vector([positions[k, 0], positions[k, 1], positions[k, 2]])
+            f.x[i] = x
+            f.x0[i] = x
+            f.x_listed[i] = x
+            f.v[i] = ti.Vector([0.0, 0.0, 0.0])
+            f.pressure[i] = 0.0
+            f.density[i] = 1.0
+            f.phi[i] = ti.Vector([0.0, 0.0])
+            f.push[i] = ti.Vector([0.0, 0.0])
+            f.home[i] = 0
+            f.name[i] = k
+            f.count[i] = 0
+            f.first[i] = 0
 
     @ti.kernel
-    def _get(self, positions: ti.types.ndarray(dtype=ti.f32, ndim=2), homes: ti.types.ndarray(dtype=ti.u8, ndim=1)):
+    def _get(
+        self,
+        begin: ti.i32,
+        count: ti.i32,
+        positions: ti.types.ndarray(dtype=ti.f32, ndim=2),
+        velocities: ti.types.ndarray(dtype=ti.f32, ndim=2),
+        homes: ti.types.ndarray(dtype=ti.u8, ndim=1),
+    ):
         f = self.state
         ti.loop_config(serialize=True)
-        for i in range(f.particles[0]):
-            k = f.name[0, i]
+        for i in range(begin, begin + count):
+            k = f.name[i]
             for c in ti.static(range(3)):
-                positions[k, c] = f.x[0, i][c]
-            homes[k] = ti.cast(f.home[0, i], ti.u8)
+                positions[k, c] = f.x[i][c]
+                velocities[k, c] = f.v[i][c]
+            homes[k] = ti.cast(f.home[i], ti.u8)
 
-    def advance(self, until: float) -> None:
-        """Run until the scene's time reaches `until` [s] or a fault stops it."""
-        self.stepper.advance(until, self._grids, self._cavities, self._poses)
+    def advance(self, until: float, scene: int = 0) -> None:
+        """Run one scene until its time reaches `until` [s] or a fault stops it."""
+        self.advance_many(np.full(scene + 1, until), scene, scene + 1)
 
-    def census(self) -> NDArray[np.int32]:
+    def advance_many(self, until: NDArray[np.float64], first: int = 0, end: int | None = None) -> None:
+        """Run scenes, each until its own time.
+
+        Args:
+            until: [s] for every scene up to `end`.
+            first, end: only the scenes first … end − 1; all without an end.
+        """
+        end = self.scenes if end is None else end
+        until = np.ascontiguousarray(until, np.float64)
+        self.stepper.advance(first, end, until, self._grids, self._planes, self._cavities, self._poses)
+
+    def census(self, scene: int = 0) -> NDArray[np.int32]:
         """Particles in each `ParticleState`, shape (5,)."""
-        counts = np.zeros(len(ParticleState), np.int32)
-        self.stepper.census(0, counts)
+        counts: NDArray[np.int32] = self._counts(scene, scene + 1)[scene]
         return counts
 
-    def particles(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def census_all(self) -> NDArray[np.int32]:
+        """Particles in each `ParticleState` of every scene, shape (scenes, 5)."""
+        return self._counts(0, self.scenes)
+
+    def _counts(self, first: int, end: int) -> NDArray[np.int32]:
+        counts = np.zeros((end, len(ParticleState)), np.int32)
+        self.stepper.census(first, end, counts)
+        return counts
+
+    def _copies(self, scene: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+        n = int(self.state.particles[scene])
+        found = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
+        self._get(int(self.state.begin[scene]), n, *found)
+        return found
+
+    def particles(self, scene: int = 0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Positions (N, 3) in the world [m] and states (N,), in the order in which they were loaded."""
-        n = int(self.state.particles[0])
-        positions, homes = np.empty((n, 3), np.float32), np.empty(n, np.uint8)
-        self._get(positions, homes)
+        positions, _, homes = self._copies(scene)
         return positions, homes
 
-    def velocities(self) -> NDArray[np.float32]:
+    def velocities(self, scene: int = 0) -> NDArray[np.float32]:
         """Velocities (N, 3) [m/s], in the order in which they were loaded."""
-        n = int(self.state.particles[0])
-        out = np.empty((n, 3), np.float32)
-        out[self.state.name.to_numpy()[0, :n]] = self.state.v.to_numpy()[0, :n]
-        return out
+        return self._copies(scene)[1]
 
-    @property
-    def time(self) -> float:
+    def time(self, scene: int = 0) -> float:
         """[s]."""
-        return float(self.state.time[0])
+        return float(self.state.time[scene])
 
-    @property
-    def steps(self) -> int:
+    def steps(self, scene: int = 0) -> int:
         """Time steps so far."""
-        return int(self.state.steps[0])
+        return int(self.state.steps[scene])
 
-    @property
-    def fault(self) -> str | None:
+    def iterations(self, scene: int = 0) -> int:
+        """Passes over the density constraint so far."""
+        return int(self.state.iterations[scene])
+
+    def fault(self, scene: int = 0) -> str | None:
         """Why the solver stopped, if it did."""
-        return {
-            0: None,
-            1: "neighbour lists overflowed: the liquid was compressed beyond any physical density",
-            2: "a particle's velocity left all bounds: the solver diverged",
-        }[int(self.state.fault[0])]
+        return FAULTS[int(self.state.fault[scene])]
 
-    @property
-    def mean_compression(self) -> float:
+    def mean_compression(self, scene: int = 0) -> float:
         """Mean over the steps of the interior particles' max(ρ/ρ₀ − 1, 0)."""
-        return float(self.state.compression[0]) / max(self.steps, 1)
+        return float(self.state.compression[scene]) / max(self.steps(scene), 1)
+
+
+T = TypeVar("T", np.float32, np.uint8)
+
+
+class _Pool(Generic[T]):
+    """Arrays side by side, each object once."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[T]] = []
+        self._offsets: dict[int, int] = {}
+        self._size = 0
+
+    def add(self, part: NDArray[T], known_as: object = None) -> int:
+        """Offset of an array in the pool. Two arrays that are `known_as` the same object are the same."""
+        key = id(part if known_as is None else known_as)
+        if key not in self._offsets:
+            self._offsets[key] = self._size
+            self._parts.append(part.ravel())
+            self._size += part.size
+        return self._offsets[key]
+
+    def array(self) -> NDArray[T]:
+        """All of them."""
+        return np.ascontiguousarray(np.concatenate(self._parts))
+
+
+def start(backend: str) -> None:
+    """Start Taichi.
+
+    Raises:
+        BackendError: this machine has no such backend.
+    """
+    if backend == "cuda" and not _cuda_is_there():
+        raise BackendError(
+            "--backend cuda: no CUDA device answers on this machine; use --backend cpu, or install the NVIDIA driver "
+            "(nvidia-smi lists what it finds)"
+        )
+    # Taichi says on which architecture it starts, on stdout, which is for results alone.
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(
+            arch=ti.cuda if backend == "cuda" else ti.cpu,
+            cpu_max_num_threads=1,
+            offline_cache=True,
+            offline_cache_file_path=str(cache_directory() / "kernels"),
+            log_level=ti.ERROR,
+            enable_fallback=False,
+        )
+
+
+def _cuda_is_there() -> bool:
+    """Whether a CUDA device can be used. Taichi itself falls back silently, or ends the process."""
+    import ctypes
+
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    count = ctypes.c_int(0)
+    return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
 
 
 _engine: FluidEngine | None = None
 
 
-def engine() -> FluidEngine:
-    """The process' engine; the first call starts Taichi and allocates."""
+def engine(backend: str | None = None) -> FluidEngine:
+    """The process' engine; the first call starts Taichi and allocates.
+
+    Args:
+        backend: 'cpu' or 'cuda'; None: whichever runs, else the CPU.
+
+    Raises:
+        BackendError: not there, or the process already runs the other one.
+    """
     global _engine
     if _engine is None:
-        _engine = FluidEngine()
+        _engine = FluidEngine(backend or "cpu")
+    elif backend is not None and backend != _engine.backend:
+        raise BackendError(f"this process already simulates on {_engine.backend}; {backend} needs a process of its own")
     return _engine
 
 

@@ -29,17 +29,18 @@ def slope(u: ti.f32) -> ti.f32:
 
 @ti.func
 def wall_density(q: ti.f32) -> ti.f32:
-    """∫ W over the half-space beyond a plane at distance q·h: ½ at q = 0, 0 from q = 1 on."""
-    u = ti.max(1.0 - ti.max(q, 0.0), 0.0)
+    """∫ W over the half-space beyond a plane at distance q·h: 1 up to q = −1, ½ at q = 0, 0 from q = 1 on."""
+    u = ti.max(1.0 - ti.abs(q), 0.0)
     u6 = u * u * u
     u6 = u6 * u6
-    return 21.0 * u6 * (1.0 / 6.0 - u * (3.0 / 14.0 - u / 14.0))
+    beyond = 21.0 * u6 * (1.0 / 6.0 - u * (3.0 / 14.0 - u / 14.0))
+    return ti.select(q < 0.0, 1.0 - beyond, beyond)
 
 
 @ti.func
 def wall_slope(q: ti.f32) -> ti.f32:
     """−h · d(wall_density)/d(distance), ≥ 0."""
-    u = ti.max(1.0 - ti.max(q, 0.0), 0.0)
+    u = ti.max(1.0 - ti.abs(q), 0.0)
     u2 = u * u
     return 21.0 * u2 * u2 * u * (1.0 - u * (1.5 - u * (4.0 / 7.0)))
 
@@ -55,16 +56,19 @@ ATTRACTION_MOMENT = 64.0 * math.factorial(7) * math.factorial(3) / math.factoria
 """∫₀¹ attraction(q) q⁴ dq, for the scaling of cohesion to a tension."""
 
 
-def cohesion_strength(tension: float, spacing: float, support: float) -> float:
-    """Peak pair force [N] that gives a liquid of that spacing a surface tension.
+def cohesion_acceleration(tension: float, density: float, spacing: float, support: float) -> float:
+    """Peak acceleration of one pair [m/s²] that gives a liquid of that spacing a surface tension.
 
-    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for f's amplitude.
+    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for the amplitude
+    of the pair force f.
 
     Args:
         tension: σ [N/m].
+        density: of the liquid [kg/m³].
         spacing: d [m].
         support: h [m].
 
     Source: Fowler 1937; for particle methods Tartakovsky & Panchenko 2016.
     """
-    return tension * spacing**6 / (math.pi / 8.0 * ATTRACTION_MOMENT * support**5)
+    force = tension * spacing**6 / (math.pi / 8.0 * ATTRACTION_MOMENT * support**5)
+    return force / (density * spacing**3)

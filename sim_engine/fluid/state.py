@@ -1,53 +1,69 @@
-"""Arrays of the solver, apart from its algorithm. One set holds several scenes of up to `capacity` particles each."""
+"""Arrays of the solver, apart from its algorithm. One set holds many scenes, which share one pool of particles."""
 
 import taichi as ti
 
-SUPPORT = 2.0
-"""Kernel support h over spacing d."""
+SUPPORT = 2.2
+"""Kernel support h over spacing d. At 2.0 liquid at rest was a crystal, too stiff for waves (sloshing 6 % fast)."""
 
 VESSELS = 2
 """Pourer (0) and receiver (1)."""
+
+NEIGHBOURS = 32
+"""Entries in the half lists per particle of a scene; about 18 are used."""
+
+LIST_RESERVE = 2_000
+"""Entries that one particle may add before the overflow check sees them; far above any packing."""
+
+CELLS, LEAST_CELLS = 8, 4_096
+"""Cells of a scene's table: so many per particle, and these besides. Liquid that spreads farther gets larger cells."""
 
 
 @ti.data_oriented
 class FluidState:
     """Particles, neighbour lists and per-scene scalars.
 
-    Attributes (s: scene, i: particle, sorted by cell; those still moving come first):
+    A scene s owns the particles from `begin[s]` to `begin[s] + particles[s]`; those still moving come first, sorted by
+    cell. Indices in lists and cells are those of the pool.
+
+    Attributes (i: particle):
         x, x0, v: position, position before the step [m], velocity [m/s].
         pressure, dp: accumulated density multiplier and its last change [m²].
         density: ρ/ρ₀.
-        phi, normal: signed distance to each vessel [m] at the last look, linearised in between; its gradient.
+        phi, normal: distance of the equivalent plane of each vessel's walls [m] at the last look, linearised in
+            between; its gradient. Between steps phi is the signed distance.
         push: normal displacement given by each wall in this step [m].
-        home: see `sim_engine.outcome.ParticleState`; `name`: index before any sorting.
+        home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
         gradient, squares: Σ∇W and what the constraint's gradients amount to, Σ|∇C|².
         first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
     """
 
-    def __init__(self, scenes: int, capacity: int, neighbours: int = 32, cells: int = 1 << 17) -> None:
-        self.scenes, self.capacity, self.cells = scenes, capacity, cells
-        self.list_capacity = capacity * neighbours
-        row = (scenes, capacity)
+    def __init__(self, scenes: int, pool: int) -> None:
+        self.scenes, self.pool = scenes, pool
 
         def vectors():
-            return ti.Vector.field(3, ti.f32, shape=row)
+            return ti.Vector.field(3, ti.f32, shape=pool)
 
         def scalars(kind=ti.f32):
-            return ti.field(kind, shape=row)
+            return ti.field(kind, shape=pool)
 
         self.x, self.x0, self.v, self.dx, self.dv, self.x_listed = (vectors() for _ in range(6))
         self.x_copy, self.v_copy = vectors(), vectors()
         self.pressure, self.dp, self.density, self.pressure_copy = (scalars() for _ in range(4))
-        self.phi = ti.Vector.field(VESSELS, ti.f32, shape=row)
-        self.push = ti.Vector.field(VESSELS, ti.f32, shape=row)
-        self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=row)
+        self.phi = ti.Vector.field(VESSELS, ti.f32, shape=pool)
+        self.push = ti.Vector.field(VESSELS, ti.f32, shape=pool)
+        self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=pool)
         self.home, self.home_copy, self.name, self.name_copy, self.cell = (scalars(ti.i32) for _ in range(5))
         self.gradient, self.squares = vectors(), scalars()
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
-        self.neighbour = ti.field(ti.i32, shape=(scenes, self.list_capacity))
-        self.cell_start = ti.field(ti.i32, shape=(scenes, cells + 2))
+        self.neighbour = ti.field(ti.i32, shape=pool * NEIGHBOURS + scenes * LIST_RESERVE)
+        self.cell_start = ti.field(ti.i32, shape=pool * CELLS + scenes * (LEAST_CELLS + 2))
 
-        # Per scene: constants of the liquid …
+        # Per scene: its place in the pools …
+        self.begin = ti.field(ti.i32, shape=scenes)
+        self.list_begin = ti.field(ti.i32, shape=scenes)
+        self.cells_begin = ti.field(ti.i32, shape=scenes)
+        self.cells = ti.field(ti.i32, shape=scenes)
+        # … constants of the liquid …
         self.particles = ti.field(ti.i32, shape=scenes)
         self.spacing = ti.field(ti.f32, shape=scenes)
         self.attraction = ti.field(ti.f32, shape=scenes)  # peak cohesive acceleration of one pair [m/s²]
@@ -57,8 +73,12 @@ class FluidState:
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
         self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles by so many spacings
         self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if that much nearer, in supports h
+        self.wait = ti.field(ti.f32, shape=scenes)  # viscosity and cohesion act at such intervals [s]
+        self.poses_begin = ti.field(ti.i32, shape=scenes)  # first row in the table of poses
         self.table_step = ti.field(ti.f32, shape=scenes)  # of the pose table [s]
         self.table_length = ti.field(ti.i32, shape=scenes)
+        self.start = ti.field(ti.f64, shape=scenes)  # the pourer moves off [s]
+        self.drift = ti.Vector.field(3, ti.f32, shape=scenes)  # velocity of all liquid at the start [m/s]
         # Poses of the vessels at the end and at the beginning of the step: vessel frame → world.
         self.origin, self.origin0 = (ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS)) for _ in range(2))
         self.turn, self.turn0 = (ti.Matrix.field(3, 3, ti.f32, shape=(scenes, VESSELS)) for _ in range(2))
@@ -66,8 +86,8 @@ class FluidState:
         # … and what changes with time.
         self.time = ti.field(ti.f64, shape=scenes)
         self.dt = ti.field(ti.f32, shape=scenes)
+        self.waited = ti.field(ti.f32, shape=scenes)  # since viscosity and cohesion acted [s]
         self.steps = ti.field(ti.i32, shape=scenes)
-        self.skin = ti.field(ti.f32, shape=scenes)  # lists reach so many spacings beyond the support
         self.iterations = ti.field(ti.i32, shape=scenes)
         self.rebuilds = ti.field(ti.i32, shape=scenes)
         self.moving = ti.field(ti.i32, shape=scenes)
@@ -79,6 +99,7 @@ class FluidState:
         self.grid_size = ti.Vector.field(3, ti.i32, shape=(scenes, VESSELS))
         self.grid_origin = ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS))
         self.grid_spacing = ti.field(ti.f32, shape=(scenes, VESSELS))
+        self.plane_offset = ti.field(ti.i32, shape=(scenes, VESSELS))  # … of equivalent distances, same size
         self.swing = ti.field(ti.f32, shape=scenes)  # farthest that the pourer carries a point in this step [m]
         self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]

@@ -8,31 +8,32 @@ Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 
 import taichi as ti
 
-from sim_engine.fluid.density import displace, measure, measure_first, multiply
+from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
 from sim_engine.fluid.forces import interact
 from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
 from sim_engine.outcome import ParticleState
 
-GRAVITY = 9.81
-CFL = 1.2
+CFL = 1.5
 """Largest displacement per step, in spacings."""
 LONGEST_STEP = 4e-3
 PACE = 0.18
 """… and the longest step in units of √(d/g): in a longer one gravity presses layers together faster than the iterations
 part them."""
 SHORTEST_STEP = 1e-4
-ITERATIONS = 3
+ITERATIONS = 2
 """At least so many passes over the density constraint in a step …"""
 TOLERANCE = 0.015
 """… and more while the mean compression inside is above this: a deep vessel needs more than a shallow one, …"""
 MOST_ITERATIONS = 30
 """… but never more than so many."""
-SKIN = 0.3
-"""Neighbour lists reach that many spacings beyond the support, so that they last for several steps …"""
-SHORT_SKIN = 0.03
-"""… unless somebody moves so fast that they would not."""
+SKIN = 0.03
+"""Neighbour lists reach that many spacings beyond the support. A skin of 0.3 made lists last for three steps of calm
+liquid, and half as long again: every pass over them paid for it."""
+SMOOTHEST, ROUGHEST = 0.7, 3.7
+"""Eigenvalues of the iteration matrix between which Chebyshev's polynomials damp: ROUGHEST is the largest that occurs
+(dense packing, h = 2.2 d); a smaller SMOOTHEST gives longer strides, and noise at rest."""
 SWING_ARM = 0.5
 """Liquid is never farther from the pourer's origin than this [m]."""
 CONTACT = 0.2
@@ -41,7 +42,7 @@ WARM = 0.3
 """Share of the last step's multipliers that a step starts with. From one half on, deep liquid swings up: multipliers
 then answer to what was, not to what is (docs/how-it-works.md has the analysis)."""
 TREACLE = 0.7
-"""Before time 0 velocities shrink to this part in every step: a lattice settles without splashing."""
+"""Before the start velocities shrink to this part in every step: a lattice settles without splashing."""
 
 IN_POURER, IN_FLIGHT, RECEIVED, SPILLED, ESCAPED = (int(s) for s in ParticleState)
 
@@ -70,12 +71,13 @@ class Stepper:
     def place_pourer(self, s, time, poses: ti.template()):
         """Pose of the pourer from the table, rows of which are `table_step` apart."""
         f = self.state
-        u = ti.cast(ti.max(time, 0.0) / f.table_step[s], ti.f32)
+        u = ti.cast(ti.max(time, f.start[s]) / f.table_step[s], ti.f32)
         k = ti.min(ti.cast(u, ti.i32), f.table_length[s] - 2)
         w = ti.min(u - k, 1.0)
+        k += f.poses_begin[s]
         row = ti.Vector([0.0] * 7)
         for c in ti.static(range(7)):
-            row[c] = poses[s, k, c] + w * (poses[s, k + 1, c] - poses[s, k, c])
+            row[c] = poses[k, c] + w * (poses[k + 1, c] - poses[k, c])
         q = ti.Vector([row[3], row[4], row[5], row[6]]).normalized()
         f.origin[s, 0] = ti.Vector([row[0], row[1], row[2]])
         f.turn[s, 0] = rotation(q)
@@ -85,8 +87,8 @@ class Stepper:
         """Of the moving particles [m/s]."""
         f = self.state
         fastest = ti.cast(0.0, ti.f32)
-        for i in range(f.moving[s]):
-            fastest = ti.max(fastest, f.v[s, i].norm_sqr())
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            fastest = ti.max(fastest, f.v[i].norm_sqr())
         return ti.sqrt(fastest)
 
     @ti.func
@@ -94,76 +96,94 @@ class Stepper:
         """Ballistic prediction, stopped by walls; asks for new lists if someone has moved too far."""
         f = self.state
         clear = CONTACT * f.spacing[s]
-        limit = 0.45 * f.skin[s] * f.spacing[s]
-        for i in range(f.moving[s]):
-            x0 = f.x[s, i]
-            f.x0[s, i] = x0
-            v = f.v[s, i]
+        limit = 0.45 * SKIN * f.spacing[s]
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            x0 = f.x[i]
+            f.x0[i] = x0
+            v = f.v[i]
             v[2] -= f.gravity[s] * dt
             x = x0 + dt * v
             # φ is that of the end of the last step: solid farther off than the way can't be met.
             reach = STRETCH * (dt * v.norm() + f.swing[s]) + 2.0 * clear
             for b in range(VESSELS):
-                if f.phi[s, i][b] < reach:
+                if f.phi[i][b] < reach:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
                     y = swept(f, grids, s, b, y0, y1, clear)
                     if (y - y1).norm_sqr() > 0.0:
                         x = to_world(f, s, b, y)
-            f.x[s, i] = x
-            f.push[s, i] = ti.Vector([0.0, 0.0])
-            if (x - f.x_listed[s, i]).norm_sqr() > limit * limit:
+            f.x[i] = x
+            f.push[i] = ti.Vector([0.0, 0.0])
+            if (x - f.x_listed[i]).norm_sqr() > limit * limit:
                 f.stale[s] = 1
 
     @ti.func
-    def look_at_walls(self, s, grids: ti.template()):
-        """Distance and normal of both vessels at every moving particle, for the iterations to linearise."""
+    def look_at_walls(self, s, planes: ti.template()):
+        """Distance and normal of both vessels' equivalent planes at all moving particles, to be linearised."""
         f = self.state
-        for i in range(f.moving[s]):
-            x = f.x[s, i]
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            x = f.x[i]
             for b in range(VESSELS):
-                look = distance_and_gradient(f, grids, s, b, to_vessel(f, s, b, x, False))
-                f.phi[s, i][b] = look[3]
+                look = distance_and_gradient(f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False))
+                f.phi[i][b] = look[3]
                 n = f.turn[s, b] @ ti.Vector([look[0], look[1], look[2]])
                 for c in ti.static(range(3)):
-                    f.normal[s, i][b, c] = n[c]
+                    f.normal[i][b, c] = n[c]
 
     @ti.func
     def apply(self, s):
-        """Move by the displacements found; linearised wall contact."""
+        """Move by the displacements found; linearised wall contact.
+
+        `CONTACT` is kept at the step's end only: held to it in every iteration, the ring of particles in a corner never
+        came to rest.
+        """
         f = self.state
-        clear = CONTACT * f.spacing[s]
-        for i in range(f.moving[s]):
-            x = f.x[s, i] + f.dx[s, i]
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            x = f.x[i] + f.dx[i]
             for b in ti.static(range(VESSELS)):
-                phi = f.phi[s, i][b]
+                phi = f.phi[i][b]
                 if phi < 4.0 * f.spacing[s]:
-                    n = ti.Vector([f.normal[s, i][b, 0], f.normal[s, i][b, 1], f.normal[s, i][b, 2]])
-                    phi += n.dot(f.dx[s, i])
-                    if phi < clear:
-                        x += (clear - phi) * n
-                        f.push[s, i][b] = f.push[s, i][b] + (clear - phi)
-                        phi = clear
-                    f.phi[s, i][b] = phi
-            f.x[s, i] = x
+                    n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
+                    phi += n.dot(f.dx[i])
+                    if phi < 0.0:
+                        x -= phi * n
+                        f.push[i][b] = f.push[i][b] - phi
+                        phi = 0.0
+                    f.phi[i][b] = phi
+            f.x[i] = x
 
     @ti.func
     def solve_density(self, s, ratio):
-        """`ratio`: this step's dt² over the last one's, which scales the multipliers of the warm start."""
+        """Chebyshev-accelerated Jacobi, from a share of the last step's multipliers on.
+
+        That share is not moved by on its own: the first iteration's displacements carry it, too.
+
+        Args:
+            s: scene.
+            ratio: this step's dt² over the last one's, which scales the multipliers.
+        """
         f = self.state
-        for i in range(f.moving[s]):
-            f.pressure[s, i] = f.pressure[s, i] * WARM * ratio
-            f.dp[s, i] = f.pressure[s, i]
-        displace(f, s)
-        self.apply(s)
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            f.pressure[i] = f.pressure[i] * WARM * ratio
         n = 0
         compressed = ti.cast(1.0, ti.f32)
+        # Three-term recurrence of the Chebyshev iteration on [SMOOTHEST, ROUGHEST] (Golub & Varga 1961).
+        centre = ti.cast(0.5 * (ROUGHEST + SMOOTHEST), ti.f32)
+        half = ti.cast(0.5 * (ROUGHEST - SMOOTHEST), ti.f32)
+        sigma = half / centre
+        rate = 1.0 / centre
+        momentum = ti.cast(0.0, ti.f32)
         while n < ITERATIONS or (compressed > TOLERANCE and n < MOST_ITERATIONS):
             if n == 0:
                 measure_first(f, s)
+                compressed = multiply_first(f, s, rate)
             else:
+                following = 1.0 / (2.0 * centre / half - sigma)
+                momentum = sigma * following
+                rate = 2.0 * following / half
+                sigma = following
                 measure(f, s)
-            compressed = multiply(f, s)
+                compressed = multiply(f, s, rate, momentum)
             displace(f, s)
             self.apply(s)
             n += 1
@@ -175,23 +195,23 @@ class Stepper:
         f = self.state
         d = f.spacing[s]
         clear = CONTACT * d
-        for i in range(f.moving[s]):
-            x = f.x[s, i]
-            x0 = f.x0[s, i]
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            x = f.x[i]
+            x0 = f.x0[i]
             reach = STRETCH * ((x - x0).norm() + f.swing[s]) + d
             for b in range(VESSELS):
-                if f.phi[s, i][b] < reach:
+                if f.phi[i][b] < reach:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
                     y = y1
-                    look = distance_and_gradient(f, grids, s, b, y)
+                    look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y)
                     risky = look[3] < STRETCH * (y1 - y0).norm()
                     if risky:
                         y = swept(f, grids, s, b, y0, y1, 0.5 * clear)
-                        look = distance_and_gradient(f, grids, s, b, y)
+                        look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y)
                     n = ti.Vector([look[0], look[1], look[2]])
                     phi = look[3]
-                    push = f.push[s, i][b]
+                    push = f.push[i][b]
                     if phi < clear and phi > 0.0:
                         y += (clear - phi) * n
                         push += clear - phi
@@ -205,14 +225,14 @@ class Stepper:
                             y -= along * ti.min(f.friction[s] * push / length, 1.0)
                     if (y - y1).norm_sqr() > 0.0:
                         x = to_world(f, s, b, y)
-                    f.phi[s, i][b] = phi
+                    f.phi[i][b] = phi
                     if risky:
                         if crossed(f, grids, s, b, y0, y) == 1:
-                            f.home[s, i] = ESCAPED
+                            f.home[i] = ESCAPED
                             f.stale[s] = 1
-            f.x[s, i] = x
+            f.x[i] = x
             v = (x - x0) / dt
-            f.v[s, i] = v
+            f.v[i] = v
             if not (ti.abs(v[0]) + ti.abs(v[1]) + ti.abs(v[2]) < 1e3):
                 f.fault[s] = 2
 
@@ -223,13 +243,13 @@ class Stepper:
         lift = ti.Vector([0.0, 0.0, 0.5 * f.spacing[s]])
         compressed = ti.cast(0.0, ti.f32)
         inside = 0
-        for i in range(f.moving[s]):
-            if f.home[s, i] != ESCAPED:
-                x = f.x[s, i]
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            if f.home[i] != ESCAPED:
+                x = f.x[i]
                 home = IN_FLIGHT
-                if f.phi[s, i][0] < FAR and in_cavity(f, cavities, s, 0, to_vessel(f, s, 0, x, False)) == 1:
+                if f.phi[i][0] < FAR and in_cavity(f, cavities, s, 0, to_vessel(f, s, 0, x, False)) == 1:
                     home = IN_POURER
-                elif f.phi[s, i][1] < FAR and (
+                elif f.phi[i][1] < FAR and (
                     in_cavity(f, cavities, s, 1, to_vessel(f, s, 1, x, False) - lift) == 1
                     or in_cavity(f, cavities, s, 1, to_vessel(f, s, 1, x, False)) == 1
                 ):
@@ -237,10 +257,10 @@ class Stepper:
                 elif x[2] < f.spill_level[s]:
                     home = SPILLED
                     f.stale[s] = 1
-                f.home[s, i] = home
-                if f.density[s, i] > 0.95:
+                f.home[i] = home
+                if f.density[i] > 0.95:
                     inside += 1
-                    compressed += ti.max(f.density[s, i] - 1.0, 0.0)
+                    compressed += ti.max(f.density[i] - 1.0, 0.0)
         if inside > 0:
             f.compression[s] += compressed / inside
 
@@ -248,15 +268,15 @@ class Stepper:
     def let_fall(self, s, dt):
         """Particles out of play fall to the table, for pictures only."""
         f = self.state
-        for i in range(f.moving[s], f.particles[s]):
-            if f.x[s, i][2] > 0.0:
-                f.v[s, i][2] = f.v[s, i][2] - f.gravity[s] * dt
-                x = f.x[s, i] + dt * f.v[s, i]
+        for i in range(f.begin[s] + f.moving[s], f.begin[s] + f.particles[s]):
+            if f.x[i][2] > 0.0:
+                f.v[i][2] = f.v[i][2] - f.gravity[s] * dt
+                x = f.x[i] + dt * f.v[i]
                 x[2] = ti.max(x[2], 0.0)
-                f.x[s, i] = x
+                f.x[i] = x
 
     @ti.func
-    def step(self, s, grids: ti.template(), cavities: ti.template(), poses: ti.template()):
+    def step(self, s, grids: ti.template(), planes: ti.template(), cavities: ti.template(), poses: ti.template()):
         """One time step of one scene."""
         f = self.state
         fastest = self.top_speed(s)
@@ -273,27 +293,29 @@ class Stepper:
         f.swing[s] = (f.origin[s, 0] - f.origin0[s, 0]).norm() + turned.norm() * SWING_ARM
         self.predict(s, dt, grids)
         if f.stale[s] == 1:
-            skin = SKIN
-            if fastest * dt > 0.3 * SKIN * f.spacing[s]:
-                skin = SHORT_SKIN
-            rebuild(f, s, skin)
-        self.look_at_walls(s, grids)
+            rebuild(f, s, SKIN)
+        self.look_at_walls(s, planes)
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
-        if f.viscosity[s] > 0.0 or f.attraction[s] > 0.0:
-            interact(f, s, dt)
-        if f.time[s] < 0.0:
-            for i in range(f.moving[s]):
-                f.v[s, i] = f.v[s, i] * TREACLE
+        f.waited[s] += dt
+        if (f.viscosity[s] > 0.0 or f.attraction[s] > 0.0) and f.waited[s] >= f.wait[s]:
+            interact(f, s, f.waited[s])
+            f.waited[s] = 0.0
+        if f.time[s] < f.start[s]:
+            for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+                f.v[i] = f.v[i] * TREACLE
+        elif f.time[s] - dt < f.start[s]:
+            for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+                f.v[i] = f.v[i] + f.drift[s]
         self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1
 
     @ti.kernel
-    def begin(self, poses: ti.types.ndarray(dtype=ti.f32, ndim=3)):
-        """Put vessels in their first pose and ask for lists."""
+    def begin(self, s0: ti.i32, s1: ti.i32, poses: ti.types.ndarray(dtype=ti.f32, ndim=2)):
+        """Put the vessels of some scenes in their first pose and ask for lists."""
         f = self.state
-        for s in range(f.scenes):
+        for s in range(s0, s1):
             self.place_pourer(s, f.time[s], poses)
             for b in range(VESSELS):
                 f.origin0[s, b] = f.origin[s, b]
@@ -305,23 +327,29 @@ class Stepper:
     @ti.kernel
     def advance(
         self,
-        until: ti.f64,
+        s0: ti.i32,
+        s1: ti.i32,
+        until: ti.types.ndarray(dtype=ti.f64, ndim=1),
         grids: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        planes: ti.types.ndarray(dtype=ti.f32, ndim=1),
         cavities: ti.types.ndarray(dtype=ti.u8, ndim=1),
-        poses: ti.types.ndarray(dtype=ti.f32, ndim=3),
+        poses: ti.types.ndarray(dtype=ti.f32, ndim=2),
     ):
-        """Run every scene until its time reaches `until` [s] or a fault stops it."""
+        """Run each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s] or a fault stops it.
+
+        Scenes are independent: on a GPU each has a thread, on a CPU they follow each other.
+        """
         f = self.state
-        for s in range(f.scenes):
-            while f.time[s] < until and f.fault[s] == 0:
-                self.step(s, grids, cavities, poses)
+        for s in range(s0, s1):
+            while f.time[s] < until[s] and f.fault[s] == 0:
+                self.step(s, grids, planes, cavities, poses)
 
     @ti.kernel
-    def census(self, s: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=1)):
-        """Number of particles in each state."""
+    def census(self, s0: ti.i32, s1: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=2)):
+        """Number of particles in each state, for each of the scenes s0 … s1 − 1."""
         f = self.state
-        for k in range(5):
-            counts[k] = 0
-        ti.loop_config(serialize=True)
-        for i in range(f.particles[s]):
-            counts[f.home[s, i]] += 1
+        for s in range(s0, s1):
+            for k in range(5):
+                counts[s, k] = 0
+            for i in range(f.begin[s], f.begin[s] + f.particles[s]):
+                counts[s, f.home[i]] += 1

@@ -82,8 +82,8 @@ def distance(f: ti.template(), grids: ti.template(), s, b, y):
 
 
 @ti.func
-def distance_and_gradient(f: ti.template(), grids: ti.template(), s, b, y):
-    """(∂φ/∂y normalised, φ) as a 4-vector; gradient 0 and `FAR` beyond the grid."""
+def distance_and_gradient(f: ti.template(), grids: ti.template(), offset, s, b, y):
+    """(∂φ/∂y normalised, φ) as a 4-vector from the values that start at `offset`; 0 and `FAR` beyond the grid."""
     size = f.grid_size[s, b]
     u = (look_up(f, s, b, y) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
     result = ti.Vector([0.0, 0.0, 0.0, FAR])
@@ -99,7 +99,7 @@ def distance_and_gradient(f: ti.template(), grids: ti.template(), s, b, y):
         w = u - ti.cast(i, ti.f32)
         row = size[2]
         slab = size[1] * size[2]
-        k = f.grid_offset[s, b] + i[0] * slab + i[1] * row + i[2]
+        k = offset + i[0] * slab + i[1] * row + i[2]
         d00 = grids[k + 1] - grids[k]
         d01 = grids[k + row + 1] - grids[k + row]
         d10 = grids[k + slab + 1] - grids[k + slab]
@@ -158,7 +158,7 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
             leg = 2
         elif free < 1e-5 or stride >= TRACE_STEPS:
             if leg == 0:
-                look = distance_and_gradient(f, grids, s, b, y)
+                look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y)
                 n = ti.Vector([look[0], look[1], look[2]])
                 way -= ti.min(way.dot(n), 0.0) * n
             clear *= 0.5

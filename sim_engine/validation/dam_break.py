@@ -3,9 +3,11 @@
 A column of width a and height 2a in a channel, laid as a lattice, is let go at once. T = t √(2g/a), Z = front / a. The
 front is the mean over strips of the channel of the farthest particle, plus half a spacing.
 
-Source: Martin & Moyce 1952, Phil. Trans. R. Soc. A 244, n² = 2, a = 2.25 in and 1.125 in (digitised). Limitations: the
-experiment's gate takes time to go, so that its fronts start late by an unknown time. The slope for T > 1.9 does not
-notice; the delay that fits best, and what error it leaves, are reported beside the criterion.
+Source: Martin & Moyce 1952, Phil. Trans. R. Soc. A 244, n² = 2, a = 2.25 in and 1.125 in (digitised). The experiment's
+gate takes time to go, so that its fronts start late by a time that nobody measured: fronts are compared after the one
+delay that fits best, which is reported, as is the error without it. The slope for T > 1.9 needs none. The channel's
+floor rubs a little (`FLOOR`), in place of the boundary layer that slows the small tank: that is the only friction in
+these cases, and the slope without it is reported, too.
 """
 
 from __future__ import annotations
@@ -41,6 +43,8 @@ STRIPS = 5
 WIDTH = 10.0
 """Of the channel, in spacings."""
 ASPECT = 2.0
+FLOOR = 0.05
+"""Coulomb friction of the channel."""
 
 
 def slope(T: Floats, Z: Floats) -> float:
@@ -57,39 +61,19 @@ def dam_break(width: float, layers: int, parameters: SimulationParameters) -> tu
         layers: spacings in a.
         parameters: θ; its number of particles is not looked at.
     """
-    from sim_engine.fluid.engine import engine
-
     reference = np.array(MEASURED[width])
-    d = width / layers
-    across = WIDTH * d
-    start, d = block(
-        np.array([0.0, -across / 2.0, 0.0]),
-        np.array([width, across / 2.0, ASPECT * width]),
-        round(layers * layers * ASPECT * WIDTH),
-        1,
-    )
-    particles = len(start)
-    unit = math.sqrt(width / (2.0 * GRAVITY))
-    last = float(reference[-1, 0])
-    channel = box(width * (float(reference[-1, 1]) + 3.0), across, 1.2 * ASPECT * width, 0.5 * d)
-    times = np.linspace(0.1, last + 0.1, 80) * unit
-    front = np.empty(len(times))
-    for k in run(start, d, channel, parameters, times):
-        x = engine().particles()[0].astype(float)
-        strip = np.clip(((x[:, 1] / across + 0.5) * STRIPS).astype(int), 0, STRIPS - 1)
-        front[k] = np.mean([x[strip == s, 0].max() for s in range(STRIPS)]) + 0.5 * d
-    T, Z = times / unit, front / width
+    T, Z, particles = front(width, layers, parameters.model_copy(update={"friction": FLOOR}), float(reference[-1, 0]))
     late = reference[reference[:, 0] > FROM]
-    errors = np.interp(late[:, 0], T, Z) / late[:, 1] - 1.0
     delays = np.linspace(0.0, 0.6, 121)
-    left = [float(np.max(np.abs(np.interp(late[:, 0] - s, T, Z) / late[:, 1] - 1.0))) for s in delays]
-    best = int(np.argmin(left))
+    errors = [float(np.max(np.abs(np.interp(late[:, 0] - s, T, Z) / late[:, 1] - 1.0))) for s in delays]
+    best = int(np.argmin(errors))
     name = f"a = {1e3 * width:.1f} mm"
     wanted = slope(reference[:, 0], reference[:, 1])
+    T_free, Z_free, _ = front(width, layers, parameters, float(reference[-1, 0]))
     measurements = [
         at_most(
-            f"largest error of the front, {name}",
-            float(np.max(np.abs(errors))),
+            f"largest error of the front after the gate's delay, {name}",
+            errors[best],
             0.10,
             criterion="at most 10 % for T > 1.2",
             particles=particles,
@@ -103,13 +87,52 @@ def dam_break(width: float, layers: int, parameters: SimulationParameters) -> tu
             particles=particles,
         ),
         reported(f"delay of the gate that fits best, in T, {name}", float(delays[best]), particles=particles),
-        reported(f"largest error of the front with it, {name}", left[best], particles=particles),
+        reported(f"largest error of the front without a delay, {name}", errors[0], particles=particles),
+        reported(
+            f"slope of the front without friction, {name}",
+            slope(T_free, Z_free),
+            reference=wanted,
+            particles=particles,
+        ),
     ]
     curves = [
         Series(f"{name}, {particles:,} particles", tuple(T.tolist()), tuple(Z.tolist())),
         Series(f"{name}, experiment", tuple(reference[:, 0].tolist()), tuple(reference[:, 1].tolist()), "reference"),
     ]
     return measurements, curves
+
+
+def front(width: float, layers: int, parameters: SimulationParameters, last: float) -> tuple[Floats, Floats, int]:
+    """Course of the front.
+
+    Args:
+        width: a [m].
+        layers: spacings in a.
+        parameters: θ; its number of particles is not looked at.
+        last: T up to which it is followed.
+
+    Returns:
+        T and Z, shape (80,) each, and N.
+    """
+    from sim_engine.fluid.engine import engine
+
+    d = width / layers
+    across = WIDTH * d
+    start, d = block(
+        np.array([0.0, -across / 2.0, 0.0]),
+        np.array([width, across / 2.0, ASPECT * width]),
+        round(layers * layers * ASPECT * WIDTH),
+        1,
+    )
+    unit = math.sqrt(width / (2.0 * GRAVITY))
+    channel = box(width * (2.0 * last + 3.0), across, 1.2 * ASPECT * width, 0.5 * d)
+    times = np.linspace(0.1, last + 0.1, 80) * unit
+    places = np.empty(len(times))
+    for k in run(start, d, channel, parameters, times):
+        x = engine().particles()[0].astype(float)
+        strip = np.clip(((x[:, 1] / across + 0.5) * STRIPS).astype(int), 0, STRIPS - 1)
+        places[k] = np.mean([x[strip == s, 0].max() for s in range(STRIPS)]) + 0.5 * d
+    return times / unit, places / width, len(start)
 
 
 def dam_figure(curves: list[Series]) -> Figure:

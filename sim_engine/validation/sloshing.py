@@ -92,7 +92,8 @@ def sloshing(particles: int, parameters: SimulationParameters) -> tuple[list[Mea
         particles: N.
         parameters: θ; its number of particles is replaced.
     """
-    from sim_engine.fluid.engine import POSE_STEP, engine
+    from sim_engine.fluid.engine import engine
+    from sim_engine.fluid.setup import POSE_STEP
 
     vessel = build_vessel(CUP)
     start = fill(vessel, VOLUME, particles, 1, parameters.wall_distance).astype(float)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import inside_mask
+from sim_engine.vessel.corners import equivalent_distance
 from sim_engine.vessel.sdf import SignedDistanceGrid
 from sim_engine.vessel.vessel import Vessel
 
@@ -42,17 +43,23 @@ class Container:
         inside: 1 at the grid's nodes where a particle counts as inside.
         wall: smallest thickness [m].
         rim: height of the lip; `NO_RIM` for a tank that nothing is poured from [m].
+        open: 1 at the nodes that liquid may reach from inside, where that is more than `inside`: a hole's.
     """
 
     grid: SignedDistanceGrid
     inside: NDArray[np.uint8]
     wall: float
     rim: float = NO_RIM
+    open: NDArray[np.uint8] | None = None
 
     @classmethod
     def of(cls, vessel: Vessel) -> Container:
         """A vessel's."""
         return cls(vessel.grid, inside_mask(vessel), vessel.wall_thickness, vessel.rim_height)
+
+    def plane(self, support: float) -> NDArray[np.float32]:
+        """Distance of the equivalent plane at the grid's nodes for a kernel's support [m]."""
+        return equivalent_distance(self.grid, self.inside if self.open is None else self.open, self.rim, support)
 
 
 EMPTY_SPACE = Container(NOTHING, NOTHING.cavity, 1e-3)
@@ -60,7 +67,7 @@ EMPTY_SPACE = Container(NOTHING, NOTHING.cavity, 1e-3)
 
 def still_pose(duration: float) -> Floats:
     """Poses of a vessel that stands at the world's origin, for `run`'s pose table."""
-    from sim_engine.fluid.engine import POSE_STEP
+    from sim_engine.fluid.setup import POSE_STEP
 
     poses = np.zeros((int(duration / POSE_STEP) + 3, 7))
     poses[:, 3] = 1.0
@@ -101,32 +108,34 @@ def run(
         ArithmeticError: the solver stopped with a fault.
     """
     from sim_engine.fluid.engine import engine
-    from sim_engine.fluid.kernels import cohesion_strength
+    from sim_engine.fluid.setup import SceneSetup, SolidWalls
     from sim_engine.fluid.state import SUPPORT
 
     fluid = engine()
-    attraction = cohesion_strength(parameters.cohesion, spacing, SUPPORT * spacing) / (DENSITY * spacing**3)
-    fluid.load(
-        np.ascontiguousarray(positions, dtype=np.float32),
+    walls = SolidWalls(
+        container.grid, container.plane(SUPPORT * spacing), container.inside, container.wall, container.rim
+    )
+    setup = SceneSetup(
+        positions=np.ascontiguousarray(positions, dtype=np.float32),
         spacing=spacing,
-        pair_acceleration=attraction,
+        tension=parameters.cohesion,
+        density=DENSITY,
         viscosity=parameters.viscosity,
         friction=parameters.friction,
         wall_distance=parameters.wall_distance,
         lip_drop=parameters.lip_drop,
-        grids=[container.grid, NOTHING],
-        masks=[container.inside, NOTHING.cavity],
-        walls=[container.wall, 1e-3],
-        rims=[container.rim, NO_RIM],
+        pourer=walls,
+        receiver=SolidWalls(NOTHING, NOTHING.values, NOTHING.cavity, 1e-3, NO_RIM),
         receiver_at=FAR_AWAY,
         spill_level=spill_level,
         poses=still_pose(float(times[-1])) if poses is None else poses,
-        start_time=-settling,
+        settling=settling,
         gravity=gravity,
-        **({} if longest_step is None else {"longest_step": longest_step}),
+        longest_step=longest_step,
     )
+    fluid.load([setup])
     for k, time in enumerate(times):
         fluid.advance(float(time))
-        if fluid.fault is not None:
-            raise ArithmeticError(f"at {fluid.time:.3f} s: {fluid.fault}")
+        if fluid.fault() is not None:
+            raise ArithmeticError(f"at {fluid.time():.3f} s: {fluid.fault()}")
         yield k

@@ -66,9 +66,11 @@ def holed_cup(radius: float, height: float, hole: float, floor: float, spacing: 
     values = values[place.reshape(-1)].reshape(shape)
     inside = ((r < radius + 0.5 * wall) & (z > -0.5 * floor) & (z < height)).astype(np.uint8)
     inside = inside[place.reshape(-1)].reshape(shape)
+    hollow = np.broadcast_to(r < hole + 0.5 * spacing, (len(squares), len(z))).astype(np.uint8)
+    free = np.ascontiguousarray(inside | hollow[place.reshape(-1)].reshape(shape))
     origin = np.array([across[0], across[0], z[0]])
     grid = SignedDistanceGrid(origin, spacing, values, (inside & (values > 0.0)).astype(np.uint8))
-    return Container(grid, np.ascontiguousarray(inside), min(wall, floor))
+    return Container(grid, np.ascontiguousarray(inside), min(wall, floor), open=free)
 
 
 def block(low: Floats, high: Floats, count: int, seed: int) -> tuple[Floats, float]:

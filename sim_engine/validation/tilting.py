@@ -133,7 +133,8 @@ def slow_tilt(
         angles: at which to read, increasing [rad].
         seed: of the initial positions.
     """
-    from sim_engine.fluid.engine import POSE_STEP, engine
+    from sim_engine.fluid.engine import engine
+    from sim_engine.fluid.setup import POSE_STEP
     from sim_engine.outcome import ParticleState
 
     d = spacing(volume, particles)
