@@ -55,8 +55,17 @@ class LocalCluster:
         settings = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(self._token), "RAY_USAGE_STATS_ENABLED": "0"}
         return {**os.environ, **settings}
 
-    def start_node(self, *, cpus: int, bench: bool = False) -> int:
-        """Start a node; returns its number."""
+    def start_node(self, *, cpus: int, bench: bool = False, cache: Path | None = None) -> int:
+        """Start a node.
+
+        Args:
+            cpus: cores that it offers.
+            bench: whether it offers the bench's resource.
+            cache: its cache directory, as if it shared no files with this program.
+
+        Returns:
+            Its number.
+        """
         number = len(self._raylets)
         port = self.address.rpartition(":")[2]
         role = (
@@ -73,7 +82,11 @@ class LocalCluster:
         known = {p.pid for p in self._raylets}
         done = subprocess.run(
             command,
-            env={**self.environment, MARK: str(self.folder)},
+            env={
+                **self.environment,
+                **({} if cache is None else {"DECANT_CACHE_DIR": str(cache)}),
+                MARK: str(self.folder),
+            },
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -185,17 +186,55 @@ _internal_kv_put("CLUSTER_METADATA", json.dumps({**facts, "ray_version": "2.9.0"
 """
 
 
-def program(text: str, cluster: LocalCluster, **environment: str) -> str:
+def program(text: str, cluster: LocalCluster, cwd: Path = ROOT, **environment: str) -> str:
     """What a program says of the cluster."""
     done = subprocess.run(
         [sys.executable, "-c", text, cluster.address],
         env={**cluster.environment, "PYTHONPATH": str(ROOT), **environment},
+        cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
+
+
+MUG_POURS = """
+import asyncio, sys
+from pathlib import Path
+from actors.laboratory import open_laboratory
+from actors.spec import LaboratorySpec, RaySpec
+from sim_engine.action import DEG, Action
+from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.task import PourTask, Scene
+from sim_engine.vessel.spec import MeshShape, VesselSpec, cylinder
+
+address, mesh = sys.argv[1], Path("mug.stl").absolute()
+mug = VesselSpec(name="mug", shape=MeshShape(path=mesh, unit="mm"))
+scene = Scene("mug", cylinder("beaker", inner_radius=0.035, inner_height=0.1), mug, Liquid(mass=0.15))
+action = Action(angular_velocity=90 * DEG, x_offset=0.13, height=0.05, max_angle=110 * DEG, hold_time=0.2)
+
+async def main():
+    async with open_laboratory(LaboratorySpec("far", ray=RaySpec(address)), need_bench=False) as laboratory:
+        theta = SimulationParameters(particles=300)
+        tasks = [PourTask(scene, action, theta, seed) for seed in range(4)]
+        for result in await asyncio.gather(*map(laboratory.simulators.simulate, tasks)):
+            assert result.outcome.invalid is None, result
+        for cache in map(Path, ("cache-0", "cache-1")):
+            kernels = sum(1 for _ in (cache / "kernels").glob("*.tic"))
+            print(kernels > 3, [path.name for path in (cache / "meshes").glob("*/*")], flush=True)
+
+asyncio.run(main())
+"""
+
+
+def test_nodes_that_share_no_files_get_the_mesh_and_have_warm_kernels_after_their_first_pour(cluster, tmp_path):
+    shutil.copy(ROOT / "configs" / "vessels" / "meshes" / "mug.stl", tmp_path)
+    for number in range(2):
+        cluster.start_node(cpus=1, cache=tmp_path / f"cache-{number}")
+    said = program(MUG_POURS, cluster, cwd=tmp_path)
+    assert said.splitlines() == ["True ['mug.stl']"] * 2
 
 
 def test_clusters_that_can_t_be_joined_say_why(cluster, tmp_path):
