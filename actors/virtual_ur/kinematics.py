@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from math import acos, asin, atan2, cos, hypot, pi, sin
 
 from actors.virtual_ur.models import Joints, RobotModel
-from actors.virtual_ur.poses import Frame, Vector
+from actors.virtual_ur.poses import IDENTITY, Frame, Vector, compose, multiply, rotation_matrix
 
 _SINGULAR_WRIST = 1e-6
 """Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 is taken as it was."""
@@ -75,6 +75,18 @@ class Kinematics:
         w3 = (w2[0] + m.d5 * wrist[0], w2[1] + m.d5 * wrist[1], w2[2] + m.d5 * wrist[2])
         return [(0.0, 0.0, 1.0), across, across, across, wrist, tool], [(0.0, 0.0, 0.0), shoulder, elbow, w1, w2, w3]
 
+    def links(self, q: Sequence[float]) -> list[Frame]:
+        """Denavit–Hartenberg frames of the six links, each at its link's far end, base frame."""
+        m = self.model
+        lengths = ((0.0, m.d1, 0.5), (m.a2, 0.0, 0.0), (m.a3, 0.0, 0.0), (0.0, m.d4, 0.5), (0.0, m.d5, -0.5))
+        frame: Frame = (IDENTITY, (0.0, 0.0, 0.0))
+        frames = []
+        for angle, (a, d, twist) in zip(q, (*lengths, (0.0, m.d6, 0.0)), strict=True):
+            turned = multiply(rotation_matrix((0.0, 0.0, angle)), rotation_matrix((pi * twist, 0.0, 0.0)))
+            frame = compose(frame, (turned, (a * cos(angle), a * sin(angle), d)))
+            frames.append(frame)
+        return frames
+
     def velocity(
         self, q: Sequence[float], qd: Sequence[float], point: Vector
     ) -> tuple[float, float, float, float, float, float]:
@@ -92,11 +104,6 @@ class Kinematics:
                 wy += rate * ay
                 wz += rate * az
         return vx, vy, vz, wx, wy, wz
-
-    def jacobian(self, q: Sequence[float], point: Vector) -> list[list[float]]:
-        """(6, 6): rows vx vy vz wx wy wz of a point fixed to the flange, columns joints."""
-        columns = [self.velocity(q, [float(i == k) for i in range(6)], point) for k in range(6)]
-        return [[column[row] for column in columns] for row in range(6)]
 
     def inverse(self, flange: Frame, q6: float = 0.0) -> Iterator[Joints]:
         """All joint positions, each in (−π, π], that put the flange there. None if it is out of reach.

@@ -100,7 +100,7 @@ UR10E = RobotModel(
     frequency=500,
     remote_control=True,
     serial="20205300456",
-    primary_type=(4, 1),
+    primary_type=(2, 1),
 )
 
 MODELS = {"ur10": UR10, "ur10e": UR10E}

@@ -133,8 +133,3 @@ def rotation_between(a: Matrix, b: Matrix) -> Vector:
 def angle_between(a: Matrix, b: Matrix) -> float:
     """Angle between two rotations [rad]."""
     return norm3(rotation_between(a, b))
-
-
-def wrap(angle: float, near: float) -> float:
-    """The equivalent of an angle that is nearest to another [rad]."""
-    return angle - 2.0 * pi * round((angle - near) / (2.0 * pi))

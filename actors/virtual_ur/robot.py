@@ -10,7 +10,7 @@ from actors.virtual_ur.kinematics import Kinematics
 from actors.virtual_ur.models import Joints, RobotModel
 from actors.virtual_ur.motion.lines import Arm
 from actors.virtual_ur.motion.mover import Mover, ViolationError
-from actors.virtual_ur.poses import Frame, Vector, compose, distance, frame_of, pose_of
+from actors.virtual_ur.poses import IDENTITY, Frame, Vector, compose, distance, frame_of, pose_of
 from actors.virtual_ur.safety import SafetyConfiguration
 
 TRACKING_LAG = 0.004
@@ -203,23 +203,21 @@ class Robot:
 
     @property
     def holding_torques(self) -> Joints:
-        """Joint torques that hold the arm and its payload against gravity [N m].
-
-        Masses are taken at the ends of the links that the public table gives; friction and acceleration are left out.
-        """
+        """Joint torques that hold the arm and its payload against gravity [N m]; friction and acceleration left out."""
         axes, origins = self.kinematics.axes(self.q)
-        flange = self.kinematics.flange(self.q)
-        centres = [*origins[1:], compose(flange, ((1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0), self.cog))[1]]
-        masses = [*self.model.masses[:5], self.model.masses[5] + self.payload]
-        torques = []
+        frames, model = self.kinematics.links(self.q), self.model
+        weights = [
+            (mass, compose(frame, (IDENTITY, centre))[1])
+            for mass, centre, frame in zip(model.masses, model.centres, frames, strict=True)
+        ]
+        load = (self.payload, compose(frames[5], (IDENTITY, self.cog))[1])
         gx, gy, gz = self.gravity
-        for joint in range(6):
-            (ax, ay, az), (ox, oy, oz) = axes[joint], origins[joint]
+        torques = []
+        for joint, ((ax, ay, az), (ox, oy, oz)) in enumerate(zip(axes, origins, strict=True)):
             torque = 0.0
-            for link in range(joint, 6):
-                (px, py, pz), m = centres[link], masses[link]
+            for mass, (px, py, pz) in (*weights[joint:], load):
                 rx, ry, rz = px - ox, py - oy, pz - oz
-                torque += m * ((ay * rz - az * ry) * gx + (az * rx - ax * rz) * gy + (ax * ry - ay * rx) * gz)
+                torque += mass * ((ay * rz - az * ry) * gx + (az * rx - ax * rz) * gy + (ax * ry - ay * rx) * gz)
             torques.append(torque)
         return torques[0], torques[1], torques[2], torques[3], torques[4], torques[5]
 

@@ -143,11 +143,6 @@ class InputRecipe:
         self._counts = [FORMATS[kind][1] for kind in kinds]
         self._struct = struct.Struct(">" + "".join(FORMATS[kind][0] for kind in kinds))
 
-    @property
-    def size(self) -> int:
-        """Bytes of one package, recipe number aside."""
-        return self._struct.size
-
     def read(self, payload: bytes) -> dict[str, Any] | None:
         """Values by name; None if there are too few or too many bytes for them."""
         if len(payload) != self._struct.size:

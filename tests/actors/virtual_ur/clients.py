@@ -22,6 +22,15 @@ from rtde_receive import RTDEReceiveInterface
 HOME = [0.0, -1.5707963, 1.5707963, -1.5707963, -1.5707963, 0.0]
 
 
+_KEPT: list[Any] = []
+
+
+def keep(interface: Any) -> Any:
+    """Keep an interface until the process ends at once: its destructor would sleep for half a second."""
+    _KEPT.append(interface)
+    return interface
+
+
 def until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
     """Wait for something; whether it came."""
     end = time.monotonic() + seconds
@@ -41,13 +50,13 @@ def attempt(call: Callable[[], Any]) -> Any:
 
 
 def dashboard(address: str) -> DashboardClient:
-    client = DashboardClient(address)
+    client = keep(DashboardClient(address))
     client.connect()
     return client
 
 
 def moves(address: str) -> dict[str, Any]:
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     seen: dict[str, Any] = {"home": control.moveJ(HOME, 2.0, 4.0)}
     first = receive.getTimestamp()
     target = [0.5, -1.4, 1.6, -1.7, -1.4, 0.3]
@@ -74,7 +83,7 @@ def moves(address: str) -> dict[str, Any]:
 
 def streams(address: str) -> dict[str, Any]:
     """Servo and speed commands, with their stops."""
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     seen: dict[str, Any] = {}
     q = list(HOME)
@@ -115,7 +124,7 @@ def streams(address: str) -> dict[str, Any]:
 
 def circular(address: str) -> dict[str, Any]:
     """servoC, which the library handles unlike other streams."""
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     pose = receive.getActualTCPPose()
     pose[2] += 0.05
@@ -128,7 +137,7 @@ def circular(address: str) -> dict[str, Any]:
 
 
 def paths(address: str) -> dict[str, Any]:
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     seen: dict[str, Any] = {}
     joints = [[*HOME[:5], 0.1 * k, 1.0, 3.0, 0.02 if k < 5 else 0.0] for k in range(1, 6)]
@@ -159,7 +168,7 @@ def paths(address: str) -> dict[str, Any]:
 
 def questions(address: str) -> dict[str, Any]:
     """Kinematics, limits, settings that are read back."""
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ([0.3, -1.4, 1.6, -1.7, -1.4, 0.3], 2.0, 4.0)
     until(control.isSteady)
     q, pose = receive.getActualQ(), receive.getActualTCPPose()
@@ -202,7 +211,7 @@ def questions(address: str) -> dict[str, Any]:
 
 def asynchronous(address: str) -> dict[str, Any]:
     """Moves that return at once, and their stop."""
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     before = control.getAsyncOperationProgressEx().operationId()
     seen: dict[str, Any] = {"started": control.moveJ([2.0, *HOME[1:]], 1.0, 1.4, True)}
@@ -225,8 +234,8 @@ def asynchronous(address: str) -> dict[str, Any]:
 
 
 def signals(address: str) -> dict[str, Any]:
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
-    io = RTDEIOInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
+    io = keep(RTDEIOInterface(address))
     seen: dict[str, Any] = {}
     seen["sent"] = [
         io.setStandardDigitalOut(1, True),
@@ -258,7 +267,7 @@ def signals(address: str) -> dict[str, Any]:
 
 
 def scripts(address: str) -> dict[str, Any]:
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     seen: dict[str, Any] = {}
     seen["function"] = control.sendCustomScriptFunction(
@@ -315,7 +324,7 @@ def dashboards(address: str) -> dict[str, Any]:
 
 def protective_stop(address: str) -> dict[str, Any]:
     """A blocking move is stopped by the controller; queries meanwhile; the way back."""
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     client = dashboard(address)
     control.moveJ(HOME, 2.0, 4.0)
     print("ready", flush=True)
@@ -341,7 +350,7 @@ def protective_stop(address: str) -> dict[str, Any]:
 
 
 def emergency_stop(address: str) -> dict[str, Any]:
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     client = dashboard(address)
     control.moveJ(HOME, 2.0, 4.0)
     print("ready", flush=True)
@@ -365,7 +374,7 @@ def emergency_stop(address: str) -> dict[str, Any]:
 
 def during(address: str, seconds: float = 0.0) -> dict[str, Any]:
     """An asynchronous move, watched while the test does something to the controller."""
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     control.moveJ([2.5, *HOME[1:]], 0.5, 1.0, True)
     until(lambda: receive.getActualQd()[0] > 0.4)
@@ -390,7 +399,7 @@ def during(address: str, seconds: float = 0.0) -> dict[str, Any]:
 
 def listening(address: str, seconds: float = 0.5, anew: bool = True) -> dict[str, Any]:
     """Receive only: a control interface that is cut off reconnects by itself and may crash its process."""
-    receive = RTDEReceiveInterface(address)
+    receive = keep(RTDEReceiveInterface(address))
     print("ready", flush=True)
     sys.stdin.readline()
     began, lost = time.monotonic(), None
@@ -407,7 +416,7 @@ def listening(address: str, seconds: float = 0.5, anew: bool = True) -> dict[str
 
 def watched(address: str, kick: bool = False, exits: bool = False) -> dict[str, Any]:
     """A watchdog, kicked or not, around an asynchronous move."""
-    control, receive = RTDEControlInterface(address), RTDEReceiveInterface(address)
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     control.setWatchdog(5.0)
     control.moveJ([2.0, *HOME[1:]], 0.5, 1.0, True)
@@ -426,8 +435,8 @@ def connect(address: str) -> dict[str, Any]:
     """Whether and how long it takes to connect each interface; what they say if not."""
     seen: dict[str, Any] = {}
     for name, make in {
-        "receive": lambda: RTDEReceiveInterface(address),
-        "control": lambda: RTDEControlInterface(address),
+        "receive": lambda: keep(RTDEReceiveInterface(address)),
+        "control": lambda: keep(RTDEControlInterface(address)),
         "dashboard": lambda: dashboard(address),
     }.items():
         began = time.monotonic()
@@ -439,14 +448,14 @@ def connect(address: str) -> dict[str, Any]:
 
 def second(address: str) -> dict[str, Any]:
     """Two control interfaces at one robot."""
-    first = RTDEControlInterface(address)
-    seen = {"second": attempt(lambda: RTDEControlInterface(address)) or "connected"}
+    first = keep(RTDEControlInterface(address))
+    seen = {"second": attempt(lambda: keep(RTDEControlInterface(address))) or "connected"}
     seen["first still moves"] = first.moveJ(HOME, 2.0, 4.0)
     return seen
 
 
 def unreachable(address: str) -> dict[str, Any]:
-    control = RTDEControlInterface(address)
+    control = keep(RTDEControlInterface(address))
     seen: dict[str, Any] = {"moveL": control.moveL([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])}
     seen["program runs"] = control.isProgramRunning()
     control.reuploadScript()
@@ -462,7 +471,7 @@ def unreachable(address: str) -> dict[str, Any]:
 
 def receiving(address: str, seconds: float = 2.0, frequency: float = 500.0) -> dict[str, Any]:
     """How many packages arrive."""
-    receive = RTDEReceiveInterface(address, frequency, ["timestamp", "actual_q"])
+    receive = keep(RTDEReceiveInterface(address, frequency, ["timestamp", "actual_q"]))
     began, stamps = time.monotonic(), set()
     while time.monotonic() - began < seconds:
         stamps.add(receive.getTimestamp())
@@ -474,7 +483,7 @@ def main() -> None:
     scenario, address, arguments = sys.argv[1:4]
     seen = globals()[scenario](address, **json.loads(arguments))
     print(json.dumps(seen), flush=True)
-    os._exit(0)  # the library's destructors sleep for half a second each
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -104,6 +104,7 @@ class Client:
             text=True,
         )
         self._timer = threading.Timer(deadline, self._process.kill)
+        self._timer.daemon = True
         self._timer.start()
         self._said: list[str] = []
 

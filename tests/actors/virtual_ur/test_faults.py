@@ -146,7 +146,7 @@ def test_a_silent_controller_is_noticed_after_two_and_a_half_seconds_and_values_
 
 def test_a_controller_that_hangs_holds_the_arm_too(fresh: Start) -> None:
     controller = fresh()
-    moving(controller, 0.0)
+    client = moving(controller, 0.0)
     controller.fault("stall", motion=False)
     before = controller.fault("state")
     time.sleep(0.3)
@@ -156,6 +156,8 @@ def test_a_controller_that_hangs_holds_the_arm_too(fresh: Start) -> None:
     controller.fault("clear")
     time.sleep(0.3)
     assert controller.fault("state")["joints"][0] > after["joints"][0]
+    client.go_on()
+    client.result()
 
 
 def test_cut_connections_are_noticed_and_the_arm_finishes_its_move(fresh: Start) -> None:

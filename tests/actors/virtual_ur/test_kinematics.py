@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from actors.virtual_ur.kinematics import Kinematics
 from actors.virtual_ur.models import HOME, MODELS, UR10E, RobotModel
 from actors.virtual_ur.poses import (
+    IDENTITY,
     angle_between,
     compose,
     distance,
@@ -23,6 +24,8 @@ from actors.virtual_ur.poses import (
     rotation_vector,
     transpose,
 )
+from actors.virtual_ur.robot import Robot
+from actors.virtual_ur.safety import SafetyConfiguration
 
 angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(angles, angles, angles, angles, angles, angles)
@@ -119,6 +122,31 @@ def test_velocity_is_how_fast_the_flange_moves(q: tuple[float, ...], rates: tupl
     turned = [x / (2 * h) for x in rotation_vector(multiply(after[0], transpose(before[0])))]
     velocity = kinematics.velocity(q, rates, kinematics.flange(q)[1])
     assert velocity == pytest.approx([*moved, *turned], abs=1e-6)
+
+
+@given(q=joints)
+def test_the_last_link_s_frame_is_the_flange(q: tuple[float, ...]) -> None:
+    kinematics = Kinematics(UR10E)
+    last, flange = kinematics.links(q)[5], kinematics.flange(q)
+    assert distance(last[1], flange[1]) < 1e-9
+    assert angle_between(last[0], flange[0]) < 1e-6
+
+
+@given(q=joints)
+def test_holding_torques_are_what_raising_the_arm_by_a_joint_costs(q: tuple[float, ...]) -> None:
+    robot = Robot(UR10E, q, SafetyConfiguration.of(UR10E))
+    robot.payload, robot.cog = 2.0, (0.01, 0.02, 0.1)
+
+    def energy(joints: list[float]) -> float:
+        frames = robot.kinematics.links(joints)
+        heights = [compose(f, (IDENTITY, c))[1][2] for f, c in zip(frames, UR10E.centres, strict=True)]
+        load = compose(frames[5], (IDENTITY, robot.cog))[1][2]
+        return 9.82 * (sum(m * h for m, h in zip(UR10E.masses, heights, strict=True)) + robot.payload * load)
+
+    torques, h = robot.holding_torques, 1e-5
+    for i in range(6):
+        up, down = ([a + (s * h if k == i else 0.0) for k, a in enumerate(q)] for s in (1, -1))
+        assert torques[i] == pytest.approx((energy(up) - energy(down)) / (2 * h), abs=1e-5)
 
 
 @given(rotation=st.tuples(small, small, small))
