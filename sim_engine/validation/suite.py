@@ -197,7 +197,7 @@ def _cohesion(simulator: PourSimulator, effort: Effort) -> tuple[list[Measuremen
 
 
 def _convergence(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], Figure]:
-    numbers = (500, 1_000, 2_000, 5_000, 10_000) if effort.full else (500, 1_000)
+    numbers = (1_000, 2_000, 5_000, 10_000, 20_000) if effort.full else (500, 1_000)
     return convergence.convergence(simulator, numbers, 3 if effort.full else 2, PLAIN)
 
 
