@@ -1,0 +1,346 @@
+"""What calibration buys: parameter by parameter on recorded pours, and by cross-validation over all of them.
+
+    python benchmarks/calibration_power.py [CAMPAIGN] [--seeds 11 12] [--simulations 108] [--particles 1000]
+                                           [--folds 8] [--fold-simulations 72] [--workers 1] [--fresh] [--json]
+
+Sets: the campaign's own calibration (C4), again and again with one more parameter to search and the same budget. What
+is not searched has the campaign's fixed value, or Decant's default, and `--particles`. θ* is then simulated on each
+recorded pour: mean |measured − simulated| of the normalised spillage on training, test and transfer pours. The first
+row calibrates nothing.
+
+Folds: all pours of the campaign's scene, by angular velocity, are dealt to the folds in turn, so that each has slow and
+fast ones. θ*, of what the campaign searches, comes of all other folds; the fold's pours judge it. Beside it what needs
+no simulator: the others' mean and a Gaussian process of them, for the same folds and leaving one out.
+
+Every calibration is a process of its own, `--workers` of them at a time, and kept in the cache directory: what was
+interrupted goes on where it stopped. `--fresh` forgets what was kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from machine import ROOT, describe, run_self, say, show
+from standard_pour import check_particles
+
+from orchestrator.codec import digest, to_json
+from orchestrator.config.errors import ConfigError
+from orchestrator.config.load import load_campaign
+from orchestrator.flights import Flight, free_slots, next_to_tell
+from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour
+from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.stages import CALIBRATION, calibration_stages, measured_pours, scenes_of, stage_seed
+from orchestrator.strategies.baselines import mean_predictor_discrepancy, regression_discrepancy
+from orchestrator.strategies.design import MeasuredPour
+from orchestrator.strategies.evaluation import Evaluation, ScoredPour
+from orchestrator.strategies.protocol import Strategy
+from sim_engine.cache import cache_directory
+from sim_engine.errors import InvalidSceneError
+from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis, Space
+from sim_engine.task import PourTask
+
+CAMPAIGN = ROOT / "configs" / "campaigns" / "recorded.yaml"
+STEPS = (("viscosity",), ("cohesion",), ("friction",), ("particles",), ("wall_distance", "lip_drop"))
+"""Which parameters join the search, one step after the other."""
+
+RANGES = {"friction": Axis("friction", 0.0, 0.3)}
+"""Of parameters that the campaign does not search."""
+
+SPLITS = ("train", "test", "transfer")
+
+
+def growing_sets() -> list[tuple[str, ...]]:
+    """Names searched in each row of the first table, from none to all."""
+    return [tuple(name for step in STEPS[:k] for name in step) for k in range(len(STEPS) + 1)]
+
+
+def searching(plan: CalibrationPlan, names: Sequence[str], particles: int) -> CalibrationPlan:
+    """The calibration that searches these parameters and no others.
+
+    Args:
+        names: not empty.
+        particles: N where it is not searched.
+    """
+    axes = {**RANGES, **{axis.name: axis for axis in plan.parameters.axes}}
+    fixed = {"particles": float(particles), **plan.fixed_parameters}
+    return replace(
+        plan,
+        parameters=Space(tuple(axes[name] for name in names)),
+        fixed_parameters={name: value for name, value in fixed.items() if name not in names},
+    )
+
+
+def dealt(pours: Sequence[RecordedPour], folds: int) -> list[list[int]]:
+    """Places of the pours in each fold: dealt in turn, in the order of their angular velocities."""
+    order = sorted(range(len(pours)), key=lambda i: (pours[i].action.angular_velocity, pours[i].action.max_angle))
+    return [order[k::folds] for k in range(folds)]
+
+
+def without(plan: CalibrationPlan, fold: Sequence[int]) -> CalibrationPlan:
+    """The calibration on all recorded pours but a fold, whose pours are its test."""
+    assert plan.records is not None
+    pours = tuple(
+        replace(pour, split="test" if i in set(fold) else "train") for i, pour in enumerate(plan.records.pours)
+    )
+    return replace(plan, records=replace(plan.records, pours=pours), transfer=None)
+
+
+def play(strategy: Strategy, answer: Callable[[Request], Outcome], slots: int, label: str) -> None:
+    """Ask, answer and tell until the strategy has finished, in the order in which a run of the campaign does."""
+    flights: dict[int, Flight] = {}
+    asked, begun, told = 0, time.monotonic(), 0
+    while not strategy.finished:
+        for request in strategy.ask(free_slots(list(flights.values()), slots)):
+            flights[asked] = Flight(asked, request)
+            asked += 1
+        for flight in flights.values():
+            if flight.outcome is None:
+                flight.outcome = answer(flight.request)
+        flight = cast("Flight", next_to_tell(list(flights.values()), "logical"))
+        assert flight.outcome is not None
+        del flights[flight.id]
+        strategy.tell(flight.request, flight.outcome)
+        done, total = strategy.progress()
+        if done >= told + 20 or done == total > told:
+            told = done
+            say(f"{label}: {done}/{total} simulations, {time.monotonic() - begun:.0f} s")
+
+
+class Answers:
+    """Answers questions and simulates pours in this process."""
+
+    def __init__(self, plan: CampaignPlan) -> None:
+        from sim_engine.pour import PourSimulator
+
+        self._simulator = PourSimulator()
+        self._scenes = scenes_of(plan)
+
+    def __call__(self, request: Request) -> Outcome:
+        """What a laboratory would say."""
+        from actors.optimizer.core.propose import propose
+
+        if isinstance(request, Suggest):
+            return Suggested(propose(request.problem))
+        assert isinstance(request, Simulate)
+        task = PourTask(self._scenes[request.scene], request.action, request.parameters, request.seed)
+        try:
+            outcome = self._simulator.simulate(task).outcome
+        except InvalidSceneError as error:
+            return Failed("invalid_action", str(error))
+        return Simulated(outcome) if outcome.invalid is None else Failed("simulation", outcome.invalid)
+
+    def close(self) -> None:
+        """End the simulator; compiled kernels are kept for the next process."""
+        self._simulator.close()
+
+
+def calibrate(plan: CampaignPlan, seed: int, label: str, splits: Sequence[str]) -> dict[str, Any]:
+    """Calibrate as the campaign would, and simulate θ* on the recorded pours of some splits.
+
+    Args:
+        plan: what is searched; nothing is calibrated if its budget is 0.
+        seed: takes the place of the campaign's.
+    """
+    calibration = plan.calibration
+    assert calibration is not None
+    answers, begun = Answers(plan), time.process_time()
+    theta = SimulationParameters.from_values(calibration.fixed_parameters)
+    if calibration.simulations > 0:
+        (stage,) = (stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION)
+        strategy = stage.build({}, stage_seed(seed, stage.name))
+        play(strategy, answers, plan.parallel_simulations, label)
+        theta = SimulationParameters.model_validate(cast("Mapping[str, Any]", strategy.result())["theta"])
+    pours = [scored for scored in recorded(calibration) if scored.pour.split in splits]
+    judge = Evaluation({"theta": theta}, pours, stage_seed(seed, "evaluation"))
+    play(judge, answers, plan.parallel_simulations, f"{label}, θ*")
+    answers.close()
+    pairs = cast("Sequence[Mapping[str, Any]]", judge.result()["pairs"])
+    return {
+        "theta": theta.model_dump(),
+        "discrepancy": {split: judge.discrepancy("theta", split) for split in splits},
+        "errors": [abs(p["measured"] - p["simulated"]) for p in pairs if p["simulated"] is not None],
+        "cpu_s": round(time.process_time() - begun, 1),
+    }
+
+
+def recorded(plan: CalibrationPlan) -> list[ScoredPour]:
+    """All recorded pours, those of the other receiver last."""
+    transfer = () if plan.transfer is None else plan.transfer.pours
+    others = [ScoredPour(plan.transfer.scene.name, MeasuredPour.from_record(p)) for p in transfer if plan.transfer]
+    return [*measured_pours(plan, {}), *others]
+
+
+def without_simulator(plan: CalibrationPlan, folds: Sequence[Sequence[int]]) -> dict[str, float]:
+    """Mean |Δ| over all pours of the mean and of a regression of the others."""
+    totals, count = {"mean": 0.0, "regression": 0.0}, 0
+    for fold in folds:
+        pours = [scored.pour for scored in measured_pours(without(plan, fold), {})]
+        train, test = ([pour for pour in pours if pour.split == split] for split in ("train", "test"))
+        known = sum(pour.spillage is not None for pour in test)
+        if known == 0:
+            continue
+        count += known
+        totals["mean"] += known * (mean_predictor_discrepancy(train, test) or 0.0)
+        totals["regression"] += known * (regression_discrepancy(plan.actions, train, test) or 0.0)
+    return {name: round(total / count, 4) for name, total in totals.items()}
+
+
+def set_row(names: Sequence[str], found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A row of the first table: means over the seeds, and each seed's beside them."""
+    row: dict[str, Any] = {"searched": " + ".join(names) or "nothing"}
+    for split in SPLITS:
+        values = [one["discrepancy"][split] for one in found if one["discrepancy"].get(split) is not None]
+        row[split] = round(statistics.mean(values), 4) if values else None
+        row[f"{split}_seeds"] = [round(value, 4) for value in values]
+    row["thetas"] = [_rounded(one["theta"]) for one in found]
+    row["cpu_s"] = round(sum(one["cpu_s"] for one in found), 1)
+    return row
+
+
+def fold_summary(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Mean |Δ| over all pours, each judged by a θ* that never saw it, with its standard error."""
+    errors = [error for one in found for error in one["errors"]]
+    spread = statistics.stdev(errors) / len(errors) ** 0.5 if len(errors) > 1 else None
+    return {
+        "discrepancy": round(statistics.mean(errors), 4),
+        "standard_error": None if spread is None else round(spread, 4),
+        "largest": round(max(errors), 4),
+        "pours": len(errors),
+        "cpu_s": round(sum(one["cpu_s"] for one in found), 1),
+    }
+
+
+def _rounded(theta: Mapping[str, float]) -> dict[str, float]:
+    return {name: float(f"{value:.4g}") for name, value in theta.items()}
+
+
+class Kept:
+    """Calibrations that have been made, by everything that decides them; one file for each."""
+
+    def __init__(self, *, fresh: bool) -> None:
+        self._folder = cache_directory() / "calibration-power"
+        self._folder.mkdir(exist_ok=True)
+        if fresh:
+            for path in self._folder.glob("*.json"):
+                path.unlink()
+
+    def get(self, key: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What was kept, or what is made now."""
+        path = self._folder / f"{digest(key)[:24]}.json"
+        if path.exists():
+            return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8")))
+        result = make()
+        unfinished = path.with_suffix(".tmp")
+        unfinished.write_text(json.dumps(result), encoding="utf-8")
+        unfinished.replace(path)
+        return result
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="with recorded pours")
+    parser.add_argument("--seeds", type=int, nargs="*", default=(11, 12), help="of the sets; none leaves them out")
+    parser.add_argument("--simulations", type=int, help="budget of each set; the campaign's unless given")
+    parser.add_argument("--particles", type=int, default=1_000, metavar="N", help="where they are not searched")
+    parser.add_argument("--folds", type=int, default=8, help="0 leaves the cross-validation out")
+    parser.add_argument("--fold-simulations", type=int, default=72, help="budget of each fold")
+    parser.add_argument("--workers", type=int, default=1, help="calibrations at a time")
+    parser.add_argument("--fresh", action="store_true", help="forget what was kept")
+    parser.add_argument("--json", action="store_true", help="one line of JSON")
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # this is a process that makes one calibration
+    return parser.parse_args()
+
+
+@dataclass(frozen=True)
+class Job:
+    """One calibration and its judges."""
+
+    calibration: CalibrationPlan
+    seed: int
+    label: str
+    splits: tuple[str, ...]
+
+
+def job(calibration: CalibrationPlan, options: argparse.Namespace, which: str) -> Job:
+    """What is meant by 'set 3 11', row 3 of the sets with seed 11, or 'fold 3 11', the fourth fold."""
+    kind, number, seed = which.split()
+    if kind == "fold":
+        fold = dealt(calibration.records.pours if calibration.records else (), options.folds)[int(number)]
+        changed = replace(without(calibration, fold), simulations=options.fold_simulations)
+        return Job(changed, int(seed), f"fold {int(number) + 1} of {options.folds}", ("test",))
+    names = growing_sets()[int(number)]
+    if names:
+        changed = replace(searching(calibration, names, options.particles), simulations=options.simulations)
+    else:
+        fixed = {"particles": float(options.particles), **calibration.fixed_parameters}
+        changed = replace(calibration, fixed_parameters=fixed, simulations=0)
+    return Job(changed, int(seed), f"{' + '.join(names) or 'nothing'}, seed {seed}", SPLITS)
+
+
+def main() -> None:
+    """Measure and print."""
+    options = _options()
+    try:
+        plan = load_campaign(options.campaign)
+    except ConfigError as error:
+        raise SystemExit(str(error)) from None
+    calibration = plan.calibration
+    if calibration is None or calibration.records is None:
+        raise SystemExit(f"{options.campaign}: a campaign with recorded pours is needed (calibration.pours.from)")
+    check_particles(options.particles)
+    count = len(calibration.records.pours)
+    if options.folds and not 2 <= options.folds <= count:
+        raise SystemExit(f"--folds {options.folds}: 2 to {count} are possible with {count} recorded pours")
+    options.simulations = options.simulations or calibration.simulations
+    if options.one is not None:
+        one = job(calibration, options, options.one)
+        print(json.dumps(calibrate(replace(plan, calibration=one.calibration), one.seed, one.label, one.splits)))
+        return
+    sets = growing_sets()
+    wanted = [f"set {k} {seed}" for seed in options.seeds for k in range(len(sets))]
+    wanted += [f"fold {k} {plan.seed}" for k in range(options.folds)]
+    same = [str(options.campaign.resolve()), f"--simulations={options.simulations}", f"--particles={options.particles}"]
+    same += [f"--folds={options.folds}", f"--fold-simulations={options.fold_simulations}"]
+    machine, kept, begun = describe(), Kept(fresh=options.fresh), time.monotonic()
+    decides = [plan.parallel_simulations, machine["fingerprint"]]
+
+    def make(which: str) -> dict[str, Any]:
+        one = job(calibration, options, which)
+        key = [*decides, to_json(one.calibration, CalibrationPlan), one.seed, one.splits]
+        return kept.get(key, lambda: run_self(__file__, *same, f"--one={which}"))
+
+    with ThreadPoolExecutor(max(options.workers, 1)) as pool:
+        found = dict(zip(wanted, pool.map(make, wanted), strict=True))
+    say(f"all made, {time.monotonic() - begun:.0f} s")
+    result: dict[str, Any] = {"campaign": options.campaign.stem}
+    if options.seeds:
+        rows = [[found[f"set {k} {seed}"] for seed in options.seeds] for k in range(len(sets))]
+        result["sets"] = [set_row(names, row) for names, row in zip(sets, rows, strict=True)]
+        result |= {"seeds": list(options.seeds), "simulations": options.simulations, "particles": options.particles}
+    if options.folds:
+        folds = dealt(calibration.records.pours, options.folds)
+        judged = [found[f"fold {k} {plan.seed}"] for k in range(options.folds)]
+        result["cross_validation"] = {
+            "folds": options.folds,
+            "simulations": options.fold_simulations,
+            "searched": " + ".join(calibration.parameters.names),
+            **fold_summary(judged),
+            "by_fold": [round(one["discrepancy"]["test"], 4) for one in judged],
+            "thetas": [_rounded(one["theta"]) for one in judged],
+            "without_simulator": without_simulator(calibration, folds),
+            "without_simulator_leaving_one_out": without_simulator(calibration, [[i] for i in range(count)]),
+        }
+    show({**result, "machine": machine}, options.json)
+
+
+if __name__ == "__main__":
+    main()

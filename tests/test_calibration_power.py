@@ -1,0 +1,139 @@
+"""What the benchmark of calibration counts: pours that judge a θ* were never seen by it, and budgets are the same."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from orchestrator.config.load import load_campaign
+from orchestrator.plan import CalibrationPlan
+from sim_engine.action import DEG
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def power(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import calibration_power
+
+    return calibration_power
+
+
+@pytest.fixture
+def calibration(power: ModuleType) -> CalibrationPlan:
+    plan = load_campaign(power.CAMPAIGN).calibration
+    assert plan is not None
+    return plan
+
+
+@pytest.fixture
+def options() -> argparse.Namespace:
+    return argparse.Namespace(folds=8, fold_simulations=9, simulations=10, particles=700)
+
+
+def test_every_pour_judges_once_and_slow_and_fast_ones_in_each_fold(
+    power: ModuleType, calibration: CalibrationPlan
+) -> None:
+    assert calibration.records is not None
+    pours = calibration.records.pours
+    folds = power.dealt(pours, 8)
+    assert sorted(i for fold in folds for i in fold) == list(range(32))
+    speeds = [sorted(pours[i].action.angular_velocity / DEG for i in fold) for fold in folds]
+    assert all(slow < 47 and fast > 94 for slow, *_, fast in speeds)
+    assert sorted(len(fold) for fold in power.dealt(pours, 5)) == [6, 6, 6, 7, 7]
+
+
+def test_what_judges_a_fold_was_not_calibrated_on(
+    power: ModuleType, calibration: CalibrationPlan, options: argparse.Namespace
+) -> None:
+    assert calibration.records is not None
+    judged = []
+    for k in range(options.folds):
+        job = power.job(calibration, options, f"fold {k} 11")
+        pours = job.calibration.records.pours
+        test = [pour.action for pour in pours if pour.split == "test"]
+        assert not {pour.action for pour in pours if pour.split == "train"} & set(test)
+        assert len(pours) == 32
+        assert (job.splits, job.calibration.simulations, job.calibration.transfer) == (("test",), 9, None)
+        assert job.calibration.parameters == calibration.parameters
+        judged += test
+    assert set(judged) == {pour.action for pour in calibration.records.pours}
+
+
+def test_each_set_searches_one_step_more_at_the_same_budget(
+    power: ModuleType, calibration: CalibrationPlan, options: argparse.Namespace
+) -> None:
+    jobs = [power.job(calibration, options, f"set {k} 11").calibration for k in range(len(power.growing_sets()))]
+    nothing, first, second, *_, last = jobs
+    assert nothing.simulations == 0
+    assert nothing.fixed_parameters["particles"] == 700
+    assert {job.simulations for job in jobs[1:]} == {10}
+    assert first.parameters.names == ("viscosity",)
+    assert second.parameters.names == ("viscosity", "cohesion")
+    assert first.fixed_parameters == {**calibration.fixed_parameters, "particles": 700}
+    assert set(last.parameters.names) >= set(calibration.parameters.names)
+    assert not last.fixed_parameters
+    ours = {axis.name: axis for axis in calibration.parameters.axes}
+    assert all(ours.get(axis.name, axis) == axis for axis in last.parameters.axes)
+
+
+def found(train: float, test: float, errors: list[float]) -> dict[str, Any]:
+    discrepancy = {"train": train, "test": test, "transfer": None}
+    return {"discrepancy": discrepancy, "errors": errors, "theta": {"viscosity": 1.23456}, "cpu_s": 1.5}
+
+
+def test_rows_are_means_over_seeds_and_folds_weigh_pours_alike(power: ModuleType) -> None:
+    two = [found(0.01, 0.02, [0.1]), found(0.03, 0.06, [0.2, 0.3, 0.4])]
+    row = power.set_row(("viscosity",), two)
+    assert (row["train"], row["test"], row["transfer"], row["test_seeds"]) == (0.02, 0.04, None, [0.02, 0.06])
+    assert (row["searched"], row["cpu_s"], row["thetas"][0]) == ("viscosity", 3.0, {"viscosity": 1.235})
+    folds = power.fold_summary(two)
+    assert (folds["discrepancy"], folds["pours"], folds["largest"]) == (0.25, 4, 0.4)
+    assert folds["standard_error"] == pytest.approx(0.0645, abs=1e-4)  # s/√n of 0.1, 0.2, 0.3, 0.4
+
+
+def test_mean_of_the_others_is_what_the_records_say_it_is(power: ModuleType, calibration: CalibrationPlan) -> None:
+    assert calibration.records is not None
+    spillage = [pour.normalised_spillage or 0.0 for pour in calibration.records.pours]
+    others = [abs(r - (sum(spillage) - r) / 31) for r in spillage]
+    told = power.without_simulator(calibration, [[i] for i in range(32)])
+    assert told["mean"] == pytest.approx(sum(others) / 32, abs=1e-4)
+    assert told["regression"] < told["mean"]
+
+
+def test_what_was_made_is_kept_and_what_broke_off_is_not(
+    power: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path))
+    made: list[int] = []
+
+    def make() -> dict[str, int]:
+        made.append(len(made))
+        if len(made) == 1:
+            raise SystemExit("killed")
+        return {"number": len(made)}
+
+    with pytest.raises(SystemExit):
+        power.Kept(fresh=False).get(["a"], make)
+    assert power.Kept(fresh=False).get(["a"], make) == {"number": 2}
+    assert power.Kept(fresh=False).get(["a"], make) == {"number": 2}
+    assert power.Kept(fresh=False).get(["b"], make) == {"number": 3}
+    assert power.Kept(fresh=True).get(["a"], make) == {"number": 4}
+
+
+def test_what_can_t_be_measured_is_refused(power: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusal(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["calibration_power.py", *arguments])
+        with pytest.raises(SystemExit) as refused:
+            power.main()
+        return str(refused.value)
+
+    assert refusal("--folds=33") == "--folds 33: 2 to 32 are possible with 32 recorded pours"
+    quickstart = power.ROOT / "configs" / "campaigns" / "quickstart.yaml"
+    assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
+    assert refusal("nowhere.yaml") == "nowhere.yaml: no such file"
