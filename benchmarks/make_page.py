@@ -28,6 +28,7 @@ PLAN: dict[str, tuple[str, ...]] = {
     "pour-5000": ("pour_speed.py", "--particles=5000", "--repeats=3", "--peer=1"),
     "pour-10000": ("pour_speed.py", "--particles=10000", "--repeats=3", "--peer=1"),
     "scaling": ("scaling.py", "--repeats=1"),
+    "scenes": ("batches.py",),
     "start-up": ("start_up.py",),
     "profile": ("profile_passes.py",),
     "core-limit": ("core_limit.py",),

@@ -119,21 +119,23 @@ def measure(simulator: PourSimulator, particles: int, seed: int) -> Measured:
         SystemExit: the outcome is invalid, so that its time means nothing.
     """
     begun = time.perf_counter()
-    run = simulator.simulate(standard_task(particles, seed, record_rate=1.0))
+    run = simulator.simulate(standard_task(particles, seed, record_rate=10.0))
     wall = time.perf_counter() - begun
     outcome = run.outcome
     if outcome.invalid is not None:
         raise SystemExit(f"the standard pour with {particles} particles, seed {seed}, is invalid: {outcome.invalid}")
     frames = run.frames
     assert frames is not None
-    at_rest = frames.positions[int(np.argmin(np.abs(frames.times - REST)))]
+    # The first frame that was simulated; before it the liquid is laid out level, and settles for a moment.
+    first = int(np.argmax(frames.times >= max(REST, outcome.curve_times[1])))
+    at_rest = frames.positions[first]
     left = 1.0 - np.interp(TIMES, outcome.curve_times, outcome.curve_poured)
     return Measured(
         outcome.cpu_s,
         wall,
         iterations_of(outcome),
         tuple(float(f) for f in left),
-        density_inside(at_rest.astype(float), REST, particles),
+        density_inside(at_rest.astype(float), float(frames.times[first]), particles),
         outcome,
     )
 

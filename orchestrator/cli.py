@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -48,6 +49,13 @@ Parameters = Annotated[
 Receiver = Annotated[
     Path | None, typer.Option(help="Vessel file (YAML) in place of the campaign's receiver.", show_default=False)
 ]
+
+
+class BackendChoice(StrEnum):
+    """Where the solver runs."""
+
+    CPU = "cpu"
+    CUDA = "cuda"
 
 
 def examples(*commands: str) -> str:
@@ -180,6 +188,7 @@ def simulate(
     as_json: Json = False,
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
     png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
+    backend: Annotated[BackendChoice, typer.Option(help="Where the solver runs.")] = BackendChoice.CPU,
 ) -> None:
     """Simulate one pour of a campaign's scene, with several seeds, and say where the liquid went.
 
@@ -201,6 +210,7 @@ def simulate(
         as_json=as_json,
         rrd=rrd,
         png=png,
+        backend=backend.value,
     )
 
 

@@ -33,21 +33,25 @@ STEP = 0.02
 """Resolution, and what the begin is a multiple of [s]."""
 
 
-def wave_height(speed: float, acceleration: float, radius: float) -> float:
-    """Height of the waves in a cup whose liquid is suddenly given a speed, and is then accelerated.
+def wave_height(velocities: Floats, step: float, radius: float) -> float:
+    """Largest height of the waves in a cup that is moved about.
 
-    The first lateral mode: a push of speed u raises u/ω with ω² = 1.84 g / R (deep liquid); an acceleration a tilts the
-    surface by a/g.
+    The first lateral mode as an undamped oscillator that accelerations push, ω² = 1.84 g / R (deep liquid):
+    |∫ a(t) exp(iωt) dt| / ω. A sudden start at a speed u raises u/ω, a steady acceleration a about 2 R a / (1.84 g).
 
     Args:
-        speed: [m/s].
-        acceleration: [m/s²].
+        velocities: of the cup, shape (T, 3), `step` apart; it is at rest before [m/s].
+        step: [s].
         radius: R [m].
 
     Returns:
         At the wall [m].
     """
-    return max(speed / math.sqrt(1.841 * GRAVITY / radius), radius * acceleration / GRAVITY)
+    frequency = math.sqrt(1.841 * GRAVITY / radius)
+    pushes = np.diff(velocities[:, :2], axis=0, prepend=0.0)
+    turned = pushes * np.exp(1j * frequency * step * np.arange(len(pushes)))[:, None]
+    response = np.linalg.norm(np.abs(np.cumsum(turned, axis=0)), axis=1)
+    return float(response.max()) / frequency
 
 
 def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
@@ -68,8 +72,8 @@ def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
     begin = _last_below(pourer, volume, tilts) - round(LEAD / STEP)
     if begin <= 0:
         return 0.0
-    speeds, accelerations = _centre(motion, pourer, times[: begin + 2])
-    height = wave_height(float(speeds.max()), float(accelerations.max()), pourer.opening_radius)
+    velocities = np.diff(_middles(motion, pourer, times[: begin + 2]), axis=0) / STEP
+    height = wave_height(velocities, STEP, pourer.opening_radius)
     return float(begin * STEP) if height <= CALM * pourer.opening_radius else 0.0
 
 
@@ -101,11 +105,3 @@ def _middles(motion: Motion, pourer: Vessel, times: Floats) -> Floats:
     w, x, y, z = poses[:, 3:7].T
     axis = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     return np.asarray(poses[:, :3] + 0.5 * (pourer.inner_floor + pourer.rim_height) * axis)
-
-
-def _centre(motion: Motion, pourer: Vessel, times: Floats) -> tuple[Floats, Floats]:
-    """Speeds [m/s] and accelerations [m/s²] of the pourer's middle; a start from rest counts as a speed."""
-    places = _middles(motion, pourer, times)
-    velocities = np.diff(places, axis=0) / STEP
-    accelerations = np.diff(velocities, axis=0) / STEP
-    return np.linalg.norm(velocities, axis=1), np.linalg.norm(accelerations, axis=1)

@@ -22,7 +22,7 @@ from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fill import fill, spacing
 from sim_engine.fluid.setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.motion import Motion, plan_motion
-from sim_engine.outcome import PourOutcome
+from sim_engine.outcome import ParticleState, PourOutcome
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.corners import equivalent_distance
@@ -220,10 +220,33 @@ class PourSimulator:
                 follow(fluid, [course], cancelled)
         else:
             follow(fluid, courses, cancelled)
+        for course, task, motion in zip(courses, tasks, motions, strict=True):
+            if task.record_rate > 0.0:
+                course.frames[:0] = self._level_frames(task, motion, course.start)
         return [
             SimulationRun(outcome(fluid, course, loading), recorded_frames(course, motion))
             for course, motion in zip(courses, motions, strict=True)
         ]
+
+    def _laid(self, task: PourTask, motion: Motion, at: float) -> NDArray[np.float32]:
+        """Positions of the liquid at rest in the pourer as it stands at a time [s], (N, 3) in the world [m]."""
+        # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
+        tilt = float(motion.tilt(np.array([at]))[0]) if at > 0.0 else 0.0
+        pourer, parameters = self.vessel(task.scene.pourer), task.parameters
+        volume = task.scene.liquid.volume
+        local = fill(pourer, volume, parameters.particles, task.seed, parameters.wall_distance, tilt)
+        (pose,) = motion.sample(np.array([at]))
+        (rotation,) = rotations(pose[None])
+        placed: NDArray[np.float32] = (local @ rotation.T + pose[:3]).astype(np.float32)
+        return placed
+
+    def _level_frames(
+        self, task: PourTask, motion: Motion, start: float
+    ) -> list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]]:
+        """Frames from before the simulation began, when the liquid lay level: time, positions, states."""
+        homes = np.full(task.parameters.particles, int(ParticleState.IN_POURER), np.uint8)
+        times = np.arange(0.0, start - 0.5 / task.record_rate, 1.0 / task.record_rate)
+        return [(float(t), self._laid(task, motion, float(t)), homes) for t in times]
 
     def _setup(self, task: PourTask, motion: Motion, start: float) -> SceneSetup:
         """The scene as the engine takes it, at the time from which it has to be simulated [s]."""
@@ -232,15 +255,9 @@ class PourSimulator:
         scene, parameters, error = task.scene, task.parameters, task.pose_error or PoseError()
         pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
         d = spacing(scene.liquid.volume, parameters.particles)
-        at_start = np.array([start])
-        # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
-        tilt = float(motion.tilt(at_start)[0]) if start > 0.0 else 0.0
-        local = fill(pourer, scene.liquid.volume, parameters.particles, task.seed, parameters.wall_distance, tilt)
-        (pose,) = motion.sample(at_start)
-        (rotation,) = rotations(pose[None])
         drift = liquid_velocity(motion, pourer, start) if start > 0.0 else np.zeros(3)
         return SceneSetup(
-            positions=(local @ rotation.T + pose[:3]).astype(np.float32),
+            positions=self._laid(task, motion, start),
             spacing=d,
             tension=parameters.cohesion,
             density=scene.liquid.density,

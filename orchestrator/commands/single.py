@@ -22,6 +22,7 @@ from orchestrator.commands.common import (
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
+    from sim_engine.backend import Backend
     from sim_engine.outcome import PourOutcome
     from sim_engine.pour import PourSimulator, SimulationRun
     from sim_engine.regimes import Regimes
@@ -42,12 +43,14 @@ def simulate(
     as_json: bool,
     rrd: Path | None,
     png: Path | None,
+    backend: Backend = "cpu",
 ) -> None:
     """One pour in the simulator of this process, with several seeds: their mean and spread are the prediction."""
     from orchestrator.config.assignments import assigned_action
     from orchestrator.config.check import check_vessels
     from orchestrator.config.errors import ConfigError, shown_path
     from orchestrator.config.load import load_parameters, load_vessel
+    from sim_engine.backend import BackendError, require_backend
     from sim_engine.pour import InvalidSceneError, PourSimulator
     from sim_engine.spread import spreads
     from sim_engine.task import PourTask
@@ -72,7 +75,11 @@ def simulate(
         raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
     record_rate = 20.0 if rrd or png else 0.0
     tasks = [PourTask(scene, action, theta, seed + i, record_rate if i == 0 else 0.0) for i in range(seeds)]
-    simulator = PourSimulator()
+    try:
+        require_backend(backend)
+    except BackendError as error:
+        raise RefusalError(f"--backend: {error}", BAD_INPUT) from None
+    simulator = PourSimulator(backend)
     try:
         simulator.prepare(tasks[0])  # refused before Taichi starts
     except InvalidSceneError as error:

@@ -1,16 +1,17 @@
-"""The density constraint: C_i = ρ_i/ρ₀ − 1 ≤ 0, solved for positions by damped Jacobi with accumulated multipliers.
+"""The density constraint C_i = ρ_i/ρ₀ − 1 ≤ 0, solved for positions by Jacobi iterations.
 
-Walls enter as the kernel's integral over a half-space at the wall's distance, so that liquid keeps half a spacing from
-them and feels their pressure. Part of the multipliers is kept from step to step (warm start), which helps to carry a
-resting column; iterations go on until the mean compression inside is small, so that deep vessels are solved as well as
-shallow ones.
+Multipliers accumulate, and `step.py` accelerates them (Chebyshev).
+
+Walls enter as the kernel's integral over a half-space at the distance of their equivalent plane, so that liquid keeps
+half a spacing from them and feels their pressure. Part of the multipliers is kept from step to step (warm start), which
+helps to carry a resting column; iterations go on until the mean compression inside is small, so that deep vessels are
+solved as well as shallow ones.
 
 Pairs are visited once and add to both of their particles. Such sums are written out (a = a + b): Taichi turns += on a
 field into an atomic operation, which made a pour four times slower.
 
 Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chentanez 2016 (accumulated multipliers); wall
-integral: after Bender et al. 2019 (volume maps), here with the analytic half-space. Limitations: concave corners see
-only the nearer wall.
+integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/corners.py`.
 """
 
 import taichi as ti
@@ -19,7 +20,8 @@ from sim_engine.fluid.kernels import SIGMA, slope, wall_density, wall_slope, wei
 from sim_engine.fluid.state import SUPPORT, VESSELS
 
 PACKING = 1.012
-"""Kernel sum of a relaxed bulk of spacing d over its continuum value, measured on a cup at rest."""
+"""Kernel sum of bulk liquid of spacing d over its continuum value, measured on a cup at rest: with it the density there
+is 1.00, the compression that the iterations leave included."""
 
 
 @ti.func

@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim_engine.backend import BackendError
+from sim_engine.backend import BackendError, require_backend
 from sim_engine.cache import cache_directory
 from sim_engine.fluid.forces import forces_interval
 from sim_engine.fluid.kernels import cohesion_acceleration
@@ -240,11 +240,7 @@ def start(backend: str) -> None:
     Raises:
         BackendError: this machine has no such backend.
     """
-    if backend == "cuda" and not _cuda_is_there():
-        raise BackendError(
-            "--backend cuda: no CUDA device answers on this machine; use --backend cpu, or install the NVIDIA driver "
-            "(nvidia-smi lists what it finds)"
-        )
+    require_backend(backend)
     # Taichi says on which architecture it starts, on stdout, which is for results alone.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
@@ -255,18 +251,6 @@ def start(backend: str) -> None:
             log_level=ti.ERROR,
             enable_fallback=False,
         )
-
-
-def _cuda_is_there() -> bool:
-    """Whether a CUDA device can be used. Taichi itself falls back silently, or ends the process."""
-    import ctypes
-
-    try:
-        driver = ctypes.CDLL("libcuda.so.1")
-    except OSError:
-        return False
-    count = ctypes.c_int(0)
-    return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
 
 
 _engine: FluidEngine | None = None

@@ -1,7 +1,8 @@
 """What acts between particles besides pressure: cohesion and viscosity, one pass over the pairs.
 
-Cohesion is a pairwise attraction whose strength is scaled to a surface tension (`kernels.cohesion_strength`). Viscosity
-relaxes velocities towards the neighbours' mean at a given rate (XSPH), so that it does not depend on the time step.
+Cohesion is a pairwise attraction whose strength is scaled to a surface tension (`kernels.cohesion_acceleration`).
+Viscosity relaxes velocities towards the neighbours' mean at a given rate (XSPH), so that it does not depend on the time
+step. Both are slow, and act only every few steps.
 
 Source: Akinci et al. 2013 (pairwise cohesion); Schechter & Bridson 2012 (XSPH); scaling ours.
 """
@@ -14,7 +15,9 @@ from sim_engine.fluid.kernels import attraction, weight
 from sim_engine.fluid.state import SUPPORT
 
 LONGEST_WAIT = 0.01
+"""Viscosity and cohesion act at least that often [s] …"""
 CAPILLARY = 0.2
+"""… and once in that part of the capillary time: at half of it drops heat up."""
 LARGEST_PULL = 0.1
 """Cohesion moves a particle by at most so many spacings in a step: a strong tension at fine spacing stays stable."""
 

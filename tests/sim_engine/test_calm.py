@@ -1,0 +1,112 @@
+"""When a simulation has to begin."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sim_engine.pour as pour_module
+from sim_engine.action import DEG, Action
+from sim_engine.calm import CALM, FREEBOARD, STEP, calm_until, liquid_velocity, wave_height
+from sim_engine.hydrostatics import level
+from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.motion import plan_motion
+from sim_engine.pour import PourSimulator
+from sim_engine.task import PourTask, Scene
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.spec import cylinder
+
+SCENE = Scene(
+    "calm",
+    cylinder("cup", inner_radius=0.04, inner_height=0.1),
+    cylinder("glass", inner_radius=0.045, inner_height=0.09),
+    Liquid(mass=0.2),
+)
+POURER, RECEIVER = build_vessel(SCENE.pourer), build_vessel(SCENE.receiver)
+VOLUME = SCENE.liquid.volume
+
+
+def action(speed: float, max_angle: float = 120.0) -> Action:
+    return Action(
+        angular_velocity=speed * DEG,
+        x_offset=0.08,
+        height=0.11,
+        max_angle=max_angle * DEG,
+        angular_acceleration=None,
+        hold_time=1.0,
+        return_velocity=None,
+    )
+
+
+def begin(speed: float, max_angle: float = 120.0) -> float:
+    return calm_until(plan_motion(SCENE, action(speed, max_angle), POURER, RECEIVER), POURER, VOLUME)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(5.0, 180.0))
+def test_nothing_is_near_the_lip_when_the_simulation_begins(speed: float) -> None:
+    start = begin(speed)
+    assert start >= 0.0
+    assert start / STEP == pytest.approx(round(start / STEP))
+    motion = plan_motion(SCENE, action(speed), POURER, RECEIVER)
+    if start > 0.0:
+        tilt = float(motion.tilt(np.array([start]))[0])
+        assert level(POURER, VOLUME, tilt) < -FREEBOARD * POURER.opening_radius
+
+
+def test_slow_pours_begin_late_and_fast_ones_at_once() -> None:
+    assert begin(30.0) > 1.2
+    assert begin(15.0) > 2.0 * begin(30.0)
+    assert begin(120.0) == 0.0
+
+
+def test_a_motion_that_never_spills_ends_before_it_begins_late() -> None:
+    motion = plan_motion(SCENE, action(10.0, max_angle=46.0), POURER, RECEIVER)
+    assert 0.0 <= calm_until(motion, POURER, VOLUME) <= motion.duration
+
+
+def test_a_sudden_start_raises_the_wave_of_the_first_mode() -> None:
+    # u / ω with ω² = 1.84 g / R: 0.1 m/s in a cup of 40 mm makes 4.7 mm
+    frequency = math.sqrt(1.841 * 9.81 / 0.04)
+    at_once = np.tile([0.1, 0.0, 0.0], (100, 1))
+    assert wave_height(at_once, 0.02, 0.04) == pytest.approx(0.1 / frequency)
+    times = 0.001 * np.arange(2000)
+    steadily = np.column_stack([0.5 * times, 0.0 * times, 0.0 * times])
+    assert wave_height(steadily, 0.001, 0.04) == pytest.approx(2.0 * 0.5 / frequency**2, rel=0.02)
+    # up and down does not slosh, and a slow ramp hardly does
+    assert wave_height(at_once[:, ::-1], 0.02, 0.04) == 0.0
+    gently = np.column_stack([0.05 * np.minimum(times, 1.0), 0.0 * times, 0.0 * times])
+    assert wave_height(gently, 0.001, 0.04) < CALM * 0.04
+
+
+def test_a_ramp_of_the_arm_does_not_keep_a_slow_pour_from_beginning_late() -> None:
+    ramped = dataclasses.replace(action(30.0), angular_acceleration=1000.0 * DEG)
+    assert calm_until(plan_motion(SCENE, ramped, POURER, RECEIVER), POURER, VOLUME) > 1.2
+
+
+def test_the_liquid_moves_off_with_the_cup() -> None:
+    motion = plan_motion(SCENE, action(30.0), POURER, RECEIVER)
+    velocity = liquid_velocity(motion, POURER, 1.0)
+    pivot_to_middle = math.hypot(0.04, 0.05)
+    assert np.linalg.norm(velocity) == pytest.approx(30 * DEG * pivot_to_middle, rel=0.05)
+    assert velocity[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_leaving_the_beginning_out_changes_the_pour_by_less_than_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = PourSimulator()
+    tasks = [PourTask(SCENE, action(30.0), SimulationParameters(particles=1000), seed) for seed in (1, 2, 3)]
+    times = np.arange(1.8, 3.6, 0.1)
+
+    def left() -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        runs = [run.outcome for run in simulator.simulate_many(tasks)]
+        return np.array([1.0 - np.interp(times, o.curve_times, o.curve_poured) for o in runs])
+
+    late = left()
+    monkeypatch.setattr(pour_module, "calm_until", lambda *_: 0.0)
+    whole = left()
+    assert np.max(np.abs(late.mean(axis=0) - whole.mean(axis=0))) < 0.02
