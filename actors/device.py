@@ -47,7 +47,11 @@ class Device(Protocol):
         ...
 
     async def revive(self) -> bool:
-        """Make a new object in place of a lost one. Returns whether that was needed."""
+        """Make a new object in place of a lost one. Returns whether that was needed.
+
+        Raises:
+            MachineLostError: where it has to run there is no machine.
+        """
         ...
 
     async def close(self) -> None:
@@ -146,6 +150,7 @@ class RayDevice:
         """See `Device.revive`."""
         if not self._lost:
             return False
+        await self._check_machine("revive")
         self._start()
         return True
 

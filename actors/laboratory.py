@@ -22,12 +22,12 @@ from actors.protocols import (
     SimulatorPool,
 )
 from actors.simulation.in_process import InProcessSimulatorPool
+from actors.simulation.pool import RaySimulatorPool
 from actors.simulation.worker import Simulator, pour_simulator
 from actors.spec import LaboratorySpec
 
 if TYPE_CHECKING:
     from actors.cluster.site import Site
-    from actors.simulation.pool import RaySimulatorPool
 
 
 def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
@@ -208,7 +208,7 @@ class RayLaboratory(_Rooms):
             if self._spec.ray is not None:
                 from actors.cluster.site import Site
 
-                self._site = Site(self._spec.ray, self._tell, self._lose_bench)
+                self._site = Site(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
                 await self._site.open(need_bench=self._bench_spec is not None)
             self._open_rooms()
         except BaseException:
@@ -235,7 +235,6 @@ class RayLaboratory(_Rooms):
     def _open_pool(self) -> RaySimulatorPool:
         from actors.cluster.versions import versions
         from actors.ray_private import simulator_count
-        from actors.simulation.pool import RaySimulatorPool
 
         def tell(text: str) -> None:
             self._tell(Notice("warning", text))
@@ -256,8 +255,6 @@ class RayLaboratory(_Rooms):
     def _open_world(self) -> RaySimulatorPool:
         """The hidden liquid's simulator, beside the arm. No core is counted for it: the pool's size is the campaign's
         choice, and a pour must never wait for it."""
-        from actors.simulation.pool import RaySimulatorPool
-
         place = None if self._site is None else self._site.bench
         return RaySimulatorPool(1, make=self._make, cpus=0.0, placement=None if place is None else place.options)
 
@@ -266,6 +263,12 @@ class RayLaboratory(_Rooms):
         self._bench_problem = reason
         if self._liquid is not None:
             self._liquid.abandon(BenchLostError(reason))
+
+    def _lose_all(self, reason: str) -> None:
+        """Ray on this machine is gone: without it nothing can be asked of anybody."""
+        self._lose_bench(reason)
+        if isinstance(self._pool, RaySimulatorPool):
+            self._pool.abandon(LaboratoryError(reason))
 
     async def __aexit__(self, *exc: object) -> None:
         await self._close_rooms()

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
+from actors.cluster.last_word import dismiss, speaker
 from actors.protocols import LaboratoryError
 from actors.ray_private import PrivateRay, close_private, open_private, start_private
 from actors.ray_settings import ray_settings
@@ -160,9 +161,11 @@ def _start_keeper(cluster: _Cluster, spec: LaboratorySpec) -> None:
 def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
     settings = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"} if cluster.private is None else cluster.private.settings()
     with ray_settings(**settings):
+        speaks = None
         try:
             if cluster.private is None:
                 _join(cluster)
+                speaks = speaker(str(cluster.address))
             else:
                 start_private(cluster.private, spec)
         except Exception as error:
@@ -175,6 +178,8 @@ def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
         import ray
 
         ray.shutdown()
+        if speaks is not None:
+            dismiss(speaks)
 
 
 def _join(cluster: _Cluster) -> None:

@@ -27,12 +27,15 @@ class Site:
         spec: which cluster.
         tell: told of nodes that come and go.
         bench_lost: called with the reason when the bench's node has died.
+        here_lost: called with the reason when the node that this program is connected to has died. Ray may have ended
+            the program before.
         grown: called with the number of cores when there are more.
     """
 
     spec: RaySpec
     tell: Callable[[Notice], None]
     bench_lost: Callable[[str], None]
+    here_lost: Callable[[str], None]
     grown: Callable[[int], None] = lambda cpus: None
     bench: Place | None = None
     here: Place = field(init=False)
@@ -94,17 +97,22 @@ class Site:
             await asyncio.sleep(LOOK_INTERVAL)
             try:
                 now = await asyncio.to_thread(living_nodes)
-                bench_gone = self.bench is not None and self.bench.node.id in self._nodes and await self.bench.is_gone()
+                for place in [place for place in (self.here, self.bench) if place is not None]:
+                    if place.node.id in self._nodes and await place.is_gone():
+                        self._dead.add(place.node.id)  # Ray will list it for a while yet
             except Exception:
                 continue  # the head may be busy; if it is dead, Ray ends this program
-            if bench_gone and self.bench is not None:
-                self._dead.add(self.bench.node.id)  # Ray will list it for a while yet
             self._compare({id_: node for id_, node in now.items() if id_ not in self._dead})
 
     def _compare(self, now: dict[str, Node]) -> None:
         before, self._nodes = self._nodes, now
         for id_ in before.keys() - now.keys():
             host = before[id_].host
+            if id_ == self.here.node.id:
+                reason = f"Ray on this machine, {host}, has died; start it again with 'ray start', then resume the run"
+                self.tell(Notice("error", reason))
+                self.here_lost(reason)
+                continue
             left = f"simulations go on with {self.cpus} core(s) on {len(now)} node(s)"
             if self.bench is not None and id_ == self.bench.node.id:
                 reason = f"the bench's machine {host} is lost; no pour can be made until it is back"

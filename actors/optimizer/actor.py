@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from actors.device import Device, DeviceLostError
+from actors.device import Device, DeviceLostError, MachineLostError
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.protocols import LaboratoryError
 
@@ -43,6 +43,8 @@ class DeviceOptimizer:
             try:
                 suggestion: Suggestion = await self.device.call("suggest", problem, deadline=DEADLINE)
                 return suggestion
+            except MachineLostError:
+                raise
             except DeviceLostError as error:
                 lost = error
                 await self.device.revive()

@@ -78,6 +78,7 @@ class RaySimulatorPool:
         self._meshes: dict[Path, Any] = {}
         self._account = Account(size)
         self._hopeless: asyncio.TimerHandle | None = None
+        self._abandoned: LaboratoryError | None = None
         self._closed = False
         start = partial(simulator_actor, make, cpus=cpus, placement=placement or {})
         self._crew = Crew(size, start, expected=expected, changed=self._dispatch, tell=tell)
@@ -104,10 +105,12 @@ class RaySimulatorPool:
         """See `SimulatorPool.simulate`.
 
         Raises:
-            LaboratoryError: no simulator is up, and none comes up.
+            LaboratoryError: no simulator is up, and none comes up; or whatever the pool was abandoned with.
         """
         if self._closed:
             raise SimulationError("the pool of simulators is closed")
+        if self._abandoned is not None:
+            raise self._abandoned
         packed, parcels = self._packer.pack(task)
         for parcel in parcels:
             if parcel.key not in self._meshes:
@@ -250,11 +253,12 @@ class RaySimulatorPool:
             self._waiting.popleft().fail(LaboratoryError(reason))
 
     def abandon(self, error: LaboratoryError) -> None:
-        """All jobs fail: their simulators can't come back.
+        """All jobs fail, now and from now on: their simulators can't come back.
 
         Args:
             error: why.
         """
+        self._abandoned = error
         for member in self._crew.up:
             self._waiting.extend(sent.job for sent in member.sent if not sent.recalled)
             for sent in member.sent:

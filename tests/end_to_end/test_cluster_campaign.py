@@ -97,6 +97,7 @@ def test_a_campaign_that_loses_a_node_ends_where_an_undisturbed_one_ends(cluster
         until(lambda: cluster.workers(third), process)
         _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
+    assert "ended in the midst" not in errors
     told = notes(place.entries())
     assert "2 node(s), 2 core(s); the bench is on" in told
     assert "1 simulator(s) lost on" in told
@@ -163,6 +164,21 @@ def test_a_killed_program_leaves_no_actor_in_the_cluster_and_gives_the_bench_bac
     assert started_after_they_were_finished(place.entries()) == []
     assert cluster.is_alive()
     assert cluster.workers(0) == cluster.workers(1) == []
+
+
+def test_a_program_that_loses_its_own_node_ends_with_a_word_whether_ray_lets_it_or_not(cluster, places):
+    cluster.start_node(cpus=1)
+    cluster.start_node(cpus=1, bench=True)
+    place = places(LONGER, True)
+    process = place.start(*RUN)
+    with ended(process):
+        until(lambda: finished_in("calibration", place.entries()) >= 3, process)
+        cluster.kill_node(0)
+        _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    killed = f"Ray on this machine or at {cluster.address} died and ended it" in errors
+    assert killed or "Ray on this machine, " in errors
+    assert "what is done so far is kept" in errors
 
 
 CHECK = """
