@@ -1,0 +1,66 @@
+"""A bench whose machine is gone ends the run: with an unknown pour if one had begun, without one if none had."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from actors.protocols import BenchLostError, LaboratoryError, Notice
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.lanes import LaneError
+from tests.orchestrator.scripted import Script, one_stage, pour, run, simulate, states
+from tests.orchestrator.toy import ToyBench, ToyLaboratory
+
+LOST = BenchLostError("arm: its machine bench-pc (10.0.0.3) was lost during 'execute'")
+
+
+def kinds(directory, *wanted: Kind) -> list[str]:
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        return [entry.kind for entry in journal.entries(kinds=list(wanted))]
+
+
+def test_a_bench_lost_during_a_pour_leaves_the_pour_unknown_and_pours_nothing_more(tmp_path):
+    bench = ToyBench(fails=lambda seed: LOST)
+    script = Script(pour(1), pour(2))
+    with pytest.raises(LaneError, match=r"bench-pc .* what was poured is unknown: see to the bench, then resume"):
+        run(tmp_path, ToyLaboratory(bench=bench), stages=one_stage(script))
+    assert kinds(tmp_path, Kind.POUR_STARTED, Kind.POUR_FINISHED) == [Kind.POUR_STARTED]
+    assert states(tmp_path)[-1] == "unknown"
+    assert script.told == [], "nothing is made up in its place"
+
+
+class BenchGone(ToyLaboratory):
+    """The machine has died while nothing was being poured."""
+
+    @property
+    def bench(self) -> Any:
+        if self.simulators.tasks:
+            raise BenchLostError("the bench's machine is lost; no pour can be made until it is back")
+        return self._bench
+
+    @bench.setter
+    def bench(self, value: Any) -> None:
+        self._bench = value
+
+
+def test_a_bench_lost_between_pours_leaves_no_pour_unknown(tmp_path):
+    laboratory = BenchGone()
+    with pytest.raises(LaboratoryError, match="no pour can be made until it is back"):
+        run(tmp_path, laboratory, stages=one_stage(Script(simulate(1), pour(1))))
+    assert kinds(tmp_path, Kind.POUR_STARTED) == []
+    assert states(tmp_path)[-1] == "failed"
+
+
+class Talking(ToyLaboratory):
+    """Tells something as soon as somebody listens."""
+
+    def listen(self, hear: Any) -> None:
+        hear(Notice("warning", "machine b (10.0.0.4) is lost"))
+
+
+def test_what_happens_to_a_laboratory_is_in_the_journal(tmp_path):
+    run(tmp_path, Talking(), stages=one_stage(Script(simulate(1))))
+    with JournalReader(tmp_path / JOURNAL_NAME) as journal:
+        notes = [entry.body["text"] for entry in journal.entries(kinds=[Kind.NOTE])]
+    assert notes == ["machine b (10.0.0.4) is lost"]
