@@ -174,6 +174,7 @@ class _Run:
                 resumed=resume,
             )
             self._watchers.emit(opened)
+            self._tell_of_idle(laboratory.simulators.size)
             self._enter(State.RUNNING)
             results: dict[str, Mapping[str, Any]] = {}
             for index, stage in enumerate(self._stages, start=1):
@@ -252,6 +253,15 @@ class _Run:
         if laboratory.bench.mode != self._plan.laboratory.mode:
             raise LaneError(
                 f"the plan is for a {self._plan.laboratory.mode} bench, but the laboratory's is {laboratory.bench.mode}"
+            )
+
+    def _tell_of_idle(self, simulators: int) -> None:
+        slots = self._plan.parallel_simulations
+        if simulators > slots:
+            self._watchers.log(
+                "info",
+                f"{simulators} simulators, but this campaign keeps at most {slots} simulation(s) in flight: "
+                f"{simulators - slots} will have nothing to do; 'parallel_simulations' in the campaign changes that",
             )
 
     def _hear(self, notice: Notice) -> None:

@@ -1,4 +1,4 @@
-"""A bench whose machine is gone ends the run: with an unknown pour if one had begun, without one if none had."""
+"""What happens to a laboratory in mid-campaign: told, written down, and the end of a run that has lost its bench."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 
 from actors.protocols import BenchLostError, LaboratoryError, Notice
+from orchestrator.events import LogLine
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.lanes import LaneError
 from tests.orchestrator.scripted import Script, one_stage, pour, run, simulate, states
-from tests.orchestrator.toy import ToyBench, ToyLaboratory
+from tests.orchestrator.toy import ToyBench, ToyLaboratory, ToySimulators
 
 LOST = BenchLostError("arm: its machine bench-pc (10.0.0.3) was lost during 'execute'")
 
@@ -64,3 +65,12 @@ def test_what_happens_to_a_laboratory_is_in_the_journal(tmp_path):
     with JournalReader(tmp_path / JOURNAL_NAME) as journal:
         notes = [entry.body["text"] for entry in journal.entries(kinds=[Kind.NOTE])]
     assert notes == ["machine b (10.0.0.4) is lost"]
+
+
+@pytest.mark.parametrize(("simulators", "pointed_out"), [(2, False), (16, True)])
+def test_simulators_that_a_campaign_will_leave_idle_are_pointed_out(tmp_path, simulators, pointed_out):
+    seen: list[Any] = []
+    laboratory = ToyLaboratory(simulators=ToySimulators(size=simulators))
+    run(tmp_path, laboratory, stages=one_stage(Script(simulate(1))), watchers=[seen.append])
+    lines = [event.text for event in seen if isinstance(event, LogLine)]
+    assert any("14 will have nothing to do" in line for line in lines) == pointed_out
