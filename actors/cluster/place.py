@@ -61,21 +61,20 @@ class Place:
 
     async def is_gone(self) -> bool:
         """Whether the node has died. Ray itself takes fifteen seconds to be sure of that; a dead node's raylet refuses
-        connections at once."""
-        if self.node.id not in await asyncio.to_thread(living_nodes):
-            return True
+        connections at once. Where nobody answers, a lost packet is no death: Ray decides then."""
         try:
             _, writer = await asyncio.wait_for(
                 asyncio.open_connection(self.node.address, self.node.port), timeout=_PATIENCE
             )
+            writer.close()
+            await writer.wait_closed()
+            return False
         except ConnectionRefusedError:
             return True
         except (OSError, TimeoutError):
-            return False  # a lost packet is no death: Ray decides
-        writer.close()
-        with contextlib.suppress(OSError):
-            await writer.wait_closed()
-        return False
+            with contextlib.suppress(Exception):  # the head may be gone, too
+                return self.node.id not in await asyncio.to_thread(living_nodes)
+            return False
 
 
 def this_node() -> Place:

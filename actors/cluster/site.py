@@ -18,6 +18,9 @@ LOOK_INTERVAL = 2.0
 RESERVE_DEADLINE = 20.0
 """Longest time to get hold of the bench [s]."""
 
+CLOSE_DEADLINE = 10.0
+"""Longest time to give it back [s]."""
+
 
 @dataclass
 class Site:
@@ -55,10 +58,13 @@ class Site:
         Raises:
             LaboratoryError: no node has the bench's resource, or another program has it.
         """
-        self._nodes = await asyncio.to_thread(living_nodes)
         self.here = await asyncio.to_thread(this_node)
-        if need_bench:
-            self.bench = await self._reserve()
+        bench_node, options = await self._reserve() if need_bench else (None, {})
+        self._nodes = await asyncio.to_thread(living_nodes)
+        if bench_node is not None:
+            if bench_node not in self._nodes:
+                raise LaboratoryError(f"Ray cluster at {self.spec.address}: the bench's machine was lost; try again")
+            self.bench = Place(self._nodes[bench_node], options)
         self._watching = asyncio.create_task(self._watch())
         bench = "" if self.bench is None else f"; the bench is on {self.bench.node.host}"
         nodes = f"{len(self._nodes)} node(s), {self.cpus} core(s)"
@@ -72,11 +78,15 @@ class Site:
         if self._bundle is not None:
             from ray.util.placement_group import remove_placement_group
 
-            with contextlib.suppress(Exception):
-                await asyncio.to_thread(remove_placement_group, self._bundle)
+            with contextlib.suppress(Exception):  # Ray gives it back in any case, when this program is gone
+                await asyncio.wait_for(asyncio.to_thread(remove_placement_group, self._bundle), CLOSE_DEADLINE)
 
-    async def _reserve(self) -> Place:
-        """All of the bench's resource on one node: a second program can't move the same arm."""
+    async def _reserve(self) -> tuple[str, dict[str, Any]]:
+        """All of the bench's resource on one node: a second program can't move the same arm.
+
+        Returns:
+            The node's id, and what Ray has to be told to put an actor there.
+        """
         from ray.util.placement_group import placement_group, placement_group_table
         from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
@@ -87,9 +97,9 @@ class Site:
                 f"Ray cluster at {self.spec.address}: '{name}' can't be had; no node offers it, or another program has "
                 "the bench"
             )
-        id_ = (await asyncio.to_thread(placement_group_table, self._bundle))["bundles_to_node_id"][0]
+        node: str = (await asyncio.to_thread(placement_group_table, self._bundle))["bundles_to_node_id"][0]
         strategy = PlacementGroupSchedulingStrategy(self._bundle, placement_group_bundle_index=0)
-        return Place(self._nodes[id_], {"scheduling_strategy": strategy})
+        return node, {"scheduling_strategy": strategy}
 
     async def _watch(self) -> None:
         """Compare the nodes with those of the last look."""

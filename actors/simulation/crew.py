@@ -65,7 +65,8 @@ class Crew:
 
     async def greeted(self) -> list[Greeting]:
         """What the members say of themselves; waits for those that are starting."""
-        await asyncio.wait([member.greeted for member in self._members.values()])
+        if self._members:
+            await asyncio.wait([member.greeted for member in self._members.values()])
         return [member.greeting for member in self.up if member.greeting is not None]
 
     def grow(self, size: int) -> None:
