@@ -31,9 +31,10 @@ from typing import Any, cast
 from machine import ROOT, describe, run_self, say, show
 from standard_pour import check_particles
 
-from orchestrator.codec import digest, to_json
+from orchestrator.codec import digest
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign
+from orchestrator.fingerprint import fingerprint
 from orchestrator.flights import Flight, free_slots, next_to_tell
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
@@ -311,11 +312,11 @@ def main() -> None:
     same = [str(options.campaign.resolve()), f"--simulations={options.simulations}", f"--particles={options.particles}"]
     same += [f"--folds={options.folds}", f"--fold-simulations={options.fold_simulations}"]
     machine, kept, begun = describe(), Kept(fresh=options.fresh), time.monotonic()
-    decides = [plan.parallel_simulations, machine["fingerprint"]]
 
     def make(which: str) -> dict[str, Any]:
         one = job(calibration, options, which)
-        key = [*decides, to_json(one.calibration, CalibrationPlan), one.seed, one.splits]
+        decides = fingerprint(replace(plan, calibration=one.calibration, deployment=None))
+        key = [machine["fingerprint"], decides, one.seed, one.splits]
         return kept.get(key, lambda: run_self(__file__, *same, f"--one={which}"))
 
     with ThreadPoolExecutor(max(options.workers, 1)) as pool:
