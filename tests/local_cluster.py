@@ -86,6 +86,8 @@ class LocalCluster:
                 **self.environment,
                 **({} if cache is None else {"DECANT_CACHE_DIR": str(cache)}),
                 MARK: str(self.folder),
+                # a private Ray of this program, in an earlier test, may have turned it off
+                "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "1",
             },
             stdin=subprocess.DEVNULL,
             capture_output=True,

@@ -160,13 +160,13 @@ def test_a_closed_cup_holds_and_one_with_a_hole_drains(simulator: PourSimulator)
 def test_the_front_of_a_dam_break_runs_as_fast_as_in_the_experiment(simulator: PourSimulator) -> None:
     measurements, _ = dam_break.dam_break(0.05715, 10, suite.PLAIN)
     assert failures([m for m in measurements if m.name.startswith("slope")]) == []
-    with_delay = next(m for m in measurements if "with it" in m.name)
+    with_delay = next(m for m in measurements if "after the gate's delay" in m.name)
     assert with_delay.value < 0.10
 
 
 def test_cohesion_makes_a_cube_round_and_nothing_else_does(simulator: PourSimulator) -> None:
     free = SimulationParameters(cohesion=0.0, viscosity=0.0, friction=0.0)
-    measurement = droplet.cube_to_sphere(343, free)[0]
+    measurement = droplet.cube_to_sphere(1000, free)[0]
     assert measurement.passed
     axis = np.arange(10) - 4.5
     cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
@@ -199,10 +199,6 @@ def test_cases_are_found_by_name_and_a_wrong_name_lists_them() -> None:
 # What the solver did not reach when the case was written, by case: a case that begins to pass, or one that passes no
 # longer, fails the slow test, so that this list stays true.
 NOT_MET = {
-    "rest": "two to three times the kinetic energy that is asked for is left after a second",
-    "sloshing": "5 to 6 % too fast at all resolutions",
-    "torricelli": "particles' distance from the hole's edge makes it narrower: C_d 0.54 and 0.58",
-    "dam-break": "early fronts lead the experiment's by the time that its gate took; a slope that is 17 % too steep",
     "cohesion": "small drops creep back and do not oscillate",
 }
 
