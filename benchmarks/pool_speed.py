@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
 import statistics
 import subprocess
@@ -140,14 +141,21 @@ async def pour_in_pool(pool: RaySimulatorPool, particles: int, pours: int) -> Bl
 async def _processes(pool: RaySimulatorPool) -> tuple[list[psutil.Process], list[psutil.Process]]:
     """The pool's members, and what else Ray runs."""
     members = [psutil.Process(pid) for pid in await pool.pids()]
-    mine = psutil.Process().children(recursive=True)
-    ray = [p for p in mine if p not in members and "pool_speed" not in " ".join(p.cmdline())]
-    return members, ray
+    others = []
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # gone in between
+            if process not in members and "pool_speed" not in " ".join(process.cmdline()):
+                others.append(process)
+    return members, others
 
 
 def _cpu(processes: list[psutil.Process]) -> float:
-    times = [process.cpu_times() for process in processes if process.is_running()]
-    return sum(t.user + t.system for t in times)
+    total = 0.0
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            times = process.cpu_times()
+            total += times.user + times.system
+    return total
 
 
 async def throughput(options: argparse.Namespace) -> dict[str, Any]:
