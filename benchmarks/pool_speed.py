@@ -91,12 +91,19 @@ class Plain:
     def pour(self, particles: int, pours: int) -> Block:
         """Make so many pours, shared out evenly."""
         begun = time.perf_counter()
-        for k, process in enumerate(self._processes):
-            seeds = list(range(k, pours, len(self._processes)))
-            assert process.stdin is not None
-            process.stdin.write(json.dumps({"particles": particles, "seeds": seeds}) + "\n")
-            process.stdin.flush()
-        cpu = sum(float(cast("Any", process.stdout).readline()) for process in self._processes)
+        cpu = 0.0
+        try:
+            for k, process in enumerate(self._processes):
+                seeds = list(range(k, pours, len(self._processes)))
+                assert process.stdin is not None
+                process.stdin.write(json.dumps({"particles": particles, "seeds": seeds}) + "\n")
+                process.stdin.flush()
+            for process in self._processes:
+                assert process.stdout is not None
+                cpu += float(process.stdout.readline())
+        except (OSError, ValueError):
+            ends = [process.wait(timeout=10.0) for process in self._processes if process.poll() is not None]
+            raise SystemExit(f"a plain process has ended with {ends}; nothing to compare the pool with") from None
         return Block(time.perf_counter() - begun, cpu)
 
     def close(self) -> None:
