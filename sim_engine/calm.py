@@ -32,6 +32,9 @@ CALM = 0.06
 STEP = 0.02
 """Resolution, and what the begin is a multiple of [s]."""
 
+FALL = 2e-3
+"""A tilt that has come down so far is on its way back; less is the tremor of an arm that was read back [rad]."""
+
 
 def wave_height(velocities: Floats, step: float, radius: float) -> float:
     """Largest height of the waves in a cup that is moved about.
@@ -80,7 +83,7 @@ def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
 def _last_below(pourer: Vessel, volume: float, tilts: Floats) -> int:
     """Index up to which the level stays below the lip by the freeboard: bisection over the first rise of the tilt."""
     limit = -FREEBOARD * pourer.opening_radius
-    falls = np.append(np.diff(tilts) < -1e-9, True)
+    falls = np.append((np.maximum.accumulate(tilts) - tilts > FALL)[1:], True)
     low, high = 0, int(np.argmax(falls))
     if level(pourer, volume, float(tilts[0])) > limit:
         return 0

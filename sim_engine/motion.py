@@ -155,7 +155,7 @@ class PourMotion:
         return poses
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SampledMotion:
     """A motion read back from an arm: poses at times, interpolated in between.
 

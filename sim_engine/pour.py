@@ -140,7 +140,7 @@ class PourSimulator:
             check_holds(pourer, scene.liquid.volume)
         except VesselError as problem:
             raise InvalidSceneError(str(problem)) from None
-        motion = plan_motion(
+        motion: Motion = task.motion or plan_motion(
             scene, task.action, pourer, receiver, tilt_error=error.tilt, speed_factor=error.speed_factor
         )
         check_motion(motion, scene, task.action, pourer, receiver, error)

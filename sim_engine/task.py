@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from sim_engine.action import Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.vessel.spec import VesselSpec
+
+if TYPE_CHECKING:
+    from sim_engine.motion import SampledMotion
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,8 @@ class PourTask:
         seed: of the initial positions; same task, same seed → same bits on one CPU thread.
         record_rate: frames of all particles kept per simulated second; 0 keeps none.
         pose_error: deviations from the intended scene; None for a plain simulation.
+        motion: what an arm did, read back from it, in place of the motion planned for `action`; what of `pose_error`
+            changes a motion must then be in it already.
     """
 
     scene: Scene
@@ -80,3 +86,9 @@ class PourTask:
     seed: int
     record_rate: float = 0.0
     pose_error: PoseError | None = None
+    motion: SampledMotion | None = None
+
+    def __post_init__(self) -> None:
+        error = self.pose_error
+        if self.motion is not None and error is not None and (error.tilt != 0.0 or error.speed_factor != 1.0):
+            raise ValueError("an executed motion holds its own errors of tilt and speed; pose_error may only shift it")

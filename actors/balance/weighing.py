@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 from actors.balance.actor import DeviceBalance
 from actors.balance.errors import (
@@ -18,25 +16,11 @@ from actors.balance.errors import (
 from actors.balance.placement import Step, Weighed, measurement, weighing_uncertainty, weighings
 from actors.balance.spec import BalanceSpec
 from actors.balance.typed import typed_weight
+from actors.operator import Question
 from sim_engine.outcome import PourMeasurement
 
 MENDABLE = (NotStableError, OutOfRangeError, CommandError, UnitError)
 """Errors that a person beside the balance can mend and have tried again; nothing is lost by it."""
-
-
-@dataclass(frozen=True)
-class Question:
-    """Something to do and say, for the person beside the balance.
-
-    Attributes:
-        text: what to do; whole sentences.
-        wants: 'done' when it is done, a 'weight' with its unit, or 'yes' or 'no'.
-        problem: why it is asked again; '' the first time.
-    """
-
-    text: str
-    wants: Literal["done", "weight", "yes or no"]
-    problem: str = ""
 
 
 Ask = Callable[[Question], Awaitable[str]]
@@ -108,7 +92,9 @@ class Weighings:
         while True:
             answer = ""
             if step.hands or problem:
-                answer = await self._ask(Question(step.put, "weight" if typed else "done", problem))
+                answer = await self._ask(
+                    Question(step.put, "weight" if typed else "done", problem, about=step.key or step.do)
+                )
             try:
                 if typed:
                     self._weighed[step.key] = self._typed(answer)
@@ -133,7 +119,11 @@ class Weighings:
             weight = await self._balance.weigh()
         except ReferenceLostError as error:
             question = Question(
-                "Did the balance stay switched on, and does it still show this weight?", "yes or no", str(error)
+                "Did the balance stay switched on, and does it still show this weight?",
+                "yes or no",
+                str(error),
+                about="reference",
+                hands=False,
             )
             if (await self._ask(question)).strip().lower() not in ("yes", "y"):
                 raise

@@ -15,7 +15,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.calm import CALM, FREEBOARD, STEP, calm_until, liquid_velocity, wave_height
 from sim_engine.hydrostatics import level
 from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.motion import plan_motion
+from sim_engine.motion import SampledMotion, plan_motion
 from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.build import build_vessel
@@ -110,3 +110,15 @@ def test_leaving_the_beginning_out_changes_the_pour_by_less_than_seeds_do(monkey
     monkeypatch.setattr(pour_module, "calm_until", lambda *_: 0.0)
     whole = left()
     assert np.max(np.abs(late.mean(axis=0) - whole.mean(axis=0))) < 0.02
+
+
+def test_the_tremor_of_an_arm_that_was_read_back_does_not_move_the_begin() -> None:
+    motion = plan_motion(SCENE, action(40.0), POURER, RECEIVER)
+    times = np.arange(0.0, motion.duration, 0.008)
+    poses = motion.sample(times)
+    poses[:, :3] += np.random.default_rng(1).normal(0.0, 2e-5, (len(times), 3))
+    poses[:, 5] += np.random.default_rng(2).normal(0.0, 5e-5, len(times))
+    done = SampledMotion(times, poses)
+    planned = calm_until(motion, POURER, VOLUME)
+    assert planned > 0.0
+    assert calm_until(done, POURER, VOLUME) == pytest.approx(planned, abs=2.5 * STEP)

@@ -11,6 +11,7 @@ import pytest
 from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import retained_volume
 from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.motion import SampledMotion
 from sim_engine.pour import InvalidSceneError, PourSimulator, SimulationCancelled, SimulationRun
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.validation.at_rest import tall_column
@@ -231,3 +232,19 @@ def test_a_simulation_can_be_given_up(simulator: PourSimulator) -> None:
         simulator.simulate(task(), cancelled=cancelled)
     assert len(calls) == 3
     assert run(simulator).outcome.invalid is None  # and the simulator is ready for the next
+
+
+def test_what_an_arm_did_is_simulated_in_place_of_what_was_planned(
+    simulator: PourSimulator, plain: SimulationRun
+) -> None:
+    planned = simulator.prepare(task())
+    times = np.append(np.arange(0.0, planned.duration, 0.008), planned.duration)
+    same = simulator.simulate(replace(task(), motion=SampledMotion(times, planned.sample(times)))).outcome
+    assert same.fractions.spilled == pytest.approx(plain.outcome.fractions.spilled, abs=0.03)
+    assert same.fractions.poured == pytest.approx(plain.outcome.fractions.poured, abs=0.03)
+    # An arm that stopped early has poured less.
+    stopped = times[times < 0.45 * planned.duration]
+    half = simulator.simulate(replace(task(), motion=SampledMotion(stopped, planned.sample(stopped)))).outcome
+    assert half.fractions.retained > plain.outcome.fractions.retained + 0.05
+    with pytest.raises(ValueError, match="executed motion"):
+        replace(task(pose_error=PoseError(tilt=0.01)), motion=SampledMotion(times, planned.sample(times)))

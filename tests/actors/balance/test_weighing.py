@@ -11,8 +11,9 @@ from actors.balance.errors import ReferenceLostError
 from actors.balance.placement import Placement, WeighingError
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.spec import BalanceSpec
-from actors.balance.weighing import Question, Weighings
+from actors.balance.weighing import Weighings
 from actors.device import LocalDevice
+from actors.operator import Question
 from actors.protocols import LaboratoryError
 
 from .conftest import spec_for
