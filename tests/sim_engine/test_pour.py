@@ -243,8 +243,8 @@ def test_what_an_arm_did_is_simulated_in_place_of_what_was_planned(
     assert same.fractions.spilled == pytest.approx(plain.outcome.fractions.spilled, abs=0.03)
     assert same.fractions.poured == pytest.approx(plain.outcome.fractions.poured, abs=0.03)
     # An arm that stopped early has poured less.
-    stopped = times[times < 0.45 * planned.duration]
+    stopped = times[times < 1.1]  # at 66 of 120 degrees
     half = simulator.simulate(replace(task(), motion=SampledMotion(stopped, planned.sample(stopped)))).outcome
-    assert half.fractions.retained > plain.outcome.fractions.retained + 0.05
+    assert half.fractions.retained > plain.outcome.fractions.retained + 0.2
     with pytest.raises(ValueError, match="executed motion"):
         replace(task(pose_error=PoseError(tilt=0.01)), motion=SampledMotion(times, planned.sample(times)))
