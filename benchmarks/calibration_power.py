@@ -1,12 +1,14 @@
 """What calibration buys: parameter by parameter on recorded pours, and by cross-validation over all of them.
 
     python benchmarks/calibration_power.py [CAMPAIGN] [--seeds 11 12] [--simulations 108] [--particles 1000]
-                                           [--folds 8] [--fold-simulations 72] [--workers 1] [--fresh] [--json]
+                                           [--known wall_distance=1.5 lip_drop=0] [--folds 8]
+                                           [--fold-simulations 72] [--workers 1] [--fresh] [--json]
 
 Sets: the campaign's own calibration (C4), again and again with one more parameter to search and the same budget. What
 is not searched has the campaign's fixed value, or Decant's default, and `--particles`. θ* is then simulated on each
 recorded pour: mean |measured − simulated| of the normalised spillage on training, test and transfer pours. The first
-row calibrates nothing.
+row calibrates nothing. With `--known` a last row searches all but these, which have the values given: what somebody
+knows of the walls, say.
 
 Folds: all pours of the campaign's scene, by angular velocity, are dealt to the folds in turn, so that each has slow and
 fast ones. θ*, of what the campaign searches, comes of all other folds; the fold's pours judge it. Beside it what needs
@@ -64,15 +66,18 @@ def growing_sets() -> list[tuple[str, ...]]:
     return [tuple(name for step in STEPS[:k] for name in step) for k in range(len(STEPS) + 1)]
 
 
-def searching(plan: CalibrationPlan, names: Sequence[str], particles: int) -> CalibrationPlan:
+def searching(
+    plan: CalibrationPlan, names: Sequence[str], particles: int, known: Mapping[str, float] | None = None
+) -> CalibrationPlan:
     """The calibration that searches these parameters and no others.
 
     Args:
         names: not empty.
         particles: N where it is not searched.
+        known: values of parameters that are not searched, in place of the campaign's.
     """
     axes = {**RANGES, **{axis.name: axis for axis in plan.parameters.axes}}
-    fixed = {"particles": float(particles), **plan.fixed_parameters}
+    fixed = {"particles": float(particles), **plan.fixed_parameters, **(known or {})}
     return replace(
         plan,
         parameters=Space(tuple(axes[name] for name in names)),
@@ -195,9 +200,38 @@ def without_simulator(plan: CalibrationPlan, folds: Sequence[Sequence[int]]) -> 
     return {name: round(total / count, 4) for name, total in totals.items()}
 
 
-def set_row(names: Sequence[str], found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def wanted_sets(options: argparse.Namespace) -> list[tuple[tuple[str, ...], dict[str, float]]]:
+    """What each row searches, and what it takes as known.
+
+    Raises:
+        SystemExit: `--known` names no parameter, or gives no number that it may have.
+    """
+    sets: list[tuple[tuple[str, ...], dict[str, float]]] = [(names, {}) for names in growing_sets()]
+    known: dict[str, float] = {}
+    for text in options.known:
+        name, _, value = text.partition("=")
+        try:
+            known[name] = float(value)
+            SimulationParameters.from_values({name: known[name]})
+        except KeyError:
+            there_are = ", ".join(SimulationParameters.info())
+            raise SystemExit(f"--known {text}: no such parameter; there are {there_are}") from None
+        except ValueError as error:
+            raise SystemExit(f"--known {text}: {error}") from None
+    if known:
+        sets.append((tuple(name for name in sets[-1][0] if name not in known), known))
+    return sets
+
+
+def set_name(names: Sequence[str], known: Mapping[str, float]) -> str:
+    """As people read it."""
+    told = ", ".join(f"{name} {value:g}" for name, value in known.items())
+    return (" + ".join(names) or "nothing") + (f" (known: {told})" if told else "")
+
+
+def set_row(name: str, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A row of the first table: means over the seeds, and each seed's beside them."""
-    row: dict[str, Any] = {"searched": " + ".join(names) or "nothing"}
+    row: dict[str, Any] = {"searched": name}
     for split in SPLITS:
         values = [one["discrepancy"][split] for one in found if one["discrepancy"].get(split) is not None]
         row[split] = round(statistics.mean(values), 4) if values else None
@@ -252,6 +286,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, nargs="*", default=(11, 12), help="of the sets; none leaves them out")
     parser.add_argument("--simulations", type=int, help="budget of each set; the campaign's unless given")
     parser.add_argument("--particles", type=int, default=1_000, metavar="N", help="where they are not searched")
+    parser.add_argument(
+        "--known", nargs="*", default=[], metavar="NAME=VALUE", help="for a last row that searches the rest"
+    )
     parser.add_argument("--folds", type=int, default=8, help="0 leaves the cross-validation out")
     parser.add_argument("--fold-simulations", type=int, default=72, help="budget of each fold")
     parser.add_argument("--workers", type=int, default=1, help="calibrations at a time")
@@ -278,13 +315,13 @@ def job(calibration: CalibrationPlan, options: argparse.Namespace, which: str) -
         fold = dealt(calibration.records.pours if calibration.records else (), options.folds)[int(number)]
         changed = replace(without(calibration, fold), simulations=options.fold_simulations)
         return Job(changed, int(seed), f"fold {int(number) + 1} of {options.folds}", ("test",))
-    names = growing_sets()[int(number)]
+    names, known = wanted_sets(options)[int(number)]
     if names:
-        changed = replace(searching(calibration, names, options.particles), simulations=options.simulations)
+        changed = replace(searching(calibration, names, options.particles, known), simulations=options.simulations)
     else:
         fixed = {"particles": float(options.particles), **calibration.fixed_parameters}
         changed = replace(calibration, fixed_parameters=fixed, simulations=0)
-    return Job(changed, int(seed), f"{' + '.join(names) or 'nothing'}, seed {seed}", SPLITS)
+    return Job(changed, int(seed), f"{set_name(names, known)}, seed {seed}", SPLITS)
 
 
 def main() -> None:
@@ -306,10 +343,11 @@ def main() -> None:
         one = job(calibration, options, options.one)
         print(json.dumps(calibrate(replace(plan, calibration=one.calibration), one.seed, one.label, one.splits)))
         return
-    sets = growing_sets()
+    sets = wanted_sets(options)
     wanted = [f"set {k} {seed}" for seed in options.seeds for k in range(len(sets))]
     wanted += [f"fold {k} {plan.seed}" for k in range(options.folds)]
     same = [str(options.campaign.resolve()), f"--simulations={options.simulations}", f"--particles={options.particles}"]
+    same += ["--known", *options.known] if options.known else []
     same += [f"--folds={options.folds}", f"--fold-simulations={options.fold_simulations}"]
     machine, kept, begun = describe(), Kept(fresh=options.fresh), time.monotonic()
 
@@ -325,7 +363,7 @@ def main() -> None:
     result: dict[str, Any] = {"campaign": options.campaign.stem}
     if options.seeds:
         rows = [[found[f"set {k} {seed}"] for seed in options.seeds] for k in range(len(sets))]
-        result["sets"] = [set_row(names, row) for names, row in zip(sets, rows, strict=True)]
+        result["sets"] = [set_row(set_name(*one), row) for one, row in zip(sets, rows, strict=True)]
         result |= {"seeds": list(options.seeds), "simulations": options.simulations, "particles": options.particles}
     if options.folds:
         folds = dealt(calibration.records.pours, options.folds)

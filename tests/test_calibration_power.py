@@ -33,7 +33,7 @@ def calibration(power: ModuleType) -> CalibrationPlan:
 
 @pytest.fixture
 def options() -> argparse.Namespace:
-    return argparse.Namespace(folds=8, fold_simulations=9, simulations=10, particles=700)
+    return argparse.Namespace(folds=8, fold_simulations=9, simulations=10, particles=700, known=[])
 
 
 def test_every_pour_judges_once_and_slow_and_fast_ones_in_each_fold(
@@ -89,7 +89,7 @@ def found(train: float, test: float, errors: list[float]) -> dict[str, Any]:
 
 def test_rows_are_means_over_seeds_and_folds_weigh_pours_alike(power: ModuleType) -> None:
     two = [found(0.01, 0.02, [0.1]), found(0.03, 0.06, [0.2, 0.3, 0.4])]
-    row = power.set_row(("viscosity",), two)
+    row = power.set_row("viscosity", two)
     assert (row["train"], row["test"], row["transfer"], row["test_seeds"]) == (0.02, 0.04, None, [0.02, 0.06])
     assert (row["searched"], row["cpu_s"], row["thetas"][0]) == ("viscosity", 3.0, {"viscosity": 1.235})
     folds = power.fold_summary(two)
@@ -137,3 +137,15 @@ def test_what_can_t_be_measured_is_refused(power: ModuleType, monkeypatch: pytes
     quickstart = power.ROOT / "configs" / "campaigns" / "quickstart.yaml"
     assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
     assert refusal("nowhere.yaml") == "nowhere.yaml: no such file"
+
+
+def test_a_last_row_takes_some_parameters_as_known(
+    power: ModuleType, calibration: CalibrationPlan, options: argparse.Namespace
+) -> None:
+    options.known = ["wall_distance=1.5", "lip_drop=0"]
+    last = power.job(calibration, options, f"set {len(power.growing_sets())} 11").calibration
+    assert set(last.parameters.names) == {"particles", "cohesion", "viscosity", "friction"}
+    assert last.fixed_parameters == {"wall_distance": 1.5, "lip_drop": 0.0}
+    options.known = ["wall_distanse=1.5"]
+    with pytest.raises(SystemExit, match="wall_distanse"):
+        power.wanted_sets(options)
