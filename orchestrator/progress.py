@@ -6,10 +6,11 @@ at most one every two seconds.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -59,6 +60,7 @@ class ProgressDisplay:
         self._live: Live | None = None
         self._lock = threading.Lock()
         self._last_line = -float("inf")
+        self._held: list[str] | None = None
 
     def __enter__(self) -> ProgressDisplay:
         if self._console.is_terminal:
@@ -75,6 +77,25 @@ class ProgressDisplay:
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """While somebody is asked something: the bars are gone, and lines wait, but for warnings and errors."""
+        live, self._live = self._live, None
+        if live is not None:
+            live.transient = True  # the bars make room for the question
+            live.stop()
+        self._held = []
+        try:
+            yield
+        finally:
+            held, self._held = self._held, None
+            for text in held:
+                self._print(text)
+            if live is not None:
+                live.transient = False
+                live.start(refresh=True)
+                self._live = live
 
     def __call__(self, event: Event) -> None:
         """Take note of an event. Returns at once."""
@@ -108,6 +129,8 @@ class ProgressDisplay:
                 self._plain(event)
 
     def _plain(self, event: Event) -> None:
+        if self._held is not None:
+            return
         now = self._clock()
         if now - self._last_line < INTERVAL:
             return
@@ -125,6 +148,9 @@ class ProgressDisplay:
     def _print(self, text: str, look: str = "") -> None:
         from rich.text import Text
 
+        if self._held is not None and not look:
+            self._held.append(text)
+            return
         self._console.print(Text(text, style=look), soft_wrap=True)
 
     def _render(self) -> RenderableType:

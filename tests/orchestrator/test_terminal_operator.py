@@ -1,0 +1,212 @@
+"""The person at the bench is asked in the terminal: at a real pseudo-terminal, by typing."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import os
+import pty
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from actors.operator import OperatorSpec, Question
+from actors.protocols import LaboratoryError
+from orchestrator.events import LogLine
+from orchestrator.progress import ProgressDisplay
+from orchestrator.terminal_operator import TerminalOperator
+from tests.orchestrator import watched
+
+DONE = Question("Put the full pourer into the gripper.", "done")
+WEIGHT = Question("Weigh the pourer on the other balance.", "weight")
+PATIENT = OperatorSpec(reminder=30.0, deadline=60.0)
+
+
+class Keyboard:
+    """The other end of the operator's terminal."""
+
+    def __init__(self) -> None:
+        self.keys, self.terminal = pty.openpty()
+        self.screen = io.StringIO()
+
+    def type(self, text: str) -> None:
+        os.write(self.keys, text.encode())
+
+    async def shows(self, text: str) -> None:
+        """Wait until the screen shows it."""
+        async with asyncio.timeout(10.0):
+            while text not in self.screen.getvalue():
+                await asyncio.sleep(0.01)
+
+    def operator(self, spec: OperatorSpec = PATIENT) -> TerminalOperator:
+        return TerminalOperator(spec, stdin=self.terminal, out=self.screen)
+
+
+@pytest.fixture
+def keyboard() -> Iterator[Keyboard]:
+    made = Keyboard()
+    yield made
+    for end in (made.keys, made.terminal):
+        with contextlib.suppress(OSError):
+            os.close(end)
+
+
+def played(scene: Callable[[], Awaitable[None]]) -> None:
+    async def within() -> None:
+        async with asyncio.timeout(30.0):
+            await scene()
+
+    asyncio.run(within())
+
+
+def test_what_to_do_what_was_wrong_and_what_is_expected_stand_on_the_screen(keyboard: Keyboard) -> None:
+    question = Question(
+        DONE.text, "done", problem="the balance reads 3 g less than before", details={"load": "200 g", "pour": 3}
+    )
+
+    async def scene() -> None:
+        asking = asyncio.create_task(keyboard.operator().ask(question))
+        await keyboard.shows("> ")
+        keyboard.type("done\n")
+        assert await asking == "done"
+
+    played(scene)
+    shown = keyboard.screen.getvalue()
+    for text in (DONE.text, "the balance reads 3 g less", "load: 200 g", "pour: 3", "'done'", "'give up'", "\a"):
+        assert text in shown
+
+
+def test_enter_alone_and_keys_typed_before_the_question_confirm_nothing(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        keyboard.type("done\n")  # too early: meant for something else
+        await asyncio.sleep(0.1)
+        asking = asyncio.create_task(keyboard.operator().ask(DONE))
+        await keyboard.shows("> ")
+        await asyncio.sleep(0.2)
+        assert not asking.done()
+        keyboard.type("\n")
+        await asyncio.sleep(0.2)
+        assert not asking.done()
+        keyboard.type("what?\n")
+        await keyboard.shows("'what?' is no answer")
+        keyboard.type("  Done \n")
+        assert await asking == "done"
+
+    played(scene)
+
+
+def test_a_weight_needs_its_unit_and_is_echoed(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        asking = asyncio.create_task(keyboard.operator().ask(WEIGHT))
+        await keyboard.shows("> ")
+        keyboard.type("203.4\n")
+        await keyboard.shows("has no unit")
+        assert not asking.done()
+        keyboard.type("0,2034 kg\n")
+        assert await asking == "0,2034 kg"
+        assert "203.4 g" in keyboard.screen.getvalue().splitlines()[-1]
+
+    played(scene)
+
+
+def test_yes_and_no_are_told_apart_from_anything_else(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        operator = keyboard.operator()
+        for typed, answer in (("maybe\nn\n", "no"), ("YES\n", "yes")):
+            asking = asyncio.create_task(operator.ask(Question("Does it still show this weight?", "yes or no")))
+            await asyncio.sleep(0.1)
+            keyboard.type(typed)
+            assert await asking == answer
+
+    played(scene)
+
+
+def test_giving_up_ends_the_pour_with_the_question_that_it_was_given_up_at(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        asking = asyncio.create_task(keyboard.operator().ask(DONE))
+        await keyboard.shows("> ")
+        keyboard.type("Give  up\n")
+        with pytest.raises(LaboratoryError, match="given up by the operator at: Put the full pourer"):
+            await asking
+
+    played(scene)
+
+
+def test_nobody_answers_reminders_then_the_question_is_given_up(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        with pytest.raises(LaboratoryError, match="nobody answered within 1 s"):
+            await keyboard.operator(OperatorSpec(reminder=0.3, deadline=1.0)).ask(DONE)
+
+    played(scene)
+    shown = keyboard.screen.getvalue()
+    assert 1 <= shown.count("still waiting") <= 3
+    assert shown.count("\a") == 1 + shown.count("still waiting")
+
+
+def test_ctrl_d_once_is_a_slip_and_a_closed_terminal_ends_the_question(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        operator = keyboard.operator()
+        asking = asyncio.create_task(operator.ask(DONE))
+        await keyboard.shows("> ")
+        keyboard.type("\x04")
+        await keyboard.shows("still open")
+        keyboard.type("done\n")
+        assert await asking == "done"
+        asking = asyncio.create_task(operator.ask(DONE))
+        await asyncio.sleep(0.1)
+        os.close(keyboard.keys)
+        with pytest.raises(LaboratoryError, match="terminal was closed"):
+            await asking
+
+    played(scene)
+
+
+def test_the_program_goes_on_while_nobody_types_and_a_question_can_be_cancelled(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        operator = keyboard.operator()
+        asking = asyncio.create_task(operator.ask(DONE))
+        await keyboard.shows("> ")
+        asking.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asking
+        asking = asyncio.create_task(operator.ask(DONE))  # the terminal was let go of
+        await asyncio.sleep(0.1)
+        keyboard.type("d\n")
+        assert await asking == "done"
+
+    played(scene)
+
+
+def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:
+    answers = tmp_path / "answers"
+    answers.write_text("done\ndone\n")
+    with answers.open() as piped:
+
+        async def scene() -> None:
+            with pytest.raises(LaboratoryError, match="no terminal"):
+                await TerminalOperator(PATIENT, stdin=piped.fileno(), out=io.StringIO()).ask(DONE)
+
+        played(scene)
+
+
+def test_progress_makes_room_for_a_question_and_goes_on_after_it() -> None:
+    plan = watched.campaign()
+    console = Console(file=io.StringIO(), force_terminal=True, width=150, highlight=False)
+
+    def written() -> str:
+        return str(console.file.getvalue())  # type: ignore[attr-defined]
+
+    with ProgressDisplay(plan, console=console) as display:
+        with display.paused():
+            before = len(written())
+            display(LogLine(level="info", text="a simulator has joined"))
+            display(LogLine(level="error", text="the balance is gone"))
+            asked = written()[before:]
+            assert "the balance is gone" in asked
+            assert "joined" not in asked
+        after = written()[before:]
+        assert "a simulator has joined" in after
+        assert "0 simulations" in after  # the bars are back
