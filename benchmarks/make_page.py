@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import page_figures
+import page_many
 import page_sections as sections
 from machine import ROOT, run_self, say
 
@@ -69,11 +70,11 @@ def page_text(records: dict[str, Any], tried: str) -> str:
         sections.beside_the_peer(pours),
         sections.passes(records.get("profile"), records.get("core-limit")),
         sections.cost(scaling),
-        sections.scenes(records.get("scenes")),
+        page_many.scenes(records.get("scenes")),
         sections.memory(scaling),
         sections.start_up(records.get("start-up")),
-        sections.pool(records.get("pool")),
-        sections.gpu(records.get("gpu")),
+        page_many.pool(records.get("pool")),
+        page_many.gpu(records.get("gpu")),
     ]
     if tried.strip():
         parts.append(re.sub(r"<!--.*?-->\n*", "", tried, flags=re.DOTALL).strip() + "\n")

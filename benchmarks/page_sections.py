@@ -199,14 +199,6 @@ def cost(record: Record | None) -> str:
 {settings([record])}"""
 
 
-def scenes(record: Record | None) -> str:
-    """Pours per minute against the number of scenes in one call."""
-    title = "Number of scenes"
-    if record is None:
-        return f"## {title}\n\nOne call simulates one pour; several at once run in several processes (see below).\n"
-    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
-
-
 def memory(record: Record | None) -> str:
     """Resident memory."""
     title = "Memory"
@@ -250,22 +242,6 @@ def start_up(record: Record | None) -> str:
 
 {table(("", "answer after", *phases), rows, "lr" + "r" * len(phases))}
 {settings([record])}"""
-
-
-def pool(record: Record | None) -> str:
-    """What `pool_speed.py` found."""
-    title = "Pool and cluster"
-    if record is None:
-        return missing(title, "pool_speed.py")
-    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
-
-
-def gpu(record: Record | None) -> str:
-    """What a GPU does with batches."""
-    title = "GPU"
-    if record is None:
-        return f"## {title}\n\nNot measured: no GPU was available.\n"
-    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
 
 
 def missing(title: str, command: str) -> str:

@@ -207,7 +207,7 @@ def test_page_shows_a_result_of_any_shape() -> None:
 
     rows = [{"batch": 1, "pours_per_min": 30.25}, {"batch": 1024, "pours_per_min": 2100.0}]
     result = {"busy_fraction": 0.98751, "nodes": {"lost": True}, "rows": rows, "machine": MACHINE}
-    page = make_page.page_text({"pool": {"command": "python pool", "result": result}}, "")
+    page = make_page.page_text({"gpu": {"command": "python batches", "result": result}}, "")
     assert "| busy fraction | 0.9875 |" in page
     assert "nodes:\n\n" in page
     assert "| lost | yes |" in page

@@ -1,0 +1,75 @@
+"""Sections of the performance page about many pours: in one call, in a pool, on a GPU."""
+
+from __future__ import annotations
+
+from page_sections import Record, facts, missing, prose, seconds, settings, table
+
+
+def scenes(record: Record | None) -> str:
+    """Pours per minute against the number of scenes in one call."""
+    title = "Number of scenes"
+    if record is None:
+        return missing(title, "batches.py")
+    r = record["result"]
+    rows = [
+        (
+            str(row["scenes"]),
+            seconds(row["cpu_s_per_pour"]),
+            seconds(row["alone_cpu_s_per_pour"]),
+            f"{row['cpu_over_alone']:.2f}",
+            f"{row['pours_per_minute']:.0f}",
+            f"{row['process_mb']:,}",
+        )
+        for row in r["batches"]
+    ]
+    head = ("scenes in a call", "CPU s a pour", "one by one", "ratio", "pours a minute", "process [MB]")
+    about = prose(
+        f"""Standard pours with {r["particles"]:,} particles, many in one call beside the same pours one by one, in the
+        same process ({r["backend"]}). On a CPU the scenes of a call follow each other, so that a call costs what its
+        pours cost, and memory does not grow with it."""
+    )
+    return f"## {title}\n\n{about}\n\n{table(head, rows, 'rrrrrr')}\n{settings([record])}"
+
+
+def pool(record: Record | None) -> str:
+    """What `pool_speed.py` found."""
+    title = "Pool and cluster"
+    if record is None:
+        return missing(title, "pool_speed.py")
+    r = record["result"]
+    about = prose(
+        f"""{r["workers"]} simulators of the pool (Ray actors) beside {r["workers"]} plain processes without Ray,
+        the same {r["pours"]} standard pours with {r["particles"]:,} particles each, in turns, in one go; medians.
+        Overhead is what a worker's time holds beside simulating, by the number of simulations, while all had work."""
+    )
+    rows = [
+        ("pours a minute, pool", f"{r['pours_per_minute_pool']:.0f}", "", ""),
+        ("pours a minute, plain processes", f"{r['pours_per_minute_plain']:.0f}", "", ""),
+        ("pool over plain", f"**{r['throughput_ratio']:.3f}**", "≥ 0.95", _met(r["throughput_met"])),
+        ("the same by CPU seconds", f"{r['throughput_ratio_by_cpu']:.3f}", "", ""),
+        ("workers busy while work was queued", f"{100 * r['busy_fraction']:.1f} %", "", ""),
+        ("CPU of everything beside the workers", f"{100 * r['cpu_beside_the_workers']:.1f} %", "", ""),
+        (
+            f"overhead a simulation, pours of {r['tiny_pour_ms']:.0f} ms",
+            f"**{r['overhead_ms']:.1f} ms**",
+            "≤ 10 ms",
+            _met(r["overhead_met"]),
+        ),
+        ("the same with a simulator that does nothing", f"{r['empty_overhead_ms']:.1f} ms", "", ""),
+        ("one such simulation, there and back", f"{r['empty_round_trip_ms']:.1f} ms", "", ""),
+        ("first answer after opening a laboratory", f"{r['start_s']['first answer after opening']:.1f} s", "", ""),
+    ]
+    shown = table(("", "", "required", ""), rows, "lrll")
+    return f"## {title}\n\n{about}\n\n{shown}\n{settings([record])}"
+
+
+def gpu(record: Record | None) -> str:
+    """What a GPU does with batches."""
+    title = "GPU"
+    if record is None:
+        return f"## {title}\n\nNot measured: no GPU was available.\n"
+    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
+
+
+def _met(met: bool) -> str:
+    return "met" if met else "**missed**"
