@@ -59,6 +59,8 @@ class TerminalOperator:
         self._stdin = stdin
         self._out = out
         self._one_question = asyncio.Lock()
+        self._open: Question | None = None
+        self._reminded = 0.0
 
     async def ask(self, question: Question) -> str:
         """See `Operator.ask`.
@@ -69,17 +71,24 @@ class TerminalOperator:
         async with self._one_question:
             with self._paused(), _Lines(self._stdin) as lines:
                 self._write(f"\a\n{_worded(question)}\n{self._expected(question)}\n> ")
-                return await self._answer(question, lines)
+                self._open, self._reminded = question, asyncio.get_running_loop().time()
+                try:
+                    return await self._answer(question, lines)
+                finally:
+                    self._open = None
 
     async def tell(self, text: str) -> None:
-        """See `Operator.tell`."""
-        self._write(f"{text}\n")
+        """See `Operator.tell`. What is said while a question is open is a reminder: it rings, and asks again."""
+        if self._open is None:
+            self._write(f"{text}\n")
+            return
+        self._reminded = asyncio.get_running_loop().time()
+        self._write(f"\a\n{text}\n{_EXPECTED[self._open.wants]}\n> ")
 
     async def _answer(self, question: Question, lines: _Lines) -> str:
         loop = asyncio.get_running_loop()
         begin = loop.time()
         ends = 0
-        reminded = begin
         while True:
             left = begin + self._spec.deadline - loop.time()
             if left <= 0.0:
@@ -88,13 +97,13 @@ class TerminalOperator:
                     f"nobody answered within {_time(self._spec.deadline)}: {question.text} Nothing moves until the run "
                     "is resumed"
                 )
-            wait = min(left, max(reminded + self._spec.reminder - loop.time(), 0.0))
+            wait = min(left, max(self._reminded + self._spec.reminder - loop.time(), 0.0))
             try:
                 line = await lines.next(wait)
             except TimeoutError:
-                reminded = loop.time()
-                if begin + self._spec.deadline > reminded:
-                    self._remind(question, begin + self._spec.deadline - reminded)
+                left = begin + self._spec.deadline - loop.time()
+                if left > 0.0 and loop.time() >= self._reminded + self._spec.reminder:
+                    await self.tell(f"still waiting, {_time(left)} left: {question.text}")
                 continue
             except EOFError:
                 ends += 1
@@ -104,7 +113,7 @@ class TerminalOperator:
                 continue
             ends = 0
             if line.strip():
-                reminded = loop.time()  # somebody is there
+                self._reminded = loop.time()  # somebody is there
             understood = self._understood(question, line)
             if understood is not None:
                 return understood
@@ -133,9 +142,6 @@ class TerminalOperator:
         return (
             f"{_EXPECTED[question.wants]}; nothing moves before that" if question.hands else _EXPECTED[question.wants]
         )
-
-    def _remind(self, question: Question, left: float) -> None:
-        self._write(f"\a\nstill waiting, {_time(left)} left: {question.text}\n{_EXPECTED[question.wants]}\n> ")
 
     def _write(self, text: str) -> None:
         out = self._out or sys.stderr
