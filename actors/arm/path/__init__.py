@@ -1,0 +1,1 @@
+"""From a pour to the joints of an arm: planned, and checked as a whole before the first movement."""

@@ -1,0 +1,123 @@
+"""Between the frames of a pour (`actors.arm.spec`): where the flange has to be for a pourer's pose, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from actors.arm.path.kinematics import MODELS, forward
+from actors.arm.spec import Pose, UrArmSpec
+from sim_engine.contact import rotations
+from sim_engine.motion import SampledMotion
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Rotations and positions of one or many frames in another.
+
+    Attributes:
+        rotation: shape (..., 3, 3).
+        position: shape (..., 3) [m].
+    """
+
+    rotation: FloatArray
+    position: FloatArray
+
+    def __matmul__(self, inner: Frames) -> Frames:
+        """`inner`, given in this frame, seen from where this one is given."""
+        return Frames(self.rotation @ inner.rotation, self.apply(inner.position))
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """Points of this frame, shape (..., 3), seen from where it is given [m]."""
+        moved: FloatArray = (self.rotation @ points[..., None])[..., 0] + self.position
+        return moved
+
+    @property
+    def inverse(self) -> Frames:
+        """What undoes it."""
+        back = np.swapaxes(self.rotation, -1, -2)
+        return Frames(back, -(back @ self.position[..., None])[..., 0])
+
+
+def frame_of(pose: Pose) -> Frames:
+    """A pose with a rotation vector as a frame."""
+    turn = Rotation.from_rotvec([pose.rx, pose.ry, pose.rz]).as_matrix()
+    return Frames(np.asarray(turn, dtype=float), np.array([pose.x, pose.y, pose.z]))
+
+
+@dataclass(frozen=True, eq=False)
+class CellFrames:
+    """What stays where it is during a pour.
+
+    Attributes:
+        world: in the base's frame.
+        tool: TCP in the flange's frame.
+        pourer: in the flange's frame.
+    """
+
+    world: Frames
+    tool: Frames
+    pourer: Frames
+
+
+@lru_cache(maxsize=32)
+def cell_frames(spec: UrArmSpec) -> CellFrames:
+    """The fixed frames of a cell."""
+    turn = Rotation.from_euler("z", spec.cell.direction).as_matrix()
+    tool = frame_of(spec.tool)
+    return CellFrames(
+        Frames(np.asarray(turn, dtype=float), np.array(spec.cell.receiver)), tool, tool @ frame_of(spec.grip)
+    )
+
+
+def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Frames:
+    """Where the flange has to be in the base's frame.
+
+    Args:
+        poses: of the pourer in the world, shape (T, 7): x y z [m], qw qx qy qz.
+        spec: of the arm and its cell.
+    """
+    cell = cell_frames(spec)
+    return cell.world @ Frames(rotations(poses), poses[:, :3]) @ cell.pourer.inverse
+
+
+def pourer_frames(joints: FloatArray, spec: UrArmSpec) -> Frames:
+    """Where the pourer is in the base's frame for joints (T, 6) [rad]."""
+    return Frames(*forward(joints, MODELS[spec.model])) @ cell_frames(spec).pourer
+
+
+def quaternions(rotation: FloatArray) -> FloatArray:
+    """Unit quaternions (T, 4), w first, of rotation matrices (T, 3, 3); the first has w ≥ 0, then without jumps."""
+    q = np.roll(np.asarray(Rotation.from_matrix(rotation).as_quat(), dtype=float), 1, axis=-1)
+    with_last = np.sum(q[1:] * q[:-1], axis=-1)
+    sign = np.cumprod(np.where(with_last < 0.0, -1.0, 1.0))
+    first = -1.0 if q[0, 0] < 0.0 else 1.0
+    signed: FloatArray = q * first * np.concatenate([[1.0], sign])[:, None]
+    return signed
+
+
+def pourer_motion(joints: FloatArray, times: FloatArray, spec: UrArmSpec, *, grip_tilt: float = 0.0) -> SampledMotion:
+    """What an arm's encoders say the pourer did.
+
+    Args:
+        joints: shape (T, 6) [rad].
+        times: of the readings, shape (T,), increasing from 0 [s].
+        spec: of the arm and its cell.
+        grip_tilt: the pourer sits in the fingers turned by so much about its own y axis, hence more tilted, about the
+            tool centre point [rad]. An arm can't know it: for the hidden reality of a virtual bench.
+
+    Returns:
+        The pourer in the world.
+    """
+    cell = cell_frames(spec)
+    grip = cell.tool.inverse @ cell.pourer
+    slipped = grip.rotation @ Rotation.from_euler("y", grip_tilt).as_matrix() @ grip.rotation.T
+    held = cell.tool @ Frames(slipped, np.zeros(3)) @ grip
+    frames = cell.world.inverse @ Frames(*forward(joints, MODELS[spec.model])) @ held
+    return SampledMotion(times, np.concatenate([frames.position, quaternions(frames.rotation)], axis=-1))
