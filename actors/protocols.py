@@ -22,6 +22,17 @@ class BenchLostError(LaboratoryError):
     """The bench's machine is gone: no pour can be made until it is back. Nobody knows what came of one under way."""
 
 
+class NotPouredError(LaboratoryError):
+    """The pour did not begin, and nothing was poured: it may be made once a person has seen to what is said here."""
+
+
+class UnknownPourError(LaboratoryError):
+    """A pour had begun and did not go as it should: a person has to say what came of it, and software never pours anew.
+
+    The text says where it stopped, and what could still be weighed.
+    """
+
+
 class InvalidActionError(LaboratoryError):
     """The vessels would touch, or the motion can't be made: refused before anything moved or was simulated."""
 
@@ -114,7 +125,9 @@ class Bench(Protocol):
 
         Raises:
             InvalidActionError: refused before anything moved.
-            LaboratoryError: it failed after something had moved: what was poured is unknown.
+            NotPouredError: it did not begin; nothing was poured, and it may be asked for again.
+            UnknownPourError: it began, and a person has to say what came of it.
+            LaboratoryError: it failed after something had moved, and counts as failed.
             BenchLostError: so is the bench; nothing more can be poured.
         """
         ...
@@ -130,9 +143,14 @@ class Optimizer(Protocol):
 
 @dataclass(frozen=True)
 class Notice:
-    """Something that happened to a laboratory, in words for people."""
+    """Something that happened to a laboratory, in words for people.
 
-    level: Literal["info", "warning", "error"]
+    Attributes:
+        level: how much it matters; a 'note' is written into the journal and not shown.
+        text: whole sentences.
+    """
+
+    level: Literal["note", "info", "warning", "error"]
     text: str
 
 

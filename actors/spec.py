@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from actors.arm.spec import UrArmSpec
+from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
+from actors.operator import OperatorSpec
 
 
 @dataclass(frozen=True)
@@ -26,11 +29,14 @@ class LaboratorySpec:
 
     Attributes:
         simulators: size of the pool; 0: one per core, of this machine or of the cluster.
-        bench: None where the laboratory can't pour.
-        mode: 'virtual', the only one yet.
+        bench: what is hidden on a virtual bench; None on hardware, and where the laboratory can't pour.
+        mode: 'virtual' or 'hardware'.
         in_process: everything in threads of one process, without Ray.
         object_store_mb: a private Ray's shared memory for results [MiB]; Ray takes no less than 80.
         ray: the cluster to join; None for a private Ray on this machine.
+        arm: reached over its controller's wires, virtual or not; None for a bench of numbers, or none.
+        balance: beside the arm; its time scale is the bench's.
+        operator: beside the arm.
     """
 
     name: str
@@ -40,3 +46,11 @@ class LaboratorySpec:
     in_process: bool = False
     object_store_mb: int = 160
     ray: RaySpec | None = None
+    arm: UrArmSpec | None = None
+    balance: BalanceSpec | None = None
+    operator: OperatorSpec = field(default_factory=lambda: OperatorSpec(answers="virtual"))
+
+    @property
+    def pours(self) -> bool:
+        """Whether there is a bench."""
+        return self.arm is not None or self.bench is not None

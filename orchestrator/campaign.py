@@ -268,7 +268,8 @@ class _Run:
         """Something happened to the laboratory: written down, and shown."""
         with contextlib.suppress(RunError):  # a full disk ends the run with the next write that matters
             self._journal.append(Kind.NOTE, {"text": notice.text})
-        self._watchers.log(notice.level, notice.text)
+        if notice.level != "note":
+            self._watchers.log(notice.level, notice.text)
 
     def _enter(self, state: State, reason: str = "") -> None:
         if state is self._state:

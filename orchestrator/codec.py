@@ -14,6 +14,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -111,7 +112,7 @@ def to_json(value: Any, hint: Any = Any) -> Any:
         return hint(value)
     if not isinstance(value, hint):
         raise CodecError(f"expected {hint.__name__}, got {type(value).__name__}")
-    if issubclass(hint, Path):
+    if issubclass(hint, Path | StrEnum):
         return str(value)
     if issubclass(hint, BaseModel):
         return typing.cast(BaseModel, value).model_dump(mode="json")
@@ -150,6 +151,9 @@ def from_json(data: Any, hint: Any = Any) -> Any:
         _expect(data, hint)
         return data
     if isinstance(hint, type) and issubclass(hint, Path):
+        return hint(data)
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        _expect(data, str)
         return hint(data)
     if isinstance(hint, type) and issubclass(hint, BaseModel):
         return hint.model_validate(data)

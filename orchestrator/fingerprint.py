@@ -17,8 +17,11 @@ _FREE = ("source", "outputs", "resolved", "on_unknown")
 _TOLD = ("surface_tension", "dynamic_viscosity")
 """Properties of a liquid that decide which warnings are given, and no request."""
 
-_MACHINE = ("simulators", "in_process", "object_store_mb", "ray")
-"""Fields of a laboratory that belong to the machine, not to the campaign."""
+_MACHINE = ("simulators", "in_process", "object_store_mb", "ray", "operator")
+"""Fields of a laboratory that belong to the machine or to who stands beside it, not to the campaign."""
+
+_WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "handshake", "reconnect_time")}
+"""Of its parts: a controller may get another address, a balance another socket."""
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
@@ -32,6 +35,15 @@ def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
         data.pop(name, None)
     for name in _MACHINE:
         data["laboratory"].pop(name, None)
+    for part, names in _WIRES.items():
+        table = data["laboratory"]
+        for key in part.split("."):
+            table = (table or {}).get(key)
+        for name in names:
+            (table or {}).pop(name, None)
+    for part in ("arm", "balance"):  # a run from before there were any may be gone on with
+        if data["laboratory"].get(part) is None:
+            data["laboratory"].pop(part, None)
     return cast("dict[str, Any]", _by_content(data))
 
 

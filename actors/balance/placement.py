@@ -67,6 +67,7 @@ class Step:
         key: of the weighing; '' for other steps.
         by: who gives the number: the 'balance' that stands here, or the 'operator', who types it.
         hands: whether somebody has to do something first; else it is done at once, before anything drifts or dries.
+        about: what it is about, for programs, where it has no key.
     """
 
     do: Literal["tare", "weigh", "pour"]
@@ -75,6 +76,7 @@ class Step:
     key: str = ""
     by: Literal["balance", "operator"] = "balance"
     hands: bool = True
+    about: str = ""
 
 
 @dataclass(frozen=True)
@@ -93,33 +95,33 @@ _LOADED = {"pourer_full": 1.0, "pourer_empty": -1.0}
 _RETAINED = {"pourer_after": 1.0, "pourer_empty": -1.0}
 
 
-def _tare(put: str, when: When, *, hands: bool = True) -> Step:
-    return Step("tare", put, when, hands=hands)
+def _tare(about: str, put: str, when: When, *, hands: bool = True) -> Step:
+    return Step("tare", put, when, hands=hands, about=about)
 
 
 _PLANS: dict[Placement, _Plan] = {
     Placement.TRAY: _Plan(
         (
-            _tare("Leave the wiped tray on the balance, with nothing on it.", "before"),
+            _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
             Step("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
             Step("weigh", "Fill the pourer and put it on the tray." + _PUT_BACK, "before", "pourer_full"),
-            _tare("Wipe the tray, and put the receiver on its stand; it must not touch the tray.", "before"),
+            _tare("set_up", "Wipe the tray, and put the receiver on its stand; it must not touch the tray.", "before"),
             _POUR,
             Step("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled", hands=False),
-            _tare("Leave the spill on the tray.", "after", hands=False),
+            _tare("spill_left", "Leave the spill on the tray.", "after", hands=False),
             Step("weigh", "Put the pourer on the tray, beside what lies there.", "after", "pourer_after"),
         ),
         {"loaded": _LOADED, "spilled": {"spilled": 1.0}, "retained": _RETAINED},
     ),
     Placement.RECEIVER: _Plan(
         (
-            _tare("Take everything off the balance.", "before"),
+            _tare("cleared", "Take everything off the balance.", "before"),
             Step("weigh", _DRY, "once", "pourer_empty"),
             Step("weigh", _FULL + _PUT_BACK, "before", "pourer_full"),
-            _tare("Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
+            _tare("set_up", "Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
             _POUR,
             Step("weigh", "Touch nothing: what is in the receiver is weighed.", "after", "received", hands=False),
-            _tare("Take everything off the balance, and wipe its pan.", "after"),
+            _tare("cleared_after", "Take everything off the balance, and wipe its pan.", "after"),
             Step("weigh", "Put the pourer on the balance, alone.", "after", "pourer_after"),
         ),
         {
@@ -131,11 +133,11 @@ _PLANS: dict[Placement, _Plan] = {
     ),
     Placement.EVERYTHING: _Plan(
         (
-            _tare("Leave the wiped tray on the balance, with nothing on it.", "before"),
+            _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
             Step("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
             Step("weigh", "Fill the pourer and put it on the tray." + _PUT_BACK, "before", "pourer_full"),
             Step("weigh", "Put the empty receiver on the tray, where it will stand.", "before", "receiver_empty"),
-            _tare("Leave tray and receiver as they are.", "before", hands=False),
+            _tare("set_up", "Leave tray and receiver as they are.", "before", hands=False),
             _POUR,
             Step("weigh", "Touch nothing: what was poured is weighed.", "after", "poured", hands=False),
             Step(

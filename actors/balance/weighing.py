@@ -22,6 +22,8 @@ from sim_engine.outcome import PourMeasurement
 MENDABLE = (NotStableError, OutOfRangeError, CommandError, UnitError)
 """Errors that a person beside the balance can mend and have tried again; nothing is lost by it."""
 
+AGAIN = "The balance can't be used as it is. Mend it, and leave what is on it. Is it mended, to be tried again?"
+
 
 Ask = Callable[[Question], Awaitable[str]]
 """Asks a person and awaits the answer; raises `LaboratoryError` where none comes, or the pour is given up."""
@@ -35,12 +37,20 @@ class Weighings:
         balance: None where the operator types all weights.
         ask: asks the operator.
         known: weighings of an earlier pour with the same vessels that still hold, see `lasting`.
+        weighed: told of each weighing at once, with its key: so that it is kept whatever comes after.
+        nominal: load that is asked for [kg]; a pourer filled otherwise is filled anew, before anything is poured.
     """
 
     def __init__(
-        self, spec: BalanceSpec, balance: DeviceBalance | None, ask: Ask, known: Mapping[str, Weighed] | None = None
+        self,
+        spec: BalanceSpec,
+        balance: DeviceBalance | None,
+        ask: Ask,
+        known: Mapping[str, Weighed] | None = None,
+        weighed: Callable[[str, Weighed], None] = lambda key, weight: None,
+        nominal: float | None = None,
     ) -> None:
-        self._spec, self._balance, self._ask = spec, balance, ask
+        self._spec, self._balance, self._ask, self._tell, self._nominal = spec, balance, ask, weighed, nominal
         self._known = dict(known or {})
         self._steps = weighings(spec.placement, known=self._known, pourer_elsewhere=spec.pourer_elsewhere)
         self._weighed: dict[str, Weighed] = {}
@@ -51,11 +61,16 @@ class Weighings:
         once = {step.key: self._weighed[step.key] for step in self._steps if self._lasts(step)}
         return self._known | once
 
+    @property
+    def weighed(self) -> dict[str, Weighed]:
+        """All weighings so far, those of earlier pours that still hold included."""
+        return self._known | self._weighed
+
     async def before(self) -> None:
         """All steps before the pour.
 
         Raises:
-            BalanceError: what nobody beside the balance can mend, e.g. no connection.
+            BalanceError: what the operator could not mend, e.g. no connection.
             LaboratoryError: whatever `ask` raises.
         """
         for step in self._steps[: self._pour]:
@@ -76,7 +91,7 @@ class Weighings:
             WeighingError: they are incomplete, or can't all be right.
         """
         return measurement(
-            self._spec.placement, self._known | self._weighed, nominal=nominal, tolerance=self._spec.load_tolerance
+            self._spec.placement, self.weighed, nominal=nominal, tolerance=self._spec.load_tolerance
         )
 
     @property
@@ -93,16 +108,39 @@ class Weighings:
             answer = ""
             if step.hands or problem:
                 answer = await self._ask(
-                    Question(step.put, "weight" if typed else "done", problem, about=step.key or step.do)
+                    Question(step.put, "weight" if typed else "done", problem, about=step.key or step.about)
                 )
             try:
                 if typed:
-                    self._weighed[step.key] = self._typed(answer)
+                    self._note(step.key, self._typed(answer))
                 else:
                     await self._read(step)
-                return
+                problem = self._misfilled(step)
+                if not problem:
+                    return
             except (*MENDABLE, ValueError) as error:
                 problem = str(error)
+            except ReferenceLostError:
+                raise  # asked already
+            except BalanceError as error:
+                question = Question(AGAIN, "yes or no", str(error), about="balance")
+                if self._balance is None or not _is_yes(await self._ask(question)):
+                    raise
+                problem = ""
+
+    def _misfilled(self, step: Step) -> str:
+        """What is wrong with the load that was just weighed; '' if nothing is."""
+        if step.key != "pourer_full" or self._nominal is None:
+            return ""
+        loaded = self.weighed["pourer_full"].mass - self.weighed["pourer_empty"].mass
+        if abs(loaded - self._nominal) <= self._spec.load_tolerance:
+            return ""
+        allowed = f"{1e3 * self._nominal:g} ± {1e3 * self._spec.load_tolerance:g} g"
+        return f"{1e3 * loaded:.2f} g are in the pourer, but {allowed} are asked for; fill anew"
+
+    def _note(self, key: str, weighed: Weighed) -> None:
+        self._weighed[key] = weighed
+        self._tell(key, weighed)
 
     def _typed(self, answer: str) -> Weighed:
         typed = typed_weight(answer)
@@ -125,12 +163,16 @@ class Weighings:
                 about="reference",
                 hands=False,
             )
-            if (await self._ask(question)).strip().lower() not in ("yes", "y"):
+            if not _is_yes(await self._ask(question)):
                 raise
             await self._balance.keep_reference()
             weight = await self._balance.weigh()
-        self._weighed[step.key] = Weighed(weight.mass, weighing_uncertainty(weight.step, self._repeatability))
+        self._note(step.key, Weighed(weight.mass, weighing_uncertainty(weight.step, self._repeatability)))
 
     @property
     def _repeatability(self) -> float:
         return 0.0 if self._spec.serial is None else self._spec.serial.repeatability
+
+
+def _is_yes(answer: str) -> bool:
+    return answer.strip().lower() in ("yes", "y")

@@ -15,10 +15,11 @@ from actors.balance.actor import DeviceBalance
 from actors.balance.virtual_balance import Load
 from actors.bench.operator import CARRYING_TIME, VirtualOperator
 from actors.bench.planning import plan_pour
+from actors.bench.progress import PourReport
 from actors.bench.spec import VirtualBenchSpec
 from actors.bench.world import Spill, World, draw_pose_error, stream
 from actors.device import Device
-from actors.protocols import InvalidActionError, LaboratoryError, PourProgress, ProgressCallback, SimulatorPool
+from actors.protocols import InvalidActionError, LaboratoryError, ProgressCallback, SimulatorPool
 from sim_engine.action import Action
 from sim_engine.motion import PourMotion
 from sim_engine.outcome import PourMeasurement
@@ -160,18 +161,12 @@ class VirtualBench:
             await asyncio.shield(stopping)
 
 
-class _Report:
-    """Tells a watcher where the pour stands, in bench time done of bench time expected.
-
-    Args:
-        progress: told; what it raises is its own affair.
-        spec: for the expected times.
-        motion: likewise.
-    """
+class _Report(PourReport):
+    """What is expected of a pour on this bench."""
 
     def __init__(self, progress: ProgressCallback | None, spec: VirtualBenchSpec, motion: PourMotion) -> None:
         weighing = 3 * CARRYING_TIME + 2 * WEIGHING_TIME
-        self._parts = {
+        parts = {
             "operator": spec.operator_time + weighing,
             "tare": WEIGHING_TIME,
             "approach": APPROACH_TIME,
@@ -180,44 +175,11 @@ class _Report:
             "weigh": WEIGHING_TIME,
             "record": weighing,
         }
-        self._progress = progress
-        self._motion_time = motion.duration
-        self._checkpoint = "operator"
-        self._fraction = 0.0
-        self._tilt: float | None = None
-        self._balance: float | None = None
-
-    def enter(self, checkpoint: str, done: float = 0.0) -> None:
-        """A checkpoint is reached, or `done` (0 … 1) of it."""
-        self._checkpoint = checkpoint
-        before = 0.0
-        for name, duration in self._parts.items():
-            if name == checkpoint:
-                before += done * duration
-                break
-            before += duration
-        self._fraction = max(self._fraction, before / sum(self._parts.values()))
-        self._tell()
+        super().__init__(progress, parts, motion.duration)
 
     def follow(self, state: ArmState) -> None:
         """Where the arm is during the motion."""
-        self._tilt = state.tilt
-        if not state.moving:
-            return
-        start = sum(duration for name, duration in self._parts.items() if name in ("operator", "tare", "approach"))
-        self._checkpoint = state.phase if state.phase in self._parts else self._checkpoint
-        self._fraction = max(self._fraction, (start + state.fraction * self._motion_time) / sum(self._parts.values()))
-        self._tell()
-
-    def show(self, balance: float) -> None:
-        """The balance's display [kg]."""
-        self._balance = balance
-        self._tell()
-
-    def _tell(self) -> None:
-        if self._progress is not None:
-            with contextlib.suppress(Exception):
-                self._progress(PourProgress(self._checkpoint, self._fraction, self._tilt, self._balance))
+        self.move(state.phase, state.fraction, state.tilt, moving=state.moving)
 
 
 async def _together(first: Awaitable[T], second: Awaitable[Any]) -> tuple[T, Any]:

@@ -10,14 +10,14 @@ from orchestrator.config.yaml_source import Document
 TELLING = {
     "campaign": {"calibration", "deployment", "seed", "liquid", "pourer", "receiver", "laboratory"},
     "vessel": {"profile", "mesh", "inner", "wall", "up"},
-    "laboratory": {"bench", "mode", "simulators"},
+    "laboratory": {"bench", "mode", "simulators", "arm", "cell"},
 }
 """Top-level keys that only one kind of file has, or that give away what was meant; looked for in this order."""
 
 NEEDED = {
     "campaign": "a campaign has keys such as laboratory, liquid, calibration, deployment",
     "vessel": "a vessel has a name and a profile or mesh",
-    "laboratory": "a laboratory has keys such as mode, simulators, bench",
+    "laboratory": "a laboratory has keys such as mode, simulators, arm, bench",
 }
 
 

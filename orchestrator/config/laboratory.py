@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, create_model
 
+from actors.arm.spec import UrArmSpec
+from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
+from actors.operator import OperatorSpec
 from actors.spec import LaboratorySpec
+from orchestrator.config.arm import ArmSection, CellSection, arm_as_file, resolve_arm
+from orchestrator.config.balance import BalanceDeviceSection, balance_as_file, resolve_balance
 from orchestrator.config.cluster import RaySection, ray_as_file, resolve_ray
 from orchestrator.config.motion import parameter_quantity, value_as_file
+from orchestrator.config.operator import OperatorSection, operator_as_file, resolve_operator
 from orchestrator.config.quantities import Quantity, format_quantity
 from orchestrator.config.sections import Count, Name, Section, Switch
+from orchestrator.config.yaml_source import Place, Report
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import PoseError
 
@@ -99,7 +107,7 @@ HiddenLiquid: Any = hidden_liquid_model()
 
 
 class BenchSection(Section):
-    """A virtual bench: an arm, a balance, and a liquid that is not the simulator's."""
+    """What is hidden on a virtual bench: a liquid that is not the simulator's, errors, and how fast time runs."""
 
     required: ClassVar[dict[str, str]] = {"liquid": "{particles: 4000, cohesion: 0.05 N/m}"}
 
@@ -113,13 +121,13 @@ class BenchSection(Section):
     """Its scatter, drawn anew for each pour."""
 
     balance: BalanceSection = BalanceSection()
-    """The virtual balance."""
+    """The balance of a bench of numbers; a laboratory with an arm has its own section for it."""
 
     time_scale: Annotated[float, Quantity("1", "30", 0.0, 1e6)] = _DEFAULT.time_scale
-    """Bench seconds per wall second; 0 waits for nothing."""
+    """Bench seconds per wall second; 0 waits for nothing (not with an arm)."""
 
     operator_time: Duration = _DEFAULT.operator_time
-    """Refilling, placing, wiping between two pours, in bench time."""
+    """Refilling, placing, wiping between two pours, in bench time; with an arm see 'operator'."""
 
 
 class LaboratoryFile(Section):
@@ -130,8 +138,8 @@ class LaboratoryFile(Section):
     name: Name | None = None
     """Its name in journals and banners."""
 
-    mode: Literal["virtual"] = "virtual"
-    """What it is made of: 'virtual' moves nothing."""
+    mode: Literal["virtual", "hardware"] = "virtual"
+    """What it is made of: 'virtual' moves nothing, 'hardware' moves an arm."""
 
     simulators: Count = 0
     """Simulators in the pool; 0: one per core, of this machine or of the cluster."""
@@ -145,31 +153,46 @@ class LaboratoryFile(Section):
     ray: RaySection | None = None
     """The Ray cluster to run on; unless given, a private Ray on this machine."""
 
+    arm: ArmSection | None = None
+    """The arm that holds the pourer, reached over its controller's own wires, virtual or not."""
+
+    cell: CellSection | None = None
+    """What stands where around the arm."""
+
+    balance: BalanceDeviceSection | None = None
+    """The balance beside the arm."""
+
+    operator: OperatorSection = OperatorSection()
+    """The person beside the arm."""
+
     bench: BenchSection | None = None
-    """The virtual bench; without one the laboratory simulates and plans, and can't pour."""
+    """What is hidden on a virtual bench; without it and without an arm, the laboratory simulates and plans."""
 
 
-def resolve_laboratory(section: LaboratoryFile) -> LaboratorySpec | None:
-    """The laboratory of a file, None if something required is missing (which is reported already)."""
-    bench = None
-    if section.bench is not None:
-        if section.bench.liquid is None:
-            return None
-        b = section.bench
-        assert b.liquid is not None
-        bench = VirtualBenchSpec(
-            liquid=b.liquid.parameters(),
-            pose_error=PoseError(**b.pose_error.model_dump()),
-            pose_noise=PoseError(**b.pose_noise.model_dump()),
-            time_scale=b.time_scale,
-            operator_time=b.operator_time,
-            balance_resolution=b.balance.resolution,
-            balance_noise=b.balance.noise,
-            balance_drift=b.balance.drift,
-            settling_time=b.balance.settling_time,
-        )
-    if section.name is None:
+def resolve_laboratory(section: LaboratoryFile, place: Place, report: Report) -> LaboratorySpec | None:
+    """The laboratory of a file; what is wrong goes to the report, and then there is none.
+
+    Args:
+        section: as written.
+        place: where it stands.
+        report: takes problems.
+    """
+    before = len(report.problems)
+    if section.mode == "hardware":
+        _check_hardware(section, place, report)
+    _check_wires(section, place, report)
+    operator = resolve_operator(section.operator, place.at("operator"), report, mode=section.mode)
+    arm = None if section.arm is None else resolve_arm(section.arm, section.cell, place, report, mode=section.mode)
+    balance = None
+    if section.arm is not None and section.balance is not None:
+        balance = resolve_balance(section.balance, place.at("balance"), report, mode=section.mode)
+    if section.name is None or operator is None or len(report.problems) > before:
         return None
+    if (section.arm is None) is not (arm is None) or (section.bench is not None and section.bench.liquid is None):
+        return None  # reported already, as missing
+    bench = None if section.bench is None else _bench(section.bench)
+    if arm is not None and bench is not None:
+        arm, balance = replace(arm, time_scale=bench.time_scale), _paced(balance, bench.time_scale)
     return LaboratorySpec(
         name=section.name,
         simulators=section.simulators,
@@ -178,7 +201,79 @@ def resolve_laboratory(section: LaboratoryFile) -> LaboratorySpec | None:
         in_process=section.in_process,
         object_store_mb=round(section.object_store),
         ray=resolve_ray(section.ray),
+        arm=arm,
+        balance=balance,
+        operator=operator if arm is not None else OperatorSpec(answers="virtual"),
     )
+
+
+def _check_hardware(section: LaboratoryFile, place: Place, report: Report) -> None:
+    if section.bench is not None:
+        report.add(
+            place.at("bench"),
+            "is what a virtual bench hides, and how fast its time runs; hardware hides its own, and its time is the "
+            "clock's. Remove the section, or write 'mode: virtual'",
+        )
+    if section.arm is None and not report.is_broken(place.at("arm")):
+        report.add(place, "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section", key=True)
+
+
+def _check_wires(section: LaboratoryFile, place: Place, report: Report) -> None:
+    """What belongs to an arm, and what with one belongs elsewhere."""
+    if section.arm is None:
+        if report.is_broken(place.at("arm")):
+            return
+        for key in ("cell", "balance", "operator"):
+            if key in section.model_fields_set:
+                meant = "; a bench of numbers has 'bench: {balance: …, operator_time: …}'" if key != "cell" else ""
+                report.add(place.at(key), f"belongs to an arm, and there is none; add 'arm', or remove it{meant}")
+        return
+    if section.balance is None and not report.is_broken(place.at("balance")):
+        report.add(
+            place, "an arm that pours needs a balance; add 'balance: {placement: tray, …}', or 'placement: manual'"
+        )
+    if section.mode == "hardware":
+        return
+    if section.bench is None:
+        if not report.is_broken(place.at("bench")):
+            report.add(place, "a virtual arm pours a hidden liquid; add 'bench: {liquid: {…}}', or 'mode: hardware'")
+        return
+    at, bench = place.at("bench"), section.bench
+    if "time_scale" in section.arm.model_fields_set:
+        report.add(place.at("arm", "time_scale"), "one clock is enough: write 'time_scale' in the section 'bench'")
+    for key, other in (("balance", "the section 'balance'"), ("operator_time", "'time' in the section 'operator'")):
+        if key in bench.model_fields_set:
+            report.add(at.at(key), f"is of a bench without wires; with an arm write it into {other}")
+    if bench.pose_error.speed_factor != 1.0 or bench.pose_noise.speed_factor != 0.0:
+        key = "pose_error" if bench.pose_error.speed_factor != 1.0 else "pose_noise"
+        report.add(
+            at.at(key, "speed_factor"),
+            "an arm over its wires moves as fast as it is told; its own lag is in what it reads back. Remove the key",
+        )
+    if bench.time_scale < 1.0:
+        report.add(at.at("time_scale"), "an arm takes its time: 1 or more, and at most some 50")
+
+
+def _bench(b: BenchSection) -> VirtualBenchSpec:
+    assert b.liquid is not None
+    return VirtualBenchSpec(
+        liquid=b.liquid.parameters(),
+        pose_error=PoseError(**b.pose_error.model_dump()),
+        pose_noise=PoseError(**b.pose_noise.model_dump()),
+        time_scale=b.time_scale,
+        operator_time=b.operator_time,
+        balance_resolution=b.balance.resolution,
+        balance_noise=b.balance.noise,
+        balance_drift=b.balance.drift,
+        settling_time=b.balance.settling_time,
+    )
+
+
+def _paced(balance: BalanceSpec | None, time_scale: float) -> BalanceSpec | None:
+    """A virtual balance in the bench's time."""
+    if balance is None or balance.serial is None:
+        return balance
+    return replace(balance, serial=replace(balance.serial, time_scale=time_scale))
 
 
 def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
@@ -190,28 +285,39 @@ def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
         "in_process": spec.in_process,
         "object_store": f"{spec.object_store_mb} MB",
         **({} if spec.ray is None else {"ray": ray_as_file(spec.ray)}),
+        **_wires_as_file(spec.arm, spec),
     }
     if spec.bench is None:
         return table
     b = spec.bench
     info = SimulationParameters.info()
     liquid = b.liquid.model_dump()
-    return table | {
-        "bench": {
-            "liquid": {
-                n: value_as_file(v, info[n].unit, info[n].unit, whole=info[n].integer) for n, v in liquid.items()
-            },
-            "pose_error": _pose_as_file(b.pose_error),
-            "pose_noise": _pose_as_file(b.pose_noise),
+    bench: dict[str, object] = {
+        "liquid": {n: value_as_file(v, info[n].unit, info[n].unit, whole=info[n].integer) for n, v in liquid.items()},
+        "pose_error": _pose_as_file(b.pose_error),
+        "pose_noise": _pose_as_file(b.pose_noise),
+        "time_scale": b.time_scale,
+    }
+    if spec.arm is None:
+        bench |= {
             "balance": {
                 "resolution": format_quantity(b.balance_resolution, "kg", "g"),
                 "noise": format_quantity(b.balance_noise, "kg", "g"),
                 "drift": format_quantity(b.balance_drift, "kg/s", "g/s"),
                 "settling_time": format_quantity(b.settling_time, "s", "s"),
             },
-            "time_scale": b.time_scale,
             "operator_time": format_quantity(b.operator_time, "s", "s"),
         }
+    return table | {"bench": bench}
+
+
+def _wires_as_file(arm: UrArmSpec | None, spec: LaboratorySpec) -> dict[str, object]:
+    if arm is None:
+        return {}
+    return {
+        **arm_as_file(replace(arm, time_scale=1.0)),
+        **({} if spec.balance is None else {"balance": balance_as_file(spec.balance)}),
+        "operator": operator_as_file(spec.operator, mode=spec.mode),
     }
 
 

@@ -69,7 +69,7 @@ def load_laboratory(path: Path) -> LaboratorySpec:
     """
     report = Report()
     found = References(report).file(path.resolve(), LaboratoryFile)
-    laboratory = None if found is None else resolve_laboratory(found[0])
+    laboratory = None if found is None else resolve_laboratory(*found, report)
     report.raise_if_any()
     assert laboratory is not None, "a laboratory without problems has a spec"
     return laboratory

@@ -100,4 +100,4 @@ class References:
     def laboratory(self, value: Any, place: Place) -> Any:
         """A `LaboratorySpec`; None where something is wrong with it."""
         found = self.section(value, place, LaboratoryFile)
-        return None if found is None else resolve_laboratory(found[0])
+        return None if found is None else resolve_laboratory(*found, self.report)

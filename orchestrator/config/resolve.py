@@ -146,7 +146,7 @@ def _calibration(
         holdout = max(1, count // 8) if pours.holdout is None and count > 1 else pours.holdout or 0
         if count and holdout >= count:
             report.add(at.at("holdout"), f"keeps {holdout} of {count} pours for testing, so that none is left to fit")
-        if count and laboratory is not None and laboratory.bench is None:
+        if count and laboratory is not None and not laboratory.pours:
             report.add(
                 at.at("count"), f"laboratory '{laboratory.name}' has no bench to pour on; name a CSV file with 'from'"
             )
@@ -194,7 +194,7 @@ def _deployment(
         )
     if pours == 0 and strategy in ("D2", "D3"):
         report.add(place.at("pours"), f"{strategy} learns on real pours; at least 1 (D1 plans without any)")
-    if pours and laboratory is not None and laboratory.bench is None:
+    if pours and laboratory is not None and not laboratory.pours:
         at = place.at("pours") if section.pours is not None else place
         hint = "'pours: 0' only plans" if strategy == "D1" else "name one with a bench"
         report.add(at, f"laboratory '{laboratory.name}' has no bench to pour on; {hint}")
