@@ -40,6 +40,7 @@ Answer = Annotated[
         show_default=False,
     ),
 ]
+Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
 ]
@@ -236,6 +237,38 @@ def schema(
     from orchestrator.commands import single
 
     _call(single.schema, which)
+
+
+@app.command(
+    epilog=examples(
+        "decant doctor configs/laboratories/virtual.yaml",
+        "decant doctor configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the teach pendant",
+    )
+)
+def doctor(
+    laboratory: Laboratory,
+    accept_safety: Annotated[
+        bool,
+        typer.Option(
+            "--accept-safety",
+            help="Record the controller's safety settings, by their checksum, as those that people have read and "
+            "accepted: NAME.safety.json beside the file. Without such a record nothing is poured.",
+        ),
+    ] = False,
+    tare: Annotated[
+        bool,
+        typer.Option("--tare", help="Also tare the balance, to see that it obeys: what is on it counts as nothing."),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Look at everything that a pour needs, and say what to do: network, controller, safety settings, balance.
+
+    Nothing moves and nothing is set. In a virtual laboratory its controller and balance are started for the purpose.
+    Exit code 1 if something fails.
+    """
+    from orchestrator.commands import doctor as verb
+
+    _call(verb.doctor, laboratory, accept_safety=accept_safety, tare=tare, as_json=as_json)
 
 
 @app.command(

@@ -1,0 +1,181 @@
+"""`decant doctor`: is the bench ready to pour, and if not, what is to be done about it?"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import getpass
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, say
+from orchestrator.commands.doctor_arm import judge
+from orchestrator.commands.doctor_balance import look_at_balance
+from orchestrator.commands.doctor_look import Check, Findings, look_at
+from orchestrator.safety import SafetyRecord, SafetyRecordError, read_record, record_path, write_record
+
+if TYPE_CHECKING:
+    from actors.arm.spec import UrArmSpec
+    from actors.spec import LaboratorySpec
+
+_MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
+
+
+def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> None:
+    """Look at everything that a pour needs, and say what to do. Nothing moves.
+
+    Args:
+        path: laboratory file.
+        accept_safety: record the controller's safety settings as accepted.
+        tare: also tare the balance.
+        as_json: one line of JSON in place of the table.
+
+    Raises:
+        RefusalError: something fails (exit code 1), or the file can't be used (2).
+    """
+    spec = read_laboratory(path)
+    if spec.arm is None:
+        raise RefusalError(
+            f"{path}: laboratory {spec.name} has no arm that could be looked at; its bench is made of numbers, and "
+            "needs no doctor"
+            if spec.bench is not None
+            else f"{path}: laboratory {spec.name} has no bench",
+            BAD_INPUT,
+        )
+    virtual = spec.mode != "hardware"
+    say(
+        f"laboratory {spec.name}, {spec.mode}"
+        + (": no robot, no balance; both are started for this" if virtual else "")
+    )
+    try:
+        record = None if virtual else read_record(path)
+    except SafetyRecordError as error:
+        if not accept_safety:
+            raise RefusalError(str(error), BAD_INPUT) from None
+        record = None
+    with _site(spec) as ready:
+        assert ready.arm is not None
+        found = look_at(ready.arm.address)
+        if virtual:
+            record = _virtual_record(found)
+        elif accept_safety:
+            record = _accept(path, found)
+        checks = judge(ready.arm, found, record, accept=f"decant doctor {path} --accept-safety")
+        checks += look_at_balance(ready.balance, tare=tare)
+    failed = [check for check in checks if check.state == "fail"]
+    if as_json:
+        table = [dataclasses.asdict(check) for check in checks]
+        print_json({"laboratory": spec.name, "mode": spec.mode, "ready": not failed, "checks": table})
+    else:
+        print_table(checks)
+    if failed:
+        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are mended")
+    say("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
+
+
+def read_laboratory(path: Path) -> LaboratorySpec:
+    """A laboratory's file.
+
+    Raises:
+        RefusalError: with all its problems, exit code 2.
+    """
+    from orchestrator.config.errors import ConfigError
+    from orchestrator.config.load import load_laboratory
+
+    try:
+        return load_laboratory(path)
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+
+
+def print_table(checks: list[Check]) -> None:
+    """The checks on stdout, advice below what it is about."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, show_header=False, padding=(0, 2, 0, 0))
+    for check in checks:
+        mark, style = _MARKS[check.state]
+        said = Text(check.found)
+        if check.advice:
+            said.append(f"\n→ {check.advice}", style="bold" if check.state == "fail" else "")
+        table.add_row(Text(mark, style=style), Text(check.name), said)
+    console = Console(highlight=False)
+    (console if console.is_terminal else Console(highlight=False, width=1000)).print(table)
+
+
+@contextlib.contextmanager
+def _site(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
+    """The laboratory with its addresses: on hardware its own, else those of what is started for as long as this."""
+    if spec.mode == "hardware":
+        yield spec
+        return
+    from actors.bench.site import VirtualSite
+
+    assert spec.arm is not None
+    site = VirtualSite(spec.arm, spec.balance)
+    try:
+        where = site.addresses()
+        arm = dataclasses.replace(spec.arm, address=where.controller)
+        _install(arm)
+        balance = spec.balance
+        if balance is not None and balance.serial is not None:
+            serial = dataclasses.replace(balance.serial, port=where.port)
+            balance = dataclasses.replace(balance, serial=serial)
+        yield dataclasses.replace(spec, arm=arm, balance=balance)
+    finally:
+        site.close()
+
+
+def _install(arm: UrArmSpec) -> None:
+    """On a real controller somebody has set TCP and payload in the installation; on a fresh virtual one nobody has."""
+    from actors.arm.survey import SCRIPTS
+
+    tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
+    centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
+    program = f"def install():\n  set_tcp(p[{tool}])\n  set_payload({arm.payload!r}, [{centre}])\nend\n"
+    with socket.create_connection((arm.address, SCRIPTS), timeout=5.0) as connection:
+        connection.sendall(program.encode("ascii"))
+        time.sleep(0.3)
+
+
+def _virtual_record(found: Findings) -> SafetyRecord | None:
+    checksum = None if found.state is None else found.state.checksum
+    if checksum is None:
+        return None
+    return SafetyRecord(checksum, found.serial, found.model, "", "this run", "nobody: it is virtual")
+
+
+def _accept(path: Path, found: Findings) -> SafetyRecord:
+    """Write down the safety settings as they are now.
+
+    Raises:
+        RefusalError: the controller doesn't tell them, or the record can't be written.
+    """
+    if found.state is None or found.state.checksum is None or not found.serial:
+        raise RefusalError(
+            "the controller doesn't tell its safety checksum and serial number, so nothing can be accepted; run "
+            f"'decant doctor {path}' without --accept-safety to see why",
+            FAILED,
+        )
+    record = SafetyRecord(
+        checksum=found.state.checksum,
+        serial=found.serial,
+        model=found.model,
+        software=".".join(str(part) for part in found.software[:3]),
+        date=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        accepted_by=getpass.getuser(),
+    )
+    try:
+        written = write_record(path, record)
+    except OSError as error:
+        raise RefusalError(f"{record_path(path)}: can't be written: {error.strerror}", BAD_INPUT) from None
+    say(
+        f"safety checksum {record.checksum} of robot {record.serial} is accepted by {record.accepted_by}: {written}\n"
+        "Compare it with the teach pendant, have a second person read the safety settings, and commit the file."
+    )
+    return record

@@ -1,0 +1,52 @@
+"""A 'hardware' laboratory for tests: its controller and balance are virtual ones, reached by address and port."""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+
+from actors.virtual_ur.launcher import VirtualController
+
+HOME = (-14.0, -91.0, -115.0, -154.0, -104.0, 0.0)
+"""[deg]"""
+
+LABORATORY = """\
+name: {name}
+mode: hardware
+simulators: 1
+arm:
+  model: ur10
+  address: {address}
+  tool: {{z: 170 mm}}
+  payload: 1.6 kg
+  payload_centre: {{z: 110 mm}}
+  grip: {{y: -60 mm, rx: -1.5707963 rad}}
+  home: {{base: -14 deg, shoulder: -91 deg, elbow: -115 deg, wrist1: -154 deg, wrist2: -104 deg, wrist3: 0 deg}}
+  limits:
+    box: {{low: {{x: 250 mm, y: -600 mm, z: 0 mm}}, high: {{x: 1000 mm, y: 400 mm, z: 900 mm}}}}
+    joint_speed: 120 deg/s
+    tool_speed: 800 mm/s
+    tilt: 135 deg
+    tilt_speed: 130 deg/s
+cell:
+  receiver: {{x: 750 mm, y: 0 mm, z: 60 mm}}
+  direction: 90 deg
+  table: 0 mm
+{balance}
+"""
+
+MANUAL = "balance: {placement: manual}"
+
+
+def write_laboratory(path: Path, address: str, balance: str = MANUAL, name: str = "rig") -> Path:
+    path.write_text(LABORATORY.format(name=name, address=address, balance=balance), encoding="utf-8")
+    return path
+
+
+def install(controller: VirtualController, tool: float = 0.17, payload: float = 1.6) -> None:
+    """What somebody would have set on the teach pendant."""
+    program = f"def setup():\n set_tcp(p[0,0,{tool},0,0,0])\n set_payload({payload}, [0,0,0.11])\nend\n"
+    with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
+        connection.sendall(program.encode())
+        time.sleep(0.2)

@@ -1,0 +1,226 @@
+"""`decant doctor` before a bench in every wrong state: it says what is wrong and what to do, and nothing moves."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from actors.arm.checksum import ChecksumError, require_accepted
+from actors.balance.virtual_serial.handle import VirtualSerialBalance
+from actors.virtual_ur.launcher import VirtualController
+from orchestrator.cli import app
+from orchestrator.safety import SafetyRecordError, accepted_checksum, read_record, record_path
+from tests.orchestrator import hardware
+
+ADDRESS = "127.81.3.2"
+JOINTS = [radians(q) for q in hardware.HOME]
+
+
+@pytest.fixture(scope="module")
+def controller() -> Iterator[VirtualController]:
+    with VirtualController.start(ADDRESS, "ur10", joints=JOINTS) as started:
+        hardware.install(started)
+        yield started
+
+
+@pytest.fixture(scope="module")
+def balance() -> Iterator[VirtualSerialBalance]:
+    started = VirtualSerialBalance.start("kcp", baud=0)
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def laboratory(tmp_path: Path, controller: VirtualController) -> Path:
+    return hardware.write_laboratory(tmp_path / "rig.yaml", controller.address)
+
+
+def doctor(path: Path, *options: str) -> Result:
+    return CliRunner().invoke(app, ["doctor", str(path), *options], catch_exceptions=False)
+
+
+def checked(path: Path, *options: str) -> dict[str, dict[str, Any]]:
+    """The table by name, the first line of each."""
+    result = doctor(path, "--json", *options)
+    table = json.loads(result.stdout.splitlines()[-1])["checks"]
+    return {check["name"]: check for check in reversed(table)}
+
+
+def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
+    tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance
+) -> None:
+    path = hardware.write_laboratory(
+        tmp_path / "rig.yaml", controller.address, f"balance: {{placement: tray, port: {balance.port}}}"
+    )
+    before = controller.fault("state")
+    refused = doctor(path)
+    assert refused.exit_code == 1
+    assert "accepted by nobody" in refused.stdout
+    assert f"decant doctor {path} --accept-safety" in refused.stdout
+    accepted = doctor(path, "--accept-safety")
+    assert accepted.exit_code == 0, accepted.output
+    record = json.loads(record_path(path).read_text())
+    assert record["checksum"] == before["checksum"]
+    assert record["serial"] == "2016300123"
+    assert set(record) == {"checksum", "serial", "model", "software", "date", "accepted_by"}
+    again = doctor(path)
+    assert again.exit_code == 0
+    assert "ready" in again.stderr
+    for line in ("PolyScope 3.15", "at home", "kcp", "0 g, stable", "not tried"):
+        assert line.lower() in again.stdout.lower()
+    after = controller.fault("state")
+    assert after["joints"] == before["joints"]
+    assert balance.state()["heard"].count("T") == 0 if "heard" in balance.state() else True
+
+
+def test_virtual_laboratory_is_started_looked_at_and_called_virtual() -> None:
+    result = doctor(Path("configs/laboratories/virtual.yaml"))
+    assert result.exit_code == 0, result.output
+    assert "virtual: no robot, no balance" in result.stderr
+    assert "nobody: it is virtual" in result.stdout
+
+
+def test_a_bench_of_numbers_and_a_bad_file_are_refused_with_exit_code_2(tmp_path: Path) -> None:
+    assert doctor(Path("configs/laboratories/twin.yaml")).exit_code == 2
+    assert doctor(tmp_path / "nowhere.yaml").exit_code == 2
+    (tmp_path / "bad.yaml").write_text("name: x\nmode: hardwear\n")
+    bad = doctor(tmp_path / "bad.yaml")
+    assert bad.exit_code == 2
+    assert "hardwear" in bad.stderr
+
+
+def test_nobody_at_the_address(tmp_path: Path) -> None:
+    path = hardware.write_laboratory(tmp_path / "rig.yaml", "127.81.3.9")  # loopback: every port refuses
+    network = checked(path)["network"]
+    assert network["state"] == "fail"
+    assert "closed" in network["found"]
+    assert "Services" in network["advice"]
+    path = hardware.write_laboratory(tmp_path / "rig.yaml", "no-such-robot.invalid")
+    assert "stands for no machine" in checked(path)["address"]["found"]
+
+
+def test_one_closed_port_is_named_with_what_it_is_for(tmp_path: Path) -> None:
+    servers = [socket.create_server(("127.81.3.8", port)) for port in (30001, 30003, 30004)]
+    path = hardware.write_laboratory(tmp_path / "rig.yaml", "127.81.3.8")
+    try:
+        table = checked(path)
+    finally:
+        for server in servers:
+            server.close()
+    assert table["port 29999"]["state"] == "fail"
+    assert "dashboard: refused" in table["port 29999"]["found"]
+    assert table["port 30004"]["state"] == "ok"
+    assert table["answers"]["state"] == "fail"  # the others accept, and say nothing
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "name", "found", "advice"),
+    [
+        ("ur10e", {"local": True}, "remote control", "off", "Remote"),
+        ("ur10", {"state": "off"}, "arm", "power off", "brakes"),
+        ("ur10", {"state": "idle"}, "arm", "idle", "brakes"),
+        ("ur10e", {}, "model", "ur10e", "correct 'model'"),
+        ("ur10", {"joints": [0.0, -1.5, 1.5, -1.5, -1.5, 0.0]}, "position", "not at home", "jog"),
+    ],
+)
+def test_a_controller_that_was_started_otherwise(
+    tmp_path: Path, model: str, options: dict[str, Any], name: str, found: str, advice: str
+) -> None:
+    with VirtualController.start("127.81.3.4", model, **options) as started:
+        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+        line = checked(path)[name]
+    assert line["state"] == ("warn" if name == "position" else "fail")
+    assert found in line["found"]
+    assert advice in line["advice"]
+
+
+def test_stops_are_named_and_never_unlocked(tmp_path: Path) -> None:
+    with VirtualController.start("127.81.3.5", "ur10", joints=JOINTS) as started:
+        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+        started.fault("protective_stop", reason="a test")
+        line = checked(path)["safety"]
+        assert (line["state"], line["found"]) == ("fail", "protective stop")
+        assert "find the cause" in line["advice"]
+        assert "PROTECTIVE" in str(started.fault("state")["safety_mode"])
+        started.fault("emergency_stop")
+        assert checked(path)["safety"]["found"] == "robot emergency stop"
+
+
+def test_another_tool_or_payload_than_the_file_s(laboratory: Path, controller: VirtualController) -> None:
+    hardware.install(controller, tool=0.12, payload=0.3)
+    try:
+        table = checked(laboratory)
+    finally:
+        hardware.install(controller)
+    assert table["tool"]["state"] == table["payload"]["state"] == "fail"
+    assert "50.0 mm" in table["tool"]["found"]
+    assert "0.30 kg on the controller, 1.60 kg in the file" in table["payload"]["found"]
+    assert checked(laboratory)["tool"]["state"] == "ok"
+
+
+def test_changed_safety_settings_are_shown_with_both_checksums(laboratory: Path, controller: VirtualController) -> None:
+    doctor(laboratory, "--accept-safety")
+    before = accepted_checksum(laboratory)  # the file names itself: nothing else has a 'laboratory' key
+    controller.fault("checksum", value="DEADBEEF")
+    try:
+        line = checked(laboratory)["safety checksum"]
+    finally:
+        controller.fault("checksum")
+    assert line["state"] == "fail"
+    assert "DEADBEEF" in line["found"]
+    assert str(before) in line["found"]
+
+
+def test_settings_that_were_accepted_for_another_robot_don_t_count(
+    laboratory: Path, controller: VirtualController
+) -> None:
+    doctor(laboratory, "--accept-safety")
+    path = record_path(laboratory)
+    path.write_text(path.read_text().replace("2016300123", "1999999999"))
+    line = checked(laboratory)["safety checksum"]
+    assert line["state"] == "fail"
+    assert "1999999999" in line["found"]
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"checksum": "12345678"}', "{"])
+def test_a_spoilt_record_is_an_error_and_not_a_missing_one(laboratory: Path, content: str) -> None:
+    record_path(laboratory).write_text(content)
+    with pytest.raises(SafetyRecordError, match="accept-safety"):
+        read_record(laboratory)
+    assert doctor(laboratory).exit_code == 2
+
+
+def test_balance_that_is_unplugged_or_silent_is_told_with_what_to_do(
+    tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance
+) -> None:
+    missing = hardware.write_laboratory(
+        tmp_path / "a.yaml", controller.address, "balance: {placement: tray, port: /dev/serial/by-id/nothing}"
+    )
+    assert "isn't there" in checked(missing)["balance port"]["found"]
+    present = hardware.write_laboratory(
+        tmp_path / "b.yaml", controller.address, f"balance: {{placement: tray, port: {balance.port}, dialect: kcp}}"
+    )
+    balance.unplug()
+    try:
+        assert checked(present)["balance port"]["state"] == "fail"
+    finally:
+        balance.plug()
+    tared = checked(present, "--tare")["balance tare"]
+    assert (tared["state"], tared["found"]) == ("ok", "it obeyed, and rests at zero")
+
+
+def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_changed() -> None:
+    require_accepted("22c99aa2", "22C99AA2", "robot")
+    with pytest.raises(ChecksumError, match="decant doctor"):
+        require_accepted(None, "22C99AA2", "robot")
+    with pytest.raises(ChecksumError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
+        require_accepted("22C99AA2", "DEADBEEF", "robot")
+    with pytest.raises(ChecksumError, match="tells no safety checksum"):
+        require_accepted("22C99AA2", None, "robot")
