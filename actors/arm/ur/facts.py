@@ -1,0 +1,96 @@
+"""What a driver knows of its robot, for people and for records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from actors.arm.spec import Joints, Pose, Vector
+from actors.arm.ur.messages import Facts
+
+ROBOT_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "confirm safety",
+    2: "booting",
+    3: "off",
+    4: "on",
+    5: "idle",
+    6: "backdrive",
+    7: "running",
+    8: "updating firmware",
+}
+SAFETY_MODES = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "violation",
+    9: "fault",
+}
+
+
+@dataclass(frozen=True)
+class ArmFacts:
+    """A robot as its controller tells of it.
+
+    Attributes:
+        model, serial, version: as on the controller.
+        robot_mode, safety_mode: in words; 'running' and 'normal' if it could move.
+        remote: remote control is on; None where the controller knows no such thing.
+        checksum: of the safety configuration, eight hexadecimal digits; '' if it isn't told.
+        tool: TCP in the flange's frame, as set at present.
+        payload: as set at present [kg]; `payload_centre` [m].
+        joints: measured [rad].
+        slider: 0 … 1.
+        program: state and name of the controller's program.
+        joint_ranges: lowest and highest of each joint [rad], as configured; empty if they aren't told.
+        joint_speeds: likewise [rad/s].
+    """
+
+    model: str
+    serial: str
+    version: str
+    robot_mode: str
+    safety_mode: str
+    remote: bool | None
+    checksum: str
+    tool: Pose
+    payload: float
+    payload_centre: Vector
+    joints: Joints
+    slider: float
+    program: str
+    joint_ranges: tuple[tuple[float, float], ...] = ()
+    joint_speeds: tuple[float, ...] = ()
+
+    @property
+    def e_series(self) -> bool:
+        """Of the generation after CB3."""
+        return int(self.version.split(".")[0]) >= 5
+
+
+def facts_of(told: Facts) -> ArmFacts:
+    """As a worker has found out."""
+    r = told.reading
+    a, b, c, d, e, f = r.joints
+    x, y, z = r.centre
+    return ArmFacts(
+        model=told.model,
+        serial=told.serial,
+        version=".".join(map(str, told.version)),
+        robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
+        safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
+        remote=told.remote,
+        checksum=told.checksum,
+        tool=Pose(*told.tool),
+        payload=r.payload,
+        payload_centre=(x, y, z),
+        joints=(a, b, c, d, e, f),
+        slider=r.slider,
+        program=told.program,
+        joint_ranges=told.ranges,
+        joint_speeds=told.speeds,
+    )

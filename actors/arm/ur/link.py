@@ -1,0 +1,179 @@
+"""The client library, behind as little as a worker needs. Imported by the worker only; never rebuilt, only discarded.
+
+Of the library only what reads and what writes input registers is used. Its control interface uploads a program of its
+own when it is made, reconnects by itself and uploads again, ends the program each time and sometimes its process: that
+can't be had in a cell where nothing may run without consent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from actors.arm.ur.messages import (
+    CLOCK,
+    GO,
+    HEARTBEAT,
+    NUMBER,
+    SILENCE,
+    STATUS,
+    STOP_ORDER,
+    TOOL,
+    Reading,
+    TroubleError,
+)
+
+PORTS = {30004: "RTDE", 29999: "dashboard", 30001: "primary interface"}
+PROBE_TIME = 2.0
+CONSTRUCTION_TIME = 10.0
+"""After which a constructor that doesn't come back ends the process [s]: it holds the interpreter."""
+
+_LOOKS = 10
+"""Looks that must have found the same time before data count as stale: a late look says nothing."""
+
+_VARIABLES = [
+    *("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state", "robot_status_bits"),
+    *("target_speed_fraction", "payload", "payload_cog", "safety_status_bits"),
+    *(f"output_int_register_{n}" for n in (NUMBER, STATUS)),
+    *(f"output_double_register_{n}" for n in (CLOCK, *range(TOOL, TOOL + 6))),
+]
+
+
+class Link:
+    """Reads the controller and writes what its program listens to.
+
+    Args:
+        address: of the controller.
+        rate: of reading [Hz of the clock].
+
+    Raises:
+        TroubleError: it can't be reached, or the library isn't there.
+    """
+
+    def __init__(self, address: str, rate: float) -> None:
+        for port, name in PORTS.items():
+            _probe(address, port, name)
+        try:
+            from rtde_io import RTDEIOInterface  # type: ignore[import-not-found]
+            from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
+        except ImportError as error:
+            raise TroubleError(
+                "refused",
+                f"the arm needs ur-rtde, which is missing here ({error}); it has no wheel for Python 3.13 yet",
+            ) from None
+        try:
+            with _bounded(CONSTRUCTION_TIME):
+                self._receive: Any = RTDEReceiveInterface(address, rate, _VARIABLES)
+                self._io: Any = RTDEIOInterface(address)
+        except (RuntimeError, ValueError) as error:
+            raise TroubleError("lost", f"{address}: {error}") from None
+        self._writing = threading.Lock()
+        self._last: Reading | None = None
+        self._looks = 0
+
+    # ---- reading
+
+    def look(self) -> Reading:
+        """The latest package.
+
+        Raises:
+            TroubleError: the connection is lost, or its time stands still.
+        """
+        r = self._receive
+        if not r.isConnected():
+            raise TroubleError("lost", "the connection to the controller was lost")
+        for _ in range(20):
+            time_before = r.getTimestamp()
+            last = self._last
+            if last is not None and time_before == last.time:
+                self._looks += 1
+                if self._looks >= _LOOKS and time.monotonic() - last.seen > SILENCE:
+                    raise TroubleError("lost", f"the controller has said nothing new for {SILENCE:g} s")
+                return last
+            reading = Reading(
+                time=time_before,
+                seen=time.monotonic(),
+                joints=tuple(r.getActualQ()),
+                speeds=tuple(r.getActualQd()),
+                robot_mode=r.getRobotMode(),
+                safety_mode=r.getSafetyMode(),
+                runtime=r.getRuntimeState(),
+                slider=r.getTargetSpeedFraction(),
+                payload=r.getPayload(),
+                centre=tuple(r.getPayloadCog()),
+                number=r.getOutputIntRegister(NUMBER),
+                status=r.getOutputIntRegister(STATUS),
+                clock=r.getOutputDoubleRegister(CLOCK),
+                tool=tuple(r.getOutputDoubleRegister(TOOL + k) for k in range(6)),
+            )
+            if r.getTimestamp() == time_before:
+                self._last, self._looks = reading, 0
+                return reading
+        raise TroubleError("lost", "packages come faster than they can be read")
+
+    def fresh(self) -> Reading:
+        """A package that is newer than this call.
+
+        Raises:
+            TroubleError: none comes.
+        """
+        before = self._receive.getTimestamp()
+        self._last, self._looks = None, 0
+        end = time.monotonic() + 5.0 * SILENCE
+        while time.monotonic() < end:
+            time.sleep(0.004)
+            reading = self.look()
+            if reading.time != before:
+                return reading
+        raise TroubleError("lost", f"the controller has said nothing new for {5.0 * SILENCE:g} s")
+
+    # ---- writing
+
+    def beat(self, count: int) -> None:
+        """The program may go on."""
+        self._write(HEARTBEAT, count & 0xFFFF)
+
+    def go(self, number: int) -> None:
+        """The program may begin."""
+        self._write(GO, number)
+
+    def order_stop(self, number: int) -> None:
+        """The program shall stop."""
+        self._write(STOP_ORDER, number)
+
+    def _write(self, register: int, value: int) -> None:
+        # A thread that hangs in here must not keep a stop from being tried by other means.
+        if not self._writing.acquire(timeout=0.2):
+            return
+        try:
+            with contextlib.suppress(RuntimeError):  # a lost connection is noticed by reading
+                self._io.setInputIntRegister(register, value)
+        finally:
+            self._writing.release()
+
+
+def _probe(address: str, port: int, name: str) -> None:
+    try:
+        with socket.create_connection((address, port), timeout=PROBE_TIME):
+            pass
+    except OSError as error:
+        raise TroubleError(
+            "lost",
+            f"no robot at {address}: its {name} (port {port}) does not answer: {error}. "
+            "Is the controller on, on this network, and are its services enabled?",
+        ) from None
+
+
+@contextlib.contextmanager
+def _bounded(seconds: float) -> Iterator[None]:
+    """End this process if what is inside takes longer: a thread of C does, which needs no interpreter."""
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()

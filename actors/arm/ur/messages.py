@@ -1,0 +1,172 @@
+"""What driver and worker say to each other. Plain values, and nothing heavy to import: the worker starts in an instant.
+
+Registers that programs and worker share; the client library lets 18 … 22 be written and 12 … 19 be read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+STOP_ORDER, HEARTBEAT, GO = 19, 20, 21
+"""Integer inputs. An order is the number of the motion that it is meant for, so an old one orders nothing."""
+
+NUMBER, STATUS = 12, 13
+"""Integer outputs: the number of the motion whose program runs, and what it is doing."""
+
+CLOCK, TOOL = 12, 13
+"""Double outputs: time on the path [s]; from here on six of the tool, as the controller has it."""
+
+READY, RUNNING, DONE, STOPPED = 1, 2, 3, 4
+"""Statuses: set up and waiting for `GO`; moving; arrived; stopped on order."""
+
+SLOWEST_HEARTBEAT = 2.0
+"""A program whose heartbeat is written less often than that ends, and the arm with it [Hz of the clock]."""
+
+SILENCE = 0.2
+"""Data whose time stands still for so long are stale [s of the clock]."""
+
+
+class TroubleError(Exception):
+    """The worker can't do what was asked.
+
+    Args:
+        kind: 'refused' before anything moved, or 'lost'.
+        text: for people.
+    """
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(kind, text)
+        self.kind, self.text = kind, text
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What every motion is made with.
+
+    Attributes:
+        tool: TCP in the flange's frame [m], [rad].
+        payload: [kg]; `centre` [m].
+    """
+
+    tool: tuple[float, ...]
+    payload: float
+    centre: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A program that moves the arm, and what has to hold around it.
+
+    Attributes:
+        program: text, waiting for `GO` before it moves anything.
+        number: its own.
+        start, end: joints [rad].
+        duration: of its path [s of controller time].
+        settings: read back before it may go.
+        stops: how many stops had been asked for when it was asked for; one more and it doesn't go.
+    """
+
+    program: str
+    number: int
+    start: tuple[float, ...]
+    end: tuple[float, ...]
+    duration: float
+    settings: Settings
+    stops: int
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One package of the controller.
+
+    Attributes:
+        time: of the controller [s]; `seen` [s of `time.monotonic`].
+        joints, speeds: measured [rad], [rad/s].
+        robot_mode, safety_mode, runtime: as numbers.
+        slider: 0 … 1.
+        payload: [kg]; `centre` [m].
+        number, status, clock, tool: of the program, see the registers.
+    """
+
+    time: float
+    seen: float
+    joints: tuple[float, ...]
+    speeds: tuple[float, ...]
+    robot_mode: int
+    safety_mode: int
+    runtime: int
+    slider: float
+    payload: float
+    centre: tuple[float, ...]
+    number: int
+    status: int
+    clock: float
+    tool: tuple[float, ...]
+
+    @property
+    def stands(self) -> bool:
+        """No joint moves."""
+        return max(map(abs, self.speeds)) < STANDSTILL
+
+
+STANDSTILL = 2e-3
+"""Joint speed that counts as none [rad/s]."""
+
+Sample = tuple[float, tuple[float, ...], float]
+"""Controller time [s], joints [rad], time on the path [s]."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a motion is now, told unasked.
+
+    Attributes:
+        clock: time on the path [s].
+        joints: [rad].
+        moving: a joint moves.
+    """
+
+    clock: float
+    joints: tuple[float, ...]
+    moving: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a motion.
+
+    Attributes:
+        kind: 'completed', or why it was broken off: see `errors.ArmStoppedError`, or 'lost'.
+        text: why, for people.
+        samples: what was read from its go on.
+        clock: time on the path where it ended [s].
+        joints: where the arm stands [rad]; as last seen, if `standing` is None.
+        standing: when it was first seen at rest [s of `time.monotonic`].
+        moved: it had been told to go.
+        slider: the lowest it was seen at.
+    """
+
+    kind: str
+    text: str
+    samples: list[Sample]
+    clock: float
+    joints: tuple[float, ...]
+    standing: float | None
+    moved: bool = True
+    slider: float = 1.0
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the worker found out about a controller; see `facts.ArmFacts`."""
+
+    model: str
+    serial: str
+    version: tuple[int, ...]
+    remote: bool | None
+    program: str
+    reading: Reading
+    checksum: str
+    tool: tuple[float, ...]
+    ranges: tuple[tuple[float, float], ...] = field(default=())
+    speeds: tuple[float, ...] = field(default=())

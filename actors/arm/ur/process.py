@@ -1,0 +1,147 @@
+"""The worker as its driver sees it: calls with deadlines, stops that overtake them, and an end that is noticed.
+
+The worker isn't asked to die with the thread that started it, as Linux offers, for that thread may end while the arm
+moves. It ends when this process closes its side of the connection, in whatever way that happens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from multiprocessing.connection import Connection
+from typing import Any
+
+from actors.arm.ur.errors import ArmLostError, ArmRefusedError
+from actors.arm.ur.messages import Progress, TroubleError
+
+SIGN_OF_LIFE = 0.1
+"""Between two signs of life to the worker while a call is awaited [s]."""
+
+_NOISE_KEPT = 2000
+
+
+class WorkerProcess:
+    """One worker, from its start to its end; never restarted.
+
+    Attributes:
+        progress: what it last told of a motion.
+        pid: of the process.
+    """
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self._noise = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
+        with theirs:
+            command = [sys.executable, "-m", "actors.arm.ur.worker", str(theirs.fileno())]
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=self._noise,
+                stderr=self._noise,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,  # an interrupt at the keyboard is not for it
+            )
+        self.pid = self._process.pid
+        self._connection = Connection(ours.detach())
+        self._sending = threading.Lock()
+        self._pending: dict[int, Future[Any]] = {}
+        self._number = 0
+        self._gone = threading.Event()
+        self.progress: Progress | None = None
+        threading.Thread(target=self._hear, name="arm-worker", daemon=True).start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked."""
+        return not self._gone.is_set()
+
+    def call(self, method: str, *arguments: Any, deadline: float) -> Any:
+        """Have something done.
+
+        Args:
+            method: of `worker.Worker`.
+            arguments: plain values.
+            deadline: longest wait [s]; a worker that misses it is ended.
+
+        Raises:
+            ArmRefusedError: refused before anything moved.
+            ArmLostError: the controller can't be reached, or the worker died or missed its deadline.
+        """
+        future: Future[Any] = Future()
+        with self._sending:
+            self._number += 1
+            number = self._number
+            self._pending[number] = future
+        if not self.alive:
+            raise ArmLostError(self._obituary(method))
+        self._send(("call", number, method, arguments))
+        end = time.monotonic() + deadline
+        while time.monotonic() < end:
+            try:
+                return future.result(timeout=SIGN_OF_LIFE)
+            except FutureTimeoutError:
+                self._send(("alive",))
+            except TroubleError as trouble:
+                if trouble.kind == "refused":
+                    raise ArmRefusedError(trouble.text) from None
+                raise ArmLostError(trouble.text + self._said()) from None
+        self.kill()
+        raise ArmLostError(f"the arm's worker did not answer '{method}' within {deadline:g} s{self._said()}")
+
+    def stop(self, stops: int) -> None:
+        """Stop whatever moves; doesn't wait."""
+        self._send(("stop", stops))
+
+    def kill(self) -> None:
+        """End it: a motion under way ends by its watchdog."""
+        self._process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(5.0)
+        self._gone.wait(2.0)
+
+    def _send(self, message: Any) -> None:
+        with self._sending, contextlib.suppress(OSError):  # that it is gone is noticed where it is heard
+            self._connection.send(message)
+
+    def _hear(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                message = self._connection.recv()
+                if isinstance(message, Progress):
+                    self.progress = message
+                    continue
+                number, good, value = message
+                future = self._pending.pop(number, None)
+                if future is not None and good:
+                    future.set_result(value)
+                elif future is not None:
+                    future.set_exception(value)
+        self._gone.set()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(5.0)
+        with self._sending:
+            pending = list(self._pending.values())
+            self._pending.clear()
+            self._connection.close()
+        for future in pending:
+            future.set_exception(TroubleError("lost", self._obituary("a request")))
+
+    def _obituary(self, method: str) -> str:
+        return f"the arm's worker died during {method} (status {self._process.poll()}); connect again"
+
+    def _said(self) -> str:
+        """What it, or the client library in it, has printed."""
+        with contextlib.suppress(OSError, ValueError):
+            size = os.fstat(self._noise.fileno()).st_size
+            data = os.pread(self._noise.fileno(), _NOISE_KEPT, max(0, size - _NOISE_KEPT))
+            if text := data.decode("utf-8", "replace").strip():
+                return f" (it said: {text})"
+        return ""

@@ -1,0 +1,173 @@
+"""`python -m actors.arm.ur.worker FD`: the process that holds the client library, until its driver hangs up or dies.
+
+Whatever the library prints goes where standard output goes: the driver reads it if things go wrong. Requests are done
+one after the other; stops and signs of life are taken by a thread of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import os
+import queue
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
+from actors.arm.ur.link import Link
+from actors.arm.ur.messages import Facts, Motion, Outcome, Progress, Reading, TroubleError
+from actors.arm.ur.primary import Primary, PrimaryError
+from actors.arm.ur.recovery import recover
+from actors.arm.ur.watch import STOPPED_PROGRAM, Watch
+
+HANDS_IN_TIME = 3.0
+
+
+class Worker:
+    """What can be asked for.
+
+    Args:
+        connection: to the driver.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._sending = threading.Lock()
+        self._requests: queue.SimpleQueue[tuple[int, str, tuple[Any, ...]]] = queue.SimpleQueue()
+        self._link: Link | None = None
+        self._address = ""
+        self._watch: Watch | None = None
+        self._stops = 0
+        self._owner_seen = time.monotonic()
+
+    # ---- life
+
+    def serve(self) -> None:
+        """Until the driver hangs up."""
+        threading.Thread(target=self._hear, name="hear", daemon=True).start()
+        while True:
+            number, method, arguments = self._requests.get()
+            try:
+                answer = (number, True, getattr(self, method)(*arguments))
+            except TroubleError as trouble:
+                answer = (number, False, trouble)
+            except Exception as error:
+                answer = (number, False, TroubleError("lost", f"{method}: {error!r}"))
+            self._send(answer)
+
+    def _hear(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                request = self._connection.recv()
+                self._owner_seen = time.monotonic()
+                if request[0] == "stop":
+                    self._stops = max(self._stops, request[1])
+                    if (watch := self._watch) is not None:
+                        watch.order_stop()
+                elif request[0] == "call":
+                    self._requests.put(request[1:])
+        os._exit(0)  # the heartbeat ends with the process, and any motion with the heartbeat
+
+    def _send(self, message: Any) -> None:
+        with self._sending:
+            try:
+                self._connection.send(message)
+            except OSError:
+                os._exit(0)
+
+    def _tell(self, progress: Progress) -> None:
+        self._send(progress)
+
+    # ---- requests
+
+    def open(self, address: str, rate: float) -> Reading:
+        """Connect; nothing moves."""
+        self._address = address
+        self._link = Link(address, rate)
+        return self._link.fresh()
+
+    @property
+    def link(self) -> Link:
+        """To the controller."""
+        if self._link is None:
+            raise TroubleError("lost", "not connected")
+        return self._link
+
+    def facts(self) -> Facts:
+        """Who is there, and how it is; nothing moves."""
+        reading = self.link.fresh()
+        try:
+            with Dashboard(self._address) as dashboard:
+                version = _version(dashboard.ask("PolyscopeVersion"))
+                model = dashboard.ask("get robot model")
+                serial = dashboard.ask("get serial number")
+                program = dashboard.ask("programState")
+                remote = None if version[0] < 5 else dashboard.ask("is in remote control").lower() == "true"
+            primary = Primary(self._address)
+            primary.close()
+        except (DashboardError, PrimaryError) as error:
+            raise TroubleError("lost", str(error)) from None
+        return Facts(
+            *(model, serial, version, remote, program, reading),
+            *(primary.checksum, primary.tool, primary.ranges, primary.speeds),
+        )
+
+    def read(self) -> Reading:
+        """A fresh package."""
+        return self.link.fresh()
+
+    def run(self, motion: Motion) -> Outcome:
+        """Make a motion."""
+        watch = Watch(self.link, self._address, motion, self._tell, lambda: self._owner_seen)
+        self._watch = watch
+        try:
+            if self._stops > motion.stops:
+                watch.order_stop()
+            return watch.run()
+        finally:
+            self._watch = None
+
+    def hands_in(self) -> None:
+        """End any program, and see that none runs."""
+        end = time.monotonic() + HANDS_IN_TIME
+        refusal = ""
+        if self.link.fresh().runtime != STOPPED_PROGRAM:
+            try:
+                stop_program(self._address)
+            except DashboardError as error:
+                refusal = f" ({error})"
+        while self.link.fresh().runtime != STOPPED_PROGRAM:
+            if time.monotonic() > end:
+                raise TroubleError("refused", f"a program still runs on the controller{refusal}: keep hands out")
+        try:
+            with Dashboard(self._address) as dashboard:
+                answer = dashboard.ask("programState")
+        except DashboardError as error:
+            raise TroubleError("lost", str(error)) from None
+        if not answer.upper().startswith("STOPPED"):
+            raise TroubleError("refused", f"the controller says that its program is '{answer}': keep hands out")
+        if not self.link.fresh().stands:
+            raise TroubleError("refused", "the arm still moves: keep hands out")
+
+    def recover(self, scale: float) -> str:
+        """Make the robot ready after a stop; nothing moves but the brakes."""
+        return recover(self.link, self._address, scale)
+
+
+def _version(text: str) -> tuple[int, ...]:
+    numbers = "".join(c if c.isdigit() or c == "." else " " for c in text).split()
+    dotted = next((n for n in numbers if "." in n), "0.0")
+    return tuple(int(part) for part in dotted.split(".") if part)
+
+
+def main() -> None:
+    """Serve on the connection whose number is the first argument."""
+    faulthandler.enable()
+    Worker(Connection(int(sys.argv[1]))).serve()
+
+
+if __name__ == "__main__":
+    main()
