@@ -44,6 +44,8 @@ class PathReport:
         clearance: smallest distance of the pourer from the receiver [m].
         low, high: corners of the box that tool and pourer pass through, base frame [m].
         duration: of approach, pour and retreat together [s].
+        deviation: largest difference between the tilt that was asked for and the path's at the same time [rad]; more
+            than rounding only where a step in speed was asked for, which joints can't make.
     """
 
     joint_speed: float
@@ -56,6 +58,7 @@ class PathReport:
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     duration: float
+    deviation: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,267 @@
+"""What forbids a path, in words for the person who can change it: all of it at once, before anything moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.joint_path import JointPath, PathReport
+from actors.arm.path.kinematics import beyond_reach
+from actors.arm.path.limits import JOINT_NAMES, UPRIGHT
+from actors.arm.path.solids import Nearest, hull, nearest_links, nearest_to_receiver
+from actors.arm.path.stretch import Stretch
+from actors.arm.spec import UrArmSpec
+from actors.protocols import InvalidActionError
+from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+SLACK = 1e-6
+"""Relative: a path planned at a limit may lie above it by rounding."""
+
+LARGEST_STEP = math.radians(15.0)
+"""Of a joint between two waypoints [rad]: more is no path but a jump."""
+
+
+def check_stretch(stretch: Stretch, pourer: Vessel, receiver: Vessel) -> list[str]:
+    """What is wrong with a stretch, other than the distance of the pourer from the receiver."""
+    of_joints = (
+        []
+        if stretch.unreached
+        else [
+            *_ranges(stretch),
+            *_joint_speeds(stretch),
+            *_singular(stretch),
+            *_links(stretch, receiver),
+        ]
+    )
+    return [
+        *of_joints,
+        *_speeds(stretch, hull(pourer)),
+        *_tilts(stretch),
+        *_places(stretch, hull(pourer)),
+    ]
+
+
+def check_clearance(stretch: Stretch, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
+    """Where the pourer comes nearest to the receiver until a time [s], and what is wrong with that."""
+    nearest = nearest_to_receiver(stretch, until, pourer, receiver)
+    least = stretch.spec.limits.clearance
+    if nearest.distance >= least:
+        return nearest, []
+    tilt = math.degrees(float(stretch.tilts[nearest.index]))
+    how = (
+        f"would come within {1e3 * nearest.distance:.1f} mm of the receiver"
+        if nearest.distance > 0.0
+        else f"would run {-1e3 * nearest.distance:.1f} mm into the receiver"
+    )
+    return nearest, [
+        f"the pourer {how} at a tilt of {tilt:.0f} deg, {stretch.when(nearest.index)}; "
+        f"{1e3 * least:.0f} mm have to stay free: a larger x_offset or height clears it"
+    ]
+
+
+def check_reach(unreached: Stretch) -> str:
+    """What to say about a stretch of which some poses can't be reached, in any posture or in home's."""
+    beyond = beyond_reach(unreached.flange.rotation, unreached.flange.position, unreached.model)
+    worst = int(np.argmax(np.abs(beyond)))
+    # a way that can't be made has no pace yet
+    when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)
+    distance = 1e3 * float(beyond[worst])
+    if distance > 0.0:
+        return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer to the base"
+    if distance < 0.0:
+        return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it"
+    return (
+        f"the {unreached.name} can be made in another posture of the arm only, not in that of 'home'; "
+        "choose a 'home' with elbow or wrist bent the other way"
+    )
+
+
+def report(stretches: list[Stretch], clearance: float, pourer: Vessel, deviation: float) -> PathReport:
+    """What was found out about a whole path.
+
+    Args:
+        stretches: approach, pour, retreat.
+        clearance: smallest distance of pourer and receiver [m].
+        pourer: geometry.
+        deviation: of the tilt from what was asked for [rad].
+    """
+    joint_speeds = np.array([s.joint_speeds.max(axis=0) for s in stretches]).max(axis=0)
+    points = hull(pourer)
+    lows, highs = [], []
+    for s in stretches:
+        lows += [s.tool.min(axis=0), [_support(s, axis, points)[0].min() for axis in np.eye(3)]]
+        highs += [s.tool.max(axis=0), [-_support(s, -axis, points)[0].min() for axis in np.eye(3)]]
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    return PathReport(
+        joint_speed=float(joint_speeds.max()),
+        fastest_joint=int(np.argmax(joint_speeds)),
+        tool_speed=max(float(s.point_speeds(points).max()) for s in stretches),
+        tilt=max(float(s.tilts.max()) for s in stretches),
+        tilt_speed=max(float(s.turning.max()) for s in stretches),
+        singularity=min(float(s.margins.min()) for s in stretches),
+        clearance=clearance,
+        low=(float(low[0]), float(low[1]), float(low[2])),
+        high=(float(high[0]), float(high[1]), float(high[2])),
+        duration=sum(float(s.times[-1]) for s in stretches),
+        deviation=deviation,
+    )
+
+
+def recheck(path: JointPath, spec: UrArmSpec) -> None:
+    """Look at a path again right before it is executed, without knowing what it is for.
+
+    Ranges, joint speeds and jumps; tool centre point and the pourer's underside against box, planes and table.
+
+    Raises:
+        InvalidActionError: it must not be executed; with everything that is wrong.
+    """
+    times, joints = path.times, path.joints
+    if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), 6):
+        raise InvalidActionError("the path has no two waypoints of six joints each")
+    if not (np.isfinite(times).all() and np.isfinite(joints).all()) or times[0] != 0.0 or np.any(np.diff(times) <= 0):
+        raise InvalidActionError("the path's times should increase from 0, and all its numbers be finite")
+    problems = []
+    jumps = np.abs(np.diff(joints, axis=0))
+    if jumps.max() > LARGEST_STEP:
+        row, joint = divmod(int(np.argmax(jumps)), 6)
+        degrees = math.degrees(jumps.max())
+        problems.append(f"{JOINT_NAMES[joint]} would jump by {degrees:.0f} deg, {times[row]:.2f} s into the path")
+    stretch = Stretch.of("path", path, spec)
+    problems += [*_ranges(stretch), *_joint_speeds(stretch), *_places(stretch, np.zeros((1, 3)))]
+    if problems:
+        raise InvalidActionError(refusal(problems))
+
+
+def refusal(problems: list[str]) -> str:
+    """All problems of a path in one text."""
+    if len(problems) == 1:
+        return f"the arm can't make this pour: {problems[0]}"
+    return "the arm can't make this pour:\n" + "\n".join(f"  - {problem}" for problem in problems)
+
+
+def _ranges(s: Stretch) -> Iterator[str]:
+    for k, (name, most) in enumerate(zip(JOINT_NAMES, s.model.joint_range, strict=True)):
+        worst = int(np.argmax(np.abs(s.joints[:, k])))
+        angle = float(s.joints[worst, k])
+        if abs(angle) > most:
+            yield (
+                f"{name} would turn to {math.degrees(angle):.1f} deg, {s.when(worst)}; its range is "
+                f"±{math.degrees(most):.0f} deg: let it start a full turn back at 'home'"
+            )
+
+
+def _joint_speeds(s: Stretch) -> Iterator[str]:
+    for k, (name, own) in enumerate(zip(JOINT_NAMES, s.model.joint_speed, strict=True)):
+        most = min(own, s.spec.limits.joint_speed)
+        worst = int(np.argmax(s.joint_speeds[:, k]))
+        speed = float(s.joint_speeds[worst, k])
+        if speed > most * (1.0 + SLACK):
+            yield (
+                f"{name} would turn at {math.degrees(speed):.0f} deg/s, {s.when(worst)}; "
+                f"{math.degrees(most):.0f} deg/s are allowed"
+            )
+
+
+def _singular(s: Stretch) -> Iterator[str]:
+    least = s.spec.limits.singularity
+    worst = np.argmin(s.margins, axis=0)
+    margins = s.margins[worst, np.arange(3)]
+    reach = abs(s.model.a2) + abs(s.model.a3)
+    shoulder, elbow, wrist = margins
+    if shoulder < least:
+        yield (
+            f"{s.when(worst[0])}: the wrist {1e3 * shoulder * reach:.0f} mm from above the base's axis, "
+            f"{1e3 * least * reach:.0f} mm are asked for; move the receiver away from the base"
+        )
+    asked = math.degrees(math.asin(least))
+    if elbow < least:
+        folded = math.cos(float(s.joints[worst[1], 2])) < 0.0
+        state, help_ = ("folded", "away from the base") if folded else ("straight", "nearer or lower")
+        yield (
+            f"{s.when(worst[1])}: elbow {math.degrees(math.asin(elbow)):.1f} deg from {state}, {asked:.1f} deg are "
+            f"asked for; move the receiver {help_}"
+        )
+    if wrist < least:
+        yield (
+            f"{s.when(worst[2])}: wrist 2 {math.degrees(math.asin(wrist)):.1f} deg from where joints 4 and 6 turn "
+            f"about one axis, {asked:.1f} deg are asked for; turn 'direction', or move the receiver sideways"
+        )
+
+
+def _speeds(s: Stretch, points: FloatArray) -> Iterator[str]:
+    speeds = s.point_speeds(points)
+    worst = int(np.argmax(speeds))
+    if speeds[worst] > s.spec.limits.tool_speed * (1.0 + SLACK):
+        yield (
+            f"tool or pourer would move at {speeds[worst]:.2f} m/s, {s.when(worst)}; "
+            f"{s.spec.limits.tool_speed:.2f} m/s are allowed"
+        )
+    worst = int(np.argmax(s.turning))
+    if s.turning[worst] > s.spec.limits.tilt_speed * (1.0 + 1e-4):
+        yield (
+            f"the pourer would turn at {math.degrees(s.turning[worst]):.0f} deg/s, {s.when(worst)}; "
+            f"{math.degrees(s.spec.limits.tilt_speed):.0f} deg/s are allowed"
+        )
+
+
+def _tilts(s: Stretch) -> Iterator[str]:
+    worst = int(np.argmax(s.tilts))
+    # on its way the pourer is full: what a pour may is not what an approach may
+    most = UPRIGHT if s.name == "approach" else s.spec.limits.tilt
+    if s.tilts[worst] > most * (1.0 + SLACK):
+        yield (
+            f"the pourer would lean {math.degrees(s.tilts[worst]):.1f} deg, {s.when(worst)}; "
+            f"{math.degrees(most):.1f} deg are allowed{' while it is full' if s.name == 'approach' else ''}"
+        )
+
+
+def _places(s: Stretch, points: FloatArray) -> Iterator[str]:
+    """Box, planes and table, for the TCP and points (V, 3) of the pourer."""
+    limits = s.spec.limits
+    for k, axis in enumerate("xyz"):
+        for sign, bound, word in ((1.0, limits.box_low[k], "least"), (-1.0, limits.box_high[k], "most")):
+            for thing, where, value in _beyond(s, sign * np.eye(3)[k], sign * bound, points):
+                yield (
+                    f"{thing} would leave the box at {axis} = {sign * value:.3f} m, {s.when(where)}; "
+                    f"at {word} {bound:.3f} m are allowed"
+                )
+    for number, plane in enumerate(limits.planes, 1):
+        for thing, where, value in _beyond(s, np.array(plane.normal), plane.offset, points):
+            yield f"{thing} would go {1e3 * (plane.offset - value):.1f} mm beyond plane {number}, {s.when(where)}"
+    table = s.spec.cell.table
+    for thing, where, value in _beyond(s, np.array([0.0, 0.0, 1.0]), table, points):
+        yield f"{thing} would go {1e3 * (table - value):.1f} mm below the table, {s.when(where)}"
+
+
+def _beyond(s: Stretch, normal: FloatArray, offset: float, points: FloatArray) -> Iterator[tuple[str, int, float]]:
+    """What would leave normal · point ≥ offset the farthest: its name, sample, and normal · point [m]."""
+    tool = s.tool @ normal
+    if tool.min() < offset:
+        yield "the tool", int(np.argmin(tool)), float(tool.min())
+    least, lowest = _support(s, normal, points)
+    if least.min() < offset:
+        where = int(np.argmin(least))
+        rim = points[lowest[where], 2] > 0.5 * points[:, 2].max() > 0.0
+        yield f"the pourer's {'rim' if rim else 'underside'}", where, float(least.min())
+
+
+def _support(s: Stretch, normal: FloatArray, points: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Smallest normal · point of the pourer's points (V, 3) at every sample [m], and which point; each (N,)."""
+    along = (normal @ s.pourer.rotation) @ points.T
+    return s.pourer.position @ normal + along.min(axis=1), along.argmin(axis=1)
+
+
+def _links(s: Stretch, receiver: Vessel) -> Iterator[str]:
+    table, cup = nearest_links(s, receiver)
+    if table.distance < 0.0:
+        yield f"the {table.name} would come {-1e3 * table.distance:.0f} mm too near to the table, {s.when(table.index)}"
+    if cup.distance < s.spec.limits.clearance:
+        yield (
+            f"the {cup.name} would come within {1e3 * cup.distance:.0f} mm of the receiver, {s.when(cup.index)}; "
+            f"{1e3 * s.spec.limits.clearance:.0f} mm have to stay free"
+        )

@@ -1,0 +1,172 @@
+"""From a pour's motion to joints over time: approach, pour, retreat, checked as a whole before the first movement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.joint_path import JointPath, PourPath
+from actors.arm.path.checks import check_clearance, check_reach, check_stretch, refusal, report
+from actors.arm.path.limits import check_limits
+from actors.arm.path.pace import STEEPEST, followable, pour_times
+from actors.arm.path.stretch import Phases, Stretch
+from actors.arm.path.travel import STEP, OutOfReachError, follow, home_pose, routes, travel
+from actors.arm.spec import UrArmSpec
+from actors.protocols import InvalidActionError
+from sim_engine.contact import rotations
+from sim_engine.motion import Phase, PourMotion, turn
+from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+ANGLE_ERROR, PLACE_ERROR = np.radians(0.1), 3e-4
+"""How far linear joints between two waypoints may leave the pose that is wanted [rad], [m]."""
+
+MOST_WAYPOINTS = 1_200
+"""Of a pour: they travel to the controller as a program."""
+
+OVER = 0.02
+"""Height above the receiver, beside `ArmLimits.clearance`, at which the pourer is carried over it [m]."""
+
+UNTILT_ACCELERATION = STEEPEST / 10.0
+"""Into and out of the turn back upright that a pour without a return ends with [rad/s²]."""
+
+
+def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Vessel) -> PourPath:
+    """Joints for a whole pour.
+
+    The arm goes from home to the pour's first pose in straight lines, the pourer upright: directly, or where that
+    is forbidden up, across the receiver's rim and down. It pours in the posture that it waits in (a change of posture
+    would have to pass a singularity with a full vessel), and goes back the way it came; a pour that ends tilted is
+    brought upright first.
+
+    Steps in speed, and accelerations above `pace.STEEPEST`, become ramps of that (`pace.followable`): each such turn
+    ends speed / STEEPEST later, and what follows is as much later. `PathReport.deviation` says how far the tilt is then
+    from the one asked for.
+
+    Args:
+        motion: as `sim_engine.motion.plan_motion` makes it.
+        spec: of the arm and its cell.
+        pourer, receiver: geometry of the scene's vessels.
+
+    Returns:
+        The path, with what was found out about it.
+
+    Raises:
+        InvalidActionError: it must not or can't be executed; the text lists everything that was found wrong.
+    """
+    problems = check_limits(spec)
+    if problems:
+        raise InvalidActionError(refusal(problems))
+    made = followable(motion)
+    phases: Phases = tuple((p.name, p.start, p.end) for p in made.phases)
+    approach, approached = _approach(made.sample(np.zeros(1))[0], spec, pourer, receiver, problems)
+    pour = None
+    try:
+        pour = _pour(made, np.array(spec.home) if approach is None else approach.joints[-1], spec)
+        during = Stretch.of("pour", pour, spec, phases)
+    except OutOfReachError as error:
+        during = Stretch.beyond("pour", pour_times(made), error.poses, spec, phases)
+        problems = [check_reach(during)]  # which is why the approach failed too, if it did
+    problems += check_stretch(during, pourer, receiver)
+    # hold, return and retreat pass through poses that tilt and approach have passed through
+    nearest, texts = check_clearance(during, made.phases[0].end, pourer, receiver)
+    if approached >= spec.limits.clearance or nearest.index > 0:  # its first pose is the approach's last
+        problems += texts
+    if pour is not None and len(pour.times) > MOST_WAYPOINTS:
+        problems.append(f"the pour needs {len(pour.times)} waypoints, a controller takes {MOST_WAYPOINTS}")
+    if problems or pour is None or approach is None:
+        raise InvalidActionError(refusal(problems))
+    retreat = _retreat(made, approach, pour, spec)
+    back = Stretch.of("retreat", retreat, spec)
+    problems = check_stretch(back, pourer, receiver)
+    if problems:
+        raise InvalidActionError(refusal(problems))
+    return PourPath(
+        approach=approach,
+        pour=pour,
+        retreat=retreat,
+        tilts=made.tilt(pour.times),
+        phases=phases,
+        report=report(
+            [Stretch.of("approach", approach, spec), during, back],
+            min(nearest.distance, approached),
+            pourer,
+            _deviation(motion, made),
+        ),
+    )
+
+
+def _approach(
+    start: FloatArray, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, problems: list[str]
+) -> tuple[JointPath | None, float]:
+    """The way there with the fewest problems, the shortest of those, and its clearance [m]; notes its problems."""
+    over = receiver.rim_height + spec.limits.clearance + OVER
+    best: tuple[JointPath | None, float, list[str]] | None = None
+    for knots in routes(home_pose(spec), start, over):
+        path: JointPath | None = None
+        try:
+            path = travel(knots, np.array(spec.home), spec)
+            stretch = Stretch.of("approach", path, spec)
+        except OutOfReachError as error:
+            stretch = Stretch.beyond(
+                "approach", np.linspace(0.0, STEP * len(error.poses), len(error.poses)), error.poses, spec
+            )
+            found, distance = [check_reach(stretch)], np.inf
+        else:
+            nearest, found = check_clearance(stretch, path.duration, pourer, receiver)
+            found += check_stretch(stretch, pourer, receiver)
+            distance = nearest.distance
+        if best is None or len(found) < len(best[2]):
+            best = (path, distance, found)
+        if not found:
+            break
+    assert best is not None
+    problems += best[2]
+    return best[0], best[1]
+
+
+def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSpec) -> JointPath:
+    """As few waypoints as follow the motion within the errors allowed."""
+    finer = 1
+    while True:
+        times = pour_times(motion, finer)
+        path = JointPath(times, follow(motion.sample(times), near, spec))
+        if finer >= 8 or _follows(path, motion, spec):
+            return path
+        finer *= 2
+
+
+def _follows(path: JointPath, motion: PourMotion, spec: UrArmSpec) -> bool:
+    middles = 0.5 * (path.times[1:] + path.times[:-1])
+    wanted = motion.sample(middles)
+    world = Stretch("pour", middles, path.at(middles), spec)
+    apart = np.linalg.norm(world.poses[:, :3] - wanted[:, :3], axis=-1)
+    turned = np.linalg.norm(rotations(world.poses) - rotations(wanted), axis=(1, 2)) / np.sqrt(2.0)
+    return bool(apart.max() < PLACE_ERROR and turned.max() < ANGLE_ERROR)
+
+
+def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: UrArmSpec) -> JointPath:
+    """Upright first, if the pour ends tilted; then the way back."""
+    times = approach.times[-1] - approach.times[::-1]
+    back = JointPath(times, approach.joints[::-1])
+    first, last = (float(motion.tilt(np.array([t]))[0]) - motion.tilt_error for t in (0.0, motion.duration))
+    if abs(last - first) < 1e-9:
+        return back
+    segments = tuple(turn(0.0, last, first, spec.untilt_speed, UNTILT_ACCELERATION))
+    end = segments[-1].start + segments[-1].duration
+    upright = replace(motion, segments=segments, phases=(Phase("untilt", 0.0, end),))
+    first_part = _pour(upright, pour.joints[-1], spec)
+    return JointPath(
+        np.concatenate([first_part.times, end + back.times[1:]]),
+        np.concatenate([first_part.joints, back.joints[1:]]),
+    )
+
+
+def _deviation(asked: PourMotion, made: PourMotion) -> float:
+    if asked is made:
+        return 0.0
+    times = np.linspace(0.0, made.duration, 2000)
+    return float(np.abs(asked.tilt(times) - made.tilt(times)).max())

@@ -1,0 +1,109 @@
+"""What takes up room: the pourer's outermost points, its distance from the receiver, the arm's links as capsules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from actors.arm.path.frames import cell_frames
+from actors.arm.path.kinematics import link_points
+from actors.arm.path.stretch import Stretch
+from sim_engine.contact import clearance
+from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+COARSE, FINE = 10e-3, 2e-3
+"""Way of any point of the pourer between two poses that are looked at, far from and near to the receiver [m]."""
+
+LINKS = (("upper arm", 1, 2, 0.08), ("forearm", 3, 4, 0.06), ("wrist", 4, 5, 0.06), ("wrist", 5, 6, 0.06),
+         ("wrist", 6, 7, 0.05), ("gripper", 7, 8, 0.04))  # fmt: skip
+"""Name, ends as `link_points` counts (8 is the TCP), radius [m]: rough, and the gripper's a guess at a slim one."""
+
+_hulls: WeakKeyDictionary[Vessel, FloatArray] = WeakKeyDictionary()
+
+
+def hull(vessel: Vessel) -> FloatArray:
+    """Corners of a vessel's convex hull, shape (V, 3) [m]: no point of it reaches farther."""
+    if vessel not in _hulls:
+        _hulls[vessel] = vessel.solid_vertices[ConvexHull(vessel.solid_vertices).vertices]
+    return _hulls[vessel]
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """Where two things come nearest to each other.
+
+    Attributes:
+        distance: [m]; negative where they overlap.
+        index: of the stretch's sample.
+        name: of the link, for those.
+    """
+
+    distance: float
+    index: int
+    name: str = ""
+
+
+def nearest_to_receiver(stretch: Stretch, until: float, pourer: Vessel, receiver: Vessel) -> Nearest:
+    """Where the pourer comes nearest to the receiver.
+
+    No point of the pourer moves by more than `FINE` between two poses that are looked at near the receiver, so that it
+    may be nearer by at most half of that in between.
+
+    Args:
+        stretch: of the path.
+        until: time from which on no new poses come [s].
+        pourer, receiver: geometry.
+    """
+    last = int(np.searchsorted(stretch.times, until + 1e-9))
+    poses = stretch.poses[:last]
+    centre, radius = pourer.bounding_sphere
+    farthest = float(np.linalg.norm(centre)) + radius
+    steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=-1)
+    steps += (stretch.turning * stretch.steps)[: last - 1] * farthest
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    coarse = _every(way, COARSE)
+    away = clearance(pourer, receiver, poses[coarse])
+    least = np.minimum(away[:-1], away[1:])
+    gaps = np.diff(way[coarse])
+    # between two poses that are a way w apart nothing can come nearer than the nearer one less w/2
+    doubtful = least - 0.5 * gaps < max(stretch.spec.limits.clearance, float(away.min()))
+    dense = _every(way, FINE)
+    gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
+    fine = dense[doubtful[gap]]
+    indices = np.concatenate([coarse, fine])
+    away = np.concatenate([away, clearance(pourer, receiver, poses[fine])])
+    best = int(np.argmin(away))
+    return Nearest(float(away[best]), int(indices[best]))
+
+
+def _every(way: FloatArray, step: float) -> NDArray[np.int64]:
+    """Samples at most `step` apart along a way, where the samples are that dense; the first and the last among them."""
+    marks = np.floor(way / step + 1e-9)
+    chosen = np.flatnonzero(np.diff(marks, prepend=-1.0) > 0)
+    return np.unique(np.append(chosen, len(way) - 1)).astype(np.int64)
+
+
+def nearest_links(stretch: Stretch, receiver: Vessel) -> tuple[Nearest, Nearest]:
+    """Where a link of the arm comes nearest to the table, and to the receiver as a cylinder."""
+    points = np.concatenate([link_points(stretch.joints, stretch.model), stretch.tool[:, None]], axis=1)
+    world = cell_frames(stretch.spec).world.inverse
+    table, cup = [], []
+    along = np.linspace(0.0, 1.0, 13)[:, None]
+    for name, first, second, radius in LINKS:
+        a, b = points[:, first, None], points[:, second, None]
+        line = a + (b - a) * along
+        above = line[..., 2].min(axis=1) - radius - stretch.spec.cell.table
+        table.append(Nearest(float(above.min()), int(np.argmin(above)), name))
+        inside = world.apply(line.reshape(-1, 3)).reshape(line.shape)
+        aside = np.hypot(inside[..., 0], inside[..., 1]) - receiver.outer_radius
+        over = np.maximum(inside[..., 2] - receiver.rim_height, -inside[..., 2])
+        outer = np.hypot(np.maximum(aside, 0.0), np.maximum(over, 0.0))
+        apart = (np.where(outer > 0.0, outer, np.maximum(aside, over)) - radius).min(axis=1)
+        cup.append(Nearest(float(apart.min()), int(np.argmin(apart)), name))
+    return min(table, key=lambda n: n.distance), min(cup, key=lambda n: n.distance)
