@@ -17,11 +17,14 @@ _FREE = ("source", "outputs", "resolved", "on_unknown")
 _TOLD = ("surface_tension", "dynamic_viscosity")
 """Properties of a liquid that decide which warnings are given, and no request."""
 
-_MACHINE = ("simulators", "in_process", "object_store_mb", "ray", "operator")
+_MACHINE = ("simulators", "in_process", "object_store_mb", "ray", "operator", "accepted_checksum")
 """Fields of a laboratory that belong to the machine or to who stands beside it, not to the campaign."""
 
 _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "handshake", "reconnect_time")}
 """Of its parts: a controller may get another address, a balance another socket."""
+
+_YOUNGER: dict[str, dict[str, Any]] = {"calibration": {"grid": {}, "thetas": 0}}
+"""Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
@@ -41,6 +44,10 @@ def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
             table = (table or {}).get(key)
         for name in names:
             (table or {}).pop(name, None)
+    for section, younger in _YOUNGER.items():
+        for name, unused in younger.items():
+            if data[section] is not None and data[section].get(name) == unused:
+                data[section].pop(name)
     for part in ("arm", "balance"):  # a run from before there were any may be gone on with
         if data["laboratory"].get(part) is None:
             data["laboratory"].pop(part, None)

@@ -13,7 +13,7 @@ from sim_engine.losses import MINIMUM_POURED, Loss
 from sim_engine.space import Space
 from sim_engine.task import Scene
 
-CalibrationName = Literal["C4"]
+CalibrationName = Literal["C1", "C2", "C3", "C4"]
 DeploymentName = Literal["D1", "D2", "D3"]
 
 
@@ -62,7 +62,7 @@ class RecordSet:
 
 @dataclass(frozen=True)
 class CalibrationPlan:
-    """C4 (and later C1–C3): which θ_s reproduces the weighed spills.
+    """C1, C2, C3 or C4: which θ_s reproduces the weighed spills.
 
     Attributes:
         actions: space in which calibration pours are designed and the prior g draws.
@@ -72,10 +72,12 @@ class CalibrationPlan:
         holdout: how many of them are kept for testing.
         records: weighed pours to calibrate on in place of new ones (split 'train' and 'test').
         transfer: weighed pours in another scene, scored only.
-        simulations: budget of the strategy.
+        simulations: budget of the strategy: single simulated pours, whichever it is.
         random_baseline: how many random θ are scored for comparison.
-        initial: random θ before the surrogate takes over.
-        kappa: κ of the lower confidence bound.
+        initial: C3, C4: random θ before the surrogate takes over.
+        kappa: C3, C4: κ of the lower confidence bound.
+        grid: C1: values tried of every searched θ_s, by name.
+        thetas: C2, C3: how many θ are tried, each on all training pours.
     """
 
     strategy: CalibrationName
@@ -91,6 +93,8 @@ class CalibrationPlan:
     random_baseline: int = 0
     initial: int = 8
     kappa: float = 2.0
+    grid: dict[str, int] = field(default_factory=dict)
+    thetas: int = 0
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,11 @@ import numpy as np
 from orchestrator.errors import RunError
 from orchestrator.flights import Order
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
-from orchestrator.strategies.calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration import Calibration
+from orchestrator.strategies.calibration_c1 import UniformGrid
+from orchestrator.strategies.calibration_c2 import StratifiedSampling
+from orchestrator.strategies.calibration_c3 import BayesianCalibration
+from orchestrator.strategies.calibration_c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.deployment import Deployment
 from orchestrator.strategies.deployment_d1 import OneShotPlanning
 from orchestrator.strategies.deployment_d2 import RealOnly
@@ -29,6 +33,12 @@ POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
 DEPLOYMENT, PREDICTION = "deployment:", "prediction:"
 """Names of a calibration's stages, and what those of receivers begin with."""
 
+_CALIBRATIONS: dict[str, type[Calibration]] = {
+    "C1": UniformGrid,
+    "C2": StratifiedSampling,
+    "C3": BayesianCalibration,
+    "C4": ContinuousBayesianCalibration,
+}
 _DEPLOYMENTS: dict[str, type[Deployment]] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 
 Results = Mapping[str, Mapping[str, Any]]
@@ -89,7 +99,7 @@ def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
 
 
 def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
-    """Pours (unless records take their place), C4, and what came of it beside its rivals."""
+    """Pours (unless records take their place), the strategy, and what came of it beside its rivals."""
     stages = []
     if plan.pour_count > 0:
 
@@ -99,7 +109,8 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
         stages.append(StageDefinition(POURS, pours, pours=True))
 
     def calibration(results: Results, seed: int) -> Strategy:
-        return ContinuousBayesianCalibration(plan, [scored.pour for scored in measured_pours(plan, results)], seed)
+        pours = [scored.pour for scored in measured_pours(plan, results)]
+        return _CALIBRATIONS[plan.strategy](plan, pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
         theta = SimulationParameters.model_validate(results[CALIBRATION]["theta"])

@@ -63,10 +63,11 @@ class PoursSection(Section):
 class CalibrationSection(Section):
     """Which parameters of the simulator reproduce the weighed spills."""
 
-    required: ClassVar[dict[str, str]] = {"pours": "{count: 32, holdout: 4}", "simulations": "108"}
+    required: ClassVar[dict[str, str]] = {"pours": "{count: 32, holdout: 4}"}
 
-    strategy: Literal["C4"] = "C4"
-    """C4: Bayesian optimisation of the mean discrepancy over the actions."""
+    strategy: Literal["C1", "C2", "C3", "C4"] = "C4"
+    """C1: uniform grid; C2: stratified sampling; C3: Bayesian optimisation, each θ on all training pours; C4: Bayesian
+    optimisation of the mean discrepancy over the actions, one simulation an iteration."""
 
     pourer: PathOr[VesselFile] | None = None
     """The campaign's unless given."""
@@ -84,13 +85,25 @@ class CalibrationSection(Section):
     """Pours to calibrate on."""
 
     simulations: PositiveCount | None = None
-    """Budget of simulations."""
+    """Budget of single simulated pours; C1 to C3 have it as a limit, or as all that says how many θ they try."""
+
+    grid: dict[Text, PositiveCount] | None = None
+    """C1: values of every searched parameter: {particles: 5, cohesion: 6}."""
+
+    per_axis: PositiveCount | None = None
+    """C1: as many values of each, in place of 'grid'."""
+
+    samples: PositiveCount | None = None
+    """C2: θ in all, in equal strata where the number fits, else a Latin hypercube."""
+
+    iterations: PositiveCount | None = None
+    """C3: θ in all, each simulated on all training pours."""
 
     initial: PositiveCount = 8
-    """Random parameters before the surrogate takes over."""
+    """C3, C4: random parameters before the surrogate takes over."""
 
     kappa: Kappa = 2.0
-    """κ of the lower confidence bound."""
+    """C3, C4: κ of the lower confidence bound."""
 
     random_baseline: Count = 0
     """Random parameters that are scored for comparison."""

@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from actors.spec import LaboratorySpec
-from orchestrator.config.campaign import CalibrationSection, CampaignFile, DeploymentSection
+from orchestrator.config.campaign import CampaignFile, DeploymentSection
 from orchestrator.config.motion import ParametersBase
-from orchestrator.config.records_resolve import read_table, resolve_records
 from orchestrator.config.references import References
+from orchestrator.config.resolve_calibration import resolve_calibration
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place, Report
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
-from sim_engine.space import Space
 
 BELONGS_TO = {
     "iterations": ("D1",),
@@ -44,7 +43,9 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     _check_ranges(file, searched, root, report)
     calibration = deployment = None
     if file.calibration is not None:
-        calibration = _calibration(file.calibration, builder, fixed, searched, root.at("calibration"), laboratory)
+        calibration = resolve_calibration(
+            file.calibration, builder, fixed, searched, root.at("calibration"), laboratory
+        )
     if file.deployment is not None:
         deployment = _deployment(file.deployment, builder, root.at("deployment"), laboratory)
     broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
@@ -102,76 +103,6 @@ def _check_ranges(file: CampaignFile, searched: dict[str, Any], root: Place, rep
             "for example 'cohesion: [0 N/m, 0.1 N/m]'",
             key=True,
         )
-
-
-def _calibration(
-    section: CalibrationSection,
-    builder: SceneBuilder,
-    fixed: dict[str, float],
-    searched: dict[str, Any],
-    place: Place,
-    laboratory: LaboratorySpec | None,
-) -> CalibrationPlan | None:
-    report = builder.report
-    pours, at = section.pours, place.at("pours")
-    recorded = pours is not None and pours.source is not None
-    pourer = builder.pourer(section.pourer, place)
-    receiver = builder.receiver(section.receiver, place)
-    actions = builder.space(section.actions, section.motion, place)
-    motions = ((section.motion, place.at("motion")),)
-    searched_actions = () if actions is None else actions.names
-    table = read_table(pours, pours.source, at.at("from"), builder) if pours is not None else None
-    constants = {} if table is None else table.constants()
-    scene = builder.scene(
-        "calibration", pourer, receiver, motions, searched_actions, place, recorded=recorded, constants=constants
-    )
-    records = transfer = None
-    count = holdout = 0
-    if pours is not None and recorded:
-        for key in ("count", "holdout"):
-            if pours.value(key) is not None:
-                report.add(
-                    at.at(key), "belongs to pours that are still to be made; these are read 'from' a file", key=True
-                )
-        records, transfer = resolve_records(pours, at, builder, table, actions, scene, pourer, motions)
-    elif pours is not None:
-        for key in ("lip_radius", "transfer", "columns"):
-            if at.at(key).loc in at.document.marks:
-                report.add(at.at(key), "belongs to pours that are read 'from' a CSV file", key=True)
-        count = pours.count or 0
-        if not count and not report.is_broken(at) and not any(report.is_broken(at.at(k)) for k in ("count", "from")):
-            report.add(
-                at, "needs 'count' (pours to make on the bench) or 'from' (a CSV file of weighed pours)", key=True
-            )
-        holdout = max(1, count // 8) if pours.holdout is None and count > 1 else pours.holdout or 0
-        if count and holdout >= count:
-            report.add(at.at("holdout"), f"keeps {holdout} of {count} pours for testing, so that none is left to fit")
-        if count and laboratory is not None and not laboratory.pours:
-            report.add(
-                at.at("count"), f"laboratory '{laboratory.name}' has no bench to pour on; name a CSV file with 'from'"
-            )
-    if section.simulations is not None and section.initial > section.simulations:
-        key = "initial" if place.at("initial").loc in place.document.marks else "simulations"
-        report.add(
-            place.at(key), f"{section.initial} random parameters don't fit into {section.simulations} simulations"
-        )
-    if scene is None or actions is None or section.simulations is None or not searched:
-        return None
-    return CalibrationPlan(
-        strategy=section.strategy,
-        scene=scene,
-        actions=actions,
-        parameters=Space(tuple(searched.values())),
-        fixed_parameters=fixed,
-        pour_count=count,
-        holdout=holdout,
-        records=records,
-        transfer=transfer,
-        simulations=section.simulations,
-        random_baseline=section.random_baseline,
-        initial=section.initial,
-        kappa=section.kappa,
-    )
 
 
 def _deployment(

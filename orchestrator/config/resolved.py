@@ -71,11 +71,22 @@ def _calibration(plan: CalibrationPlan) -> dict[str, object]:
         **_scene(plan.scene),
         "actions": space_as_file(plan.actions),
         "pours": _pours(plan),
-        "simulations": plan.simulations,
-        "initial": plan.initial,
-        "kappa": plan.kappa,
+        **_budget(plan),
         "random_baseline": plan.random_baseline,
     }
+
+
+def _budget(plan: CalibrationPlan) -> dict[str, object]:
+    bayesian = {"initial": plan.initial, "kappa": plan.kappa}
+    match plan.strategy:
+        case "C1":
+            return {"grid": dict(plan.grid)}
+        case "C2":
+            return {"samples": plan.thetas}
+        case "C3":
+            return {"iterations": plan.thetas, **bayesian}
+        case "C4":
+            return {"simulations": plan.simulations, **bayesian}
 
 
 def _pours(plan: CalibrationPlan) -> dict[str, object]:

@@ -1,188 +1,83 @@
-"""C4: which θ_s makes simulated spills look like weighed ones, at one simulation per iteration."""
+"""What the calibration strategies share: asking, listening, dropping what failed, reporting θ*."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 
-from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
+from actors.optimizer.core.problem import Point, Suggestion
 from orchestrator.errors import LearningError
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.design import MeasuredPour
 from orchestrator.strategies.display import displayed_map
-from orchestrator.strategies.prior import actions_of_prior
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, normalised_spillage
 
-CONTEXT_SIZE = 24
-"""Actions over which the surrogate's answer is averaged."""
-
 MAP_RESOLUTION = 30
 
-LIVE_MAP_EVERY = 10
-"""Simulations between two maps for those who watch; one costs about 20 ms."""
 
-LIVE_MAP_RESOLUTION = 20
+class Calibration(ABC):
+    """Base of C1 to C4. Subclasses say what to try next (`_next`) and what a simulation tells (`_discrepancy`).
 
-
-class ContinuousBayesianCalibration:
-    """C4: minimise O2(θ) = E_{a~g} |c_r(a) − c_s(a, θ)| with one simulation per iteration.
-
-    The measured spillage is first regressed by a GP, so that a discrepancy can be formed at any action. Every iteration
-    simulates one θ at one action of the prior g; the surrogate does the averaging. Two things are done
-    differently from the paper, because both lower the variance at the same price:
-
-    * In place of independent draws the actions are a scrambled Sobol sequence: any run of consecutive iterations
-      covers g evenly.
-    * The discrepancy varies far more over actions than over θ, and |·| folds away its sign. So the surrogate is a GP of
-      the signed difference c_r − c_s over (θ, a), and what is minimised is the mean over g of the absolute
-      value that it predicts (`averaging='differences'`). With `averaging='noise'`, as in the paper, the surrogate
-      sees |c_r − c_s| over θ alone and takes the action's influence for noise.
-
-    g is uniform over the box of actions, but limited to where c_r is defined: actions at which less than 5 % is
-    expected to be poured are left out. A simulation that failed, or poured too little for c_s to be defined,
-    says nothing about its neighbours and is dropped. θ* minimises the posterior mean over the whole box: the lowest
-    observation would only be the luckiest.
-
-    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); a surrogate over both arguments of an expected cost:
-    Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
-    Limitations: θ that make the simulated pour stop short are judged only by the actions at which they do pour. With
-    `averaging='noise'` the optimiser sees heteroscedastic noise, large where the discrepancy varies over g.
+    Only pours of the split 'train' are used. A simulation that failed, or poured too little for c_s to be defined, says
+    nothing and is dropped.
     """
 
-    def __init__(
-        self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int, *, averaging: str = "differences"
-    ) -> None:
-        """Plan the campaign; only pours of the split 'train' are used.
+    NAME = ""
+
+    def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
+        """Plan the campaign.
 
         Raises:
             LearningError: fewer than two usable pours.
-            ValueError: no budget, or no such averaging.
         """
-        train = [pour for pour in measured if pour.split == "train"]
-        usable = [pour for pour in train if pour.spillage is not None]
-        if len(usable) < 2:
+        self._train = [pour for pour in measured if pour.split == "train"]
+        self._usable = [pour for pour in self._train if pour.spillage is not None]
+        if len(self._usable) < 2:
             raise LearningError(
-                f"calibration needs at least 2 training pours with ≥ {MINIMUM_POURED:.0%} poured, got {len(usable)} "
-                f"of {len(train)}; make more pours, or let them tilt farther (max_angle)"
+                f"calibration needs at least 2 training pours with ≥ {MINIMUM_POURED:.0%} poured, got "
+                f"{len(self._usable)} of {len(self._train)}; make more pours, or let them tilt farther (max_angle)"
             )
-        if plan.simulations < 1:
-            raise ValueError(f"calibration needs a budget of simulations, got {plan.simulations}")
-        if averaging not in ("differences", "noise"):
-            raise ValueError(f"averaging must be 'differences' or 'noise', got {averaging!r}")
         self._plan = plan
-        self._averaging = averaging
-        self._seeds = SeedStream(seed, "C4")
+        self._seeds = SeedStream(seed, self.NAME)
         self._questions = Questions(self._seeds)
         self._trials = Trials()
-        self._started = False
         self._width_known = False
-        self._mapped = 0
-        self._final: Suggestion | None = None
-        self._actions: tuple[Point, ...] = ()
-        self._measured_at: tuple[float, ...] = ()
-        self._expected: dict[Simulate, float] = {}
         self._undefined = 0
+        self._best: Point | None = None
+        self._expected: tuple[float, float] = (0.0, 0.0)
+        self._final: Suggestion | None = None
         self.decisions: list[Decision] = []
-        self._train = train
-        self._usable = usable
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
     @property
     def finished(self) -> bool:
         """θ* is known."""
-        return self._final is not None
+        return self._best is not None and not self._questions.out
 
     def ask(self, slots: Slots) -> list[Request]:
-        """Regress c_r once; then θ by θ, one simulation each; last, θ*."""
+        """What is queued, and what comes next as soon as its premises are known."""
         if not self._width_known and slots.simulations > 0:
-            self._trials.width, self._width_known = slots.simulations, True
+            self._trials.width, self._width_known = self._trials_at_once(slots.simulations), True
         simulations = self._trials.issue(slots.simulations)
-        if not self._started:
-            self._started = True
-            self._ask_regression()
-        elif self._actions and not self.finished and not self._questions.out and not self._trials.queued:
-            self._ask_parameters()
+        if not self.finished and not self._questions.out and not self._trials.queued:
+            self._next()
+            simulations += self._trials.issue(slots.simulations - len(simulations))
         # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
         return [*self._questions.issue(), *simulations]
 
-    def _ask_regression(self) -> None:
-        """c_r(a), and whether it is defined, along the prior's sequence of actions."""
-        sequence = actions_of_prior(self._plan.actions, 2 * self._plan.simulations, self._seeds.next())
-        encode = self._plan.actions.encode
-        spillage, poured = Data(), Data()
-        for pour in self._train:
-            point = tuple(encode({name: _number(pour, name) for name in self._plan.actions.names}))
-            poured = poured.added(point, pour.poured)
-            if pour.spillage is not None:
-                spillage = spillage.added(point, pour.spillage)
-        problem = SuggestProblem(self._plan.actions, spillage, count=0, predict_at=sequence)
+    @abstractmethod
+    def _next(self) -> None:
+        """Put the next question, queue trials, or conclude. Nothing is queued and no question is out."""
 
-        def with_poured(regression: Suggestion, likely: Suggestion | None) -> None:
-            keep = [
-                i
-                for i in range(len(sequence))
-                if likely is None or likely.predictions[i] - likely.prediction_deviations[i] >= MINIMUM_POURED
-            ][: self._plan.simulations]
-            if not keep:
-                raise LearningError(
-                    f"at no action of the calibration's space would {MINIMUM_POURED:.0%} of the liquid be poured, as "
-                    "far as the weighed pours tell; let it tilt farther (max_angle)"
-                )
-            # few places may be left where c_r is defined: they are used again
-            order = [keep[i % len(keep)] for i in range(self._plan.simulations)]
-            self._actions = tuple(sequence[i] for i in order)
-            self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
-            self.decisions.append(
-                Decision(f"c_r(a) regressed from {len(self._usable)} pours", dict(regression.hyperparameters or {}))
-            )
-
-        def with_spillage(regression: Suggestion) -> None:
-            if len(self._usable) == len(self._train):
-                with_poured(regression, None)
-            else:
-                where_defined = SuggestProblem(self._plan.actions, poured, count=0, predict_at=sequence)
-                self._questions.put(where_defined, "regress", lambda likely: with_poured(regression, likely))
-
-        self._questions.put(problem, "regress", with_spillage)
-
-    def _ask_parameters(self) -> None:
-        """The next θ, or θ* once the budget is spent."""
-        remaining = self._plan.simulations - len(self._trials)
-        if remaining <= 0:
-            if self._trials.idle:
-                problem = self._problem(everything=True, acquisition="posterior_minimum", resolution=MAP_RESOLUTION)
-                self._questions.put(problem, "conclude", self._conclude)
-            return
-        if len(self._trials) == 0:
-            count = min(max(self._plan.initial, 1), remaining)
-            problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
-            self._questions.put(problem, "start", self._queue)
-        elif self._trials.ready:
-            self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
-
-    def _live_resolution(self) -> int:
-        """Resolution of the map that the next answer carries for those who watch; mostly 0, for none."""
-        if len(self._trials) - self._mapped < LIVE_MAP_EVERY:
-            return 0
-        self._mapped = len(self._trials)
-        return LIVE_MAP_RESOLUTION
-
-    def _problem(self, *, everything: bool = False, acquisition: str = "lcb", resolution: int = 0) -> SuggestProblem:
-        data = self._trials.data(everything=everything)
-        return SuggestProblem(
-            self._plan.parameters,
-            data,
-            pending=() if everything else self._trials.pending(),
-            acquisition=acquisition,  # type: ignore[arg-type]
-            kappa=self._plan.kappa,
-            map_resolution=resolution,
-            context=self._actions[:CONTEXT_SIZE] if self._averaging != "noise" else (),
-        )
+    def _trials_at_once(self, slots: int) -> int:
+        """Trials that are in flight at a time."""
+        return slots
 
     # -- listening -------------------------------------------------------------------------------------------------
 
@@ -191,44 +86,41 @@ class ContinuousBayesianCalibration:
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            self._trials.settle(request, self._discrepancy(request, outcome))
+            self._trials.settle(request, self._judged(request, outcome))
         else:
             raise ValueError(f"calibration asks for no {type(request).__name__}")
 
-    def _queue(self, suggestion: Suggestion) -> None:
-        for i, point in enumerate(suggestion.points):
-            index = len(self._trials)
-            theta = self.parameters_at(point)
-            action = self._plan.scene.action(self._plan.actions.decode(self._actions[index]))
-            request = Simulate(self._plan.scene.name, action, theta, self._seeds.next(), "calibrate")
-            context = self._actions[index] if self._averaging != "noise" else ()
-            self._expected[request] = self._measured_at[index]
-            self._trials.add(Trial(point, (request,), context))
-            if suggestion.means:
-                text = f"θ {_described(self._values(point))}: expected |Δ| {max(suggestion.means[i], 0.0):.3f}"
-                self.decisions.append(Decision(text, {"mean": suggestion.means[i], "sd": suggestion.deviations[i]}))
-
-    def _discrepancy(self, request: Simulate, outcome: Outcome) -> float | None:
-        """Δ = |c_r(a) − c_s(a, θ)|; None where it is undefined or the simulation failed."""
+    def _judged(self, request: Simulate, outcome: Outcome) -> float | None:
         if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
             return None
         simulated = normalised_spillage(outcome.outcome.fractions)
         if simulated is None:
             self._undefined += 1
             return None
-        difference = self._expected[request] - simulated
-        return abs(difference) if self._averaging == "noise" else difference
+        return self._discrepancy(request, simulated)
 
-    def _conclude(self, suggestion: Suggestion) -> None:
+    @abstractmethod
+    def _discrepancy(self, request: Simulate, simulated: float) -> float:
+        """What a simulation's c_s(a, θ) tells about Δ."""
+
+    def _settle(self, point: Point, mean: float, deviation: float) -> None:
+        """θ* is found: where, and what discrepancy is expected there."""
+        self._best, self._expected = point, (mean, deviation)
+        text = f"θ* {described(self._values(point))}: |Δ| {max(mean, 0.0):.3f} ± {deviation:.3f}"
+        self.decisions.append(Decision(text, {"mean": mean, "sd": deviation}))
+
+    def _settle_at_minimum(self, suggestion: Suggestion) -> None:
+        """θ* is the proposed minimiser of the posterior mean."""
         if not suggestion.means:
-            raise LearningError(
-                f"calibration learnt nothing: of {self._trials.answered} simulations {self._trials.lost} gave no "
-                "discrepancy (see their reasons in the journal)"
-            )
+            raise self._nothing_learnt()
         self._final = suggestion
-        values = _described(self._values(suggestion.points[0]))
-        text = f"θ* {values}: |Δ| {max(suggestion.means[0], 0.0):.3f} ± {suggestion.deviations[0]:.3f}"
-        self.decisions.append(Decision(text, {"mean": suggestion.means[0], "sd": suggestion.deviations[0]}))
+        self._settle(suggestion.points[0], suggestion.means[0], suggestion.deviations[0])
+
+    def _nothing_learnt(self) -> LearningError:
+        return LearningError(
+            f"calibration learnt nothing: of {self._trials.answered} simulations {self._trials.lost} gave no "
+            "discrepancy (see their reasons in the journal)"
+        )
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -243,54 +135,51 @@ class ContinuousBayesianCalibration:
         Raises:
             RuntimeError: the calibration isn't finished.
         """
-        if self._final is None:
+        if self._best is None:
             raise RuntimeError("the calibration isn't finished")
-        return self.parameters_at(self._final.points[0])
+        return self.parameters_at(self._best)
 
     def _values(self, point: Point) -> dict[str, float]:
         return self._plan.parameters.decode(point)
 
+    @property
+    @abstractmethod
+    def _budget(self) -> int:
+        """Simulations in all."""
+
     def progress(self) -> tuple[int, int]:
         """Simulations answered, simulations in all."""
-        return self._trials.answered, self._plan.simulations
+        return self._trials.answered, self._budget
+
+    @abstractmethod
+    def _row(self, number: int, trial: Trial) -> Mapping[str, object]:
+        """What the result has of a trial beside its θ."""
 
     def result(self) -> dict[str, object]:
-        """θ* with its predicted discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
+        """θ* with its expected discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
+        trials = [(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed]
         result: dict[str, object] = {
+            "strategy": self.NAME,
             "simulations": self._trials.answered,
             "lost": self._trials.lost,
             "undefined": self._undefined,
             "training_pours": len(self._usable),
-            "trials": [
-                {
-                    "theta": self._values(t.point),
-                    "action_si": {name: getattr(t.requests[0].action, name) for name in self._plan.actions.names},
-                    "measured": self._measured_at[i],
-                    "discrepancy": None if t.cost is None else abs(t.cost),
-                    "difference": t.cost if self._averaging == "differences" else None,
-                }
-                for i, t in enumerate(self._trials.all)
-                if t.closed
-            ],
+            "trials": [{"theta": self._values(trial.point), **self._row(i, trial)} for i, trial in trials],
         }
-        if self._final is not None:
+        if self.finished:
+            mean, deviation = self._expected
+            final = self._final
             result |= {
                 "theta": self.theta.model_dump(),
                 "searched": list(self._plan.parameters.names),
-                "predicted_discrepancy": self._final.means[0],
-                "predicted_deviation": self._final.deviations[0],
-                "hyperparameters": self._final.hyperparameters,
-                "map": displayed_map(self._final.surrogate, self._plan.parameters),
+                "predicted_discrepancy": mean,
+                "predicted_deviation": deviation,
+                "hyperparameters": None if final is None else final.hyperparameters,
+                "map": None if final is None else displayed_map(final.surrogate, self._plan.parameters),
             }
         return result
 
 
-def _number(pour: MeasuredPour, name: str) -> float:
-    value = getattr(pour.action, name)
-    if value is None:
-        raise ValueError(f"{name} is searched, but switched off in a measured pour")
-    return float(value)
-
-
-def _described(values: dict[str, float]) -> str:
+def described(values: Mapping[str, float]) -> str:
+    """Parameters for people: 'particles 1200  cohesion 0.031'."""
     return "  ".join(f"{name} {value:.4g}" for name, value in values.items())

@@ -102,10 +102,14 @@ class Trials:
     def _horizon(self) -> int:
         return max(0, len(self.all) - self.width + 1)
 
+    def counting(self, *, everything: bool = False) -> list[Trial]:
+        """Closed trials that the next choice may use, in the order of asking; `everything`: all that are closed."""
+        trials = self.all if everything else self.all[: self._horizon]
+        return [trial for trial in trials if trial.closed]
+
     def data(self, *, everything: bool = False) -> Data:
         """Observations that the next choice may use; `everything`: all answers that are in."""
-        trials = self.all if everything else self.all[: self._horizon]
-        observed = [(t, cost) for t in trials if t.closed and (cost := t.cost) is not None]
+        observed = [(t, cost) for t in self.counting(everything=everything) if (cost := t.cost) is not None]
         return Data(tuple((*t.point, *t.context) for t, _ in observed), tuple(cost for _, cost in observed))
 
     def pending(self, *, everything: bool = False) -> tuple[Point, ...]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from orchestrator.strategies.calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration_c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.deployment_d3 import Hybrid
 from orchestrator.strategies.design import MeasuredPour
 from orchestrator.strategies.evaluation import Evaluation, ScoredPour, random_parameters

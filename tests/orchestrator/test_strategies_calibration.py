@@ -8,7 +8,7 @@ from orchestrator.errors import LearningError
 from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
 from orchestrator.stages import POURS, measured_pours
 from orchestrator.strategies.baselines import mean_predictor_discrepancy, regression_discrepancy
-from orchestrator.strategies.calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration_c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.design import DesignedPours, MeasuredPour, choose_holdout, stratified
 from orchestrator.strategies.evaluation import Evaluation, ScoredPour, random_parameters
 from sim_engine.liquid import SimulationParameters

@@ -1,0 +1,104 @@
+"""What campaigns may say about strategies: their own keys, what they cost, and errors that say where."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from orchestrator.config.errors import ConfigError
+from orchestrator.config.load import load_campaign
+from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import CampaignPlan
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+CALIBRATED = f"""\
+name: test
+laboratory: {CONFIGS}/laboratories/virtual.yaml
+liquid: {{name: water, mass: 200 g}}
+pourer: {CONFIGS}/vessels/beaker.yaml
+receiver: {CONFIGS}/vessels/tumbler.yaml
+motion: {{max_angle: 110 deg, x_offset: 110 mm, height: 90 mm}}
+simulator:
+  parameters:
+    particles: {{range: [500, 2500], scale: log}}
+    cohesion: [0 N/m, 0.1 N/m]
+calibration:
+  actions: {{angular_velocity: [15 deg/s, 120 deg/s]}}
+  pours: {{count: 32, holdout: 4}}
+"""
+
+
+def load(folder: Path, text: str) -> CampaignPlan:
+    path = folder / "campaign.yaml"
+    path.write_text(text)
+    return load_campaign(path)
+
+
+def refusal(folder: Path, text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load(folder, text)
+    assert str(caught.value).count("campaign.yaml:") == 1, "one cause, one message"
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("keys", "simulations", "grid", "thetas"),
+    [
+        ("strategy: C1\n  grid: {particles: 5, cohesion: 6}", 840, {"particles": 5, "cohesion": 6}, 0),
+        ("strategy: C1\n  per_axis: 10", 2800, {"particles": 10, "cohesion": 10}, 0),
+        ("strategy: C1\n  simulations: 504", 448, {"particles": 4, "cohesion": 4}, 0),
+        ("strategy: C2\n  samples: 18", 504, {}, 18),
+        ("strategy: C2\n  simulations: 520", 504, {}, 18),
+        ("strategy: C3\n  iterations: 59", 1652, {}, 59),
+        ("strategy: C3\n  simulations: 1652", 1652, {}, 59),
+        ("strategy: C4\n  simulations: 108", 108, {}, 0),
+        ("simulations: 108", 108, {}, 0),
+    ],
+)
+def test_budgets_count_single_simulated_pours(
+    keys: str, simulations: int, grid: dict[str, int], thetas: int, tmp_path: Path
+) -> None:
+    plan = load(tmp_path, f"{CALIBRATED}  {keys}\n")
+    assert plan.calibration is not None
+    found = plan.calibration
+    assert (found.simulations, found.grid, found.thetas) == (simulations, grid, thetas)
+    (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
+    assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ("strategy: C5", "calibration.strategy: 'C5' is not known here; should be 'C1', 'C2', 'C3' or 'C4'"),
+        ("strategy: C1", "calibration: key 'per_axis' is missing; add for example 'per_axis: 10'"),
+        ("strategy: C2", "calibration: key 'samples' is missing; add for example 'samples: 18'"),
+        ("strategy: C4", "calibration: key 'simulations' is missing; add for example 'simulations: 108'"),
+        ("strategy: C2\n  per_axis: 4", "calibration.per_axis: belongs to C1, not to C2; remove it"),
+        ("strategy: C1\n  per_axis: 4\n  kappa: 1", "calibration.kappa: belongs to C3 and C4, not to C1; remove it"),
+        ("strategy: C1\n  per_axis: 4\n  grid: {particles: 2, cohesion: 2}", "stands beside 'grid'; keep one"),
+        ("strategy: C1\n  grid: {particles: 4}", "grid: has no number of values for cohesion, which is searched"),
+        ("strategy: C1\n  grid: {particles: 4, cohesion: 2, friction: 2}", "grid.friction: is not searched"),
+        ("strategy: C1\n  grid: {particles: 4, cohesion: none}", "grid.cohesion: should be a whole number"),
+        ("strategy: C1\n  simulations: 100", "2 values of each searched parameter on 28 training pours take 112"),
+        ("strategy: C1\n  per_axis: 99999", "makes 9999800001 θ × 28 training pours"),
+        ("strategy: C3\n  simulations: 27", "not a single θ: each is simulated on all 28 training pours"),
+        ("strategy: C3\n  iterations: 5", "iterations: 8 random parameters don't fit into 5 θ"),
+        (
+            "strategy: C2\n  samples: 18\n  simulations: 400",
+            "samples: makes 18 θ × 28 training pours = 504 simulations; 'simulations' allows 400",
+        ),
+    ],
+)
+def test_a_budget_that_makes_no_sense_is_refused(keys: str, expected: str, tmp_path: Path) -> None:
+    assert expected in refusal(tmp_path, f"{CALIBRATED}  {keys}\n")
+
+
+def test_runs_from_before_the_other_strategies_can_be_gone_on_with(tmp_path: Path) -> None:
+    old = fingerprint(load(tmp_path, f"{CALIBRATED}  simulations: 108\n"))
+    assert not {"grid", "thetas"} & old["calibration"].keys()
+    new = fingerprint(load(tmp_path, f"{CALIBRATED}  strategy: C2\n  samples: 18\n"))
+    assert new["calibration"]["thetas"] == 18
