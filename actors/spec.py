@@ -37,6 +37,8 @@ class LaboratorySpec:
         arm: reached over its controller's wires, virtual or not; None for a bench of numbers, or none.
         balance: beside the arm; its time scale is the bench's.
         operator: beside the arm.
+        accepted_checksum: of the safety settings of hardware that people have accepted; '' if nobody has. Filled in
+            for a run, not part of a file.
     """
 
     name: str
@@ -49,6 +51,7 @@ class LaboratorySpec:
     arm: UrArmSpec | None = None
     balance: BalanceSpec | None = None
     operator: OperatorSpec = field(default_factory=lambda: OperatorSpec(answers="virtual"))
+    accepted_checksum: str = ""
 
     @property
     def pours(self) -> bool:

@@ -41,6 +41,13 @@ Answer = Annotated[
     ),
 ]
 Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
+Arm = Annotated[
+    bool,
+    typer.Option(
+        "--arm",
+        help="Arm hardware for this run only: shows what will move, and asks for the laboratory's name.",
+    ),
+]
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
 ]
@@ -85,6 +92,7 @@ def run(
     run_id: RunId = None,
     answer: Answer = None,
     in_process: InProcess = False,
+    arm: Arm = False,
     as_json: Json = False,
 ) -> None:
     """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/.
@@ -93,7 +101,16 @@ def run(
     """
     from orchestrator.commands import campaigns
 
-    _call(campaigns.run, campaign, resume=resume, run_id=run_id, answer=answer, in_process=in_process, as_json=as_json)
+    _call(
+        campaigns.run,
+        campaign,
+        resume=resume,
+        run_id=run_id,
+        answer=answer,
+        in_process=in_process,
+        as_json=as_json,
+        armed=arm,
+    )
 
 
 @app.command(
@@ -108,6 +125,7 @@ def calibrate(
     run_id: RunId = None,
     answer: Answer = None,
     in_process: InProcess = False,
+    arm: Arm = False,
     as_json: Json = False,
 ) -> None:
     """Only calibrate: find the θ whose simulated spills match the weighed ones (C4), and score it on unseen pours.
@@ -124,6 +142,7 @@ def calibrate(
         answer=answer,
         in_process=in_process,
         as_json=as_json,
+        armed=arm,
     )
 
 
@@ -269,6 +288,23 @@ def doctor(
     from orchestrator.commands import doctor as verb
 
     _call(verb.doctor, laboratory, accept_safety=accept_safety, tare=tare, as_json=as_json)
+
+
+@app.command(
+    epilog=examples(
+        "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
+        "decant jog configs/laboratories/ur10-kern.yaml --arm",
+    )
+)
+def jog(laboratory: Laboratory, arm: Arm = False) -> None:
+    """Move the arm by small, slow steps that are typed one by one, or bring it home.
+
+    'j5 +2' turns joint 5 by 2 deg, 'z -5' moves the tool by 5 mm, 'home' goes home. The first step along an axis is
+    confirmed by Enter; Ctrl-C stops the arm.
+    """
+    from orchestrator.commands import jog as verb
+
+    _call(verb.jog, laboratory, armed=arm)
 
 
 @app.command(

@@ -13,6 +13,7 @@ from orchestrator.commands.common import (
     RefusalError,
     check_campaign_can_run,
     check_laboratory_answers,
+    check_somebody_is_there,
     print_json,
     read_campaign,
     run_in_front_of_people,
@@ -26,17 +27,33 @@ if TYPE_CHECKING:
 THETA_FILE = "theta.json"
 
 
-def run(path: Path, *, resume: bool, run_id: str | None, answer: str | None, in_process: bool, as_json: bool) -> None:
+def run(
+    path: Path,
+    *,
+    resume: bool,
+    run_id: str | None,
+    answer: str | None,
+    in_process: bool,
+    as_json: bool,
+    armed: bool = False,
+) -> None:
     """The whole campaign."""
     plan = read_campaign(path)
     check_campaign_can_run(plan)
-    finished = _run(plan, "run", path, resume, run_id, answer, in_process, None)
+    finished = _run(plan, "run", path, resume, run_id, answer, in_process, None, armed)
     if as_json:
         print_json({"run": finished.result.directory.name, **finished.summary})
 
 
 def calibrate(
-    path: Path, *, resume: bool, run_id: str | None, answer: str | None, in_process: bool, as_json: bool
+    path: Path,
+    *,
+    resume: bool,
+    run_id: str | None,
+    answer: str | None,
+    in_process: bool,
+    as_json: bool,
+    armed: bool = False,
 ) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
     from orchestrator.stages import calibration_stages
@@ -48,7 +65,7 @@ def calibrate(
     stages = calibration_stages(plan.calibration)
     plan = dataclasses.replace(plan, deployment=None)
     check_campaign_can_run(plan)
-    finished = _run(plan, "calibrate", path, resume, run_id, answer, in_process, stages)
+    finished = _run(plan, "calibrate", path, resume, run_id, answer, in_process, stages, armed)
     if as_json:
         print_json(calibration_json(finished))
 
@@ -99,7 +116,7 @@ def plan_pour(
     planning = deployment_stages(plan, plan.deployment)
     stages = [*planning, *prediction_stages(plan, plan.deployment, seeds)]
     check_laboratory_answers(plan, stages, in_process=in_process)
-    directory = _run_directory(plan, resume=False, run_id=None)
+    directory = run_directory(plan, resume=False, run_id=None)
     if parameters is None:
         say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
     finished = run_in_front_of_people(
@@ -187,16 +204,30 @@ def _run(
     answer: str | None,
     in_process: bool,
     stages: list[StageDefinition] | None,
+    armed: bool,
 ) -> Finished:
+    from orchestrator.commands.arming import arm_campaign
     from orchestrator.stages import stages_of
 
     if answer is not None and not resume:
         raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
-    check_laboratory_answers(plan, stages_of(plan) if stages is None else stages, in_process=in_process)
-    directory = _run_directory(plan, resume=resume, run_id=run_id)
-    again = f"decant {verb} {path} --resume --run {directory.name}"
+    chosen = stages_of(plan) if stages is None else stages
+    checksum = arm_campaign(plan, chosen, armed=armed, verb=verb)
+    if any(stage.pours for stage in chosen):
+        check_somebody_is_there(plan.laboratory)
+    check_laboratory_answers(plan, chosen, in_process=in_process)
+    directory = run_directory(plan, resume=resume, run_id=run_id)
+    flag = " --arm" if plan.laboratory.mode == "hardware" else ""
+    again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
     finished = run_in_front_of_people(
-        plan, directory, resume=resume, stages=stages, in_process=in_process, again=again, answer=answer
+        plan,
+        directory,
+        resume=resume,
+        stages=stages,
+        in_process=in_process,
+        again=again,
+        answer=answer,
+        checksum=checksum,
     )
     calibrated = finished.result.results.get("calibration")
     if calibrated is not None:
@@ -206,7 +237,7 @@ def _run(
     return finished
 
 
-def _run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:
+def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:
     """A new run's directory, or the one to go on with.
 
     Raises:

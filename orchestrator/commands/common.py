@@ -10,12 +10,15 @@ import os
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 if TYPE_CHECKING:
+    from actors.operator import Operator
     from actors.protocols import Laboratory
+    from actors.spec import LaboratorySpec
     from orchestrator.campaign import CampaignResult
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
@@ -166,6 +169,7 @@ def run_in_front_of_people(
     in_process: bool = False,
     again: str,
     answer: str | None = None,
+    checksum: str | None = None,
 ) -> Finished:
     """Run a campaign with a live display, a recording, figures and a summary.
 
@@ -175,6 +179,7 @@ def run_in_front_of_people(
         in_process: everything in this process, without Ray (slower; for debugging).
         again: the command that resumes, for the message after an interruption.
         answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
+        checksum: of the safety settings that people have accepted for the controller of hardware.
 
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.
@@ -189,16 +194,21 @@ def run_in_front_of_people(
     from orchestrator.stages import stages_of
 
     chosen = tuple(stages_of(plan) if stages is None else stages)
-    spec = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
-    say(f"run {directory}  ({spec.mode} bench)" if any(s.pours for s in chosen) else f"run {directory}")
+    pouring = any(stage.pours for stage in chosen)
+    spec = replace(
+        plan.laboratory, in_process=in_process or plan.laboratory.in_process, accepted_checksum=checksum or ""
+    )
+    say(f"run {directory}  ({spec.mode} bench)" if pouring else f"run {directory}")
     if not resume:
         _warn_of_what_is_not_simulated(plan)
     monitor: RerunMonitor | None = None
     try:
-        laboratory = open_laboratory(spec, need_bench=any(stage.pours for stage in chosen))
+        display = ProgressDisplay(plan)
+        operator = person_at_the_terminal(spec, display.paused) if pouring else None
+        laboratory = open_laboratory(spec, need_bench=pouring, operator=operator)
         if plan.outputs.rrd:
             monitor = RerunMonitor(directory / "campaign.rrd", plan)
-        with ProgressDisplay(plan) as display:
+        with display:
             watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]
 
             async def work(laboratory: Laboratory) -> CampaignResult:
@@ -226,6 +236,40 @@ def run_in_front_of_people(
         if monitor is not None:
             monitor.close()
     return _report(plan, result, monitor)
+
+
+def person_at_the_terminal(
+    spec: LaboratorySpec, paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
+) -> Operator | None:
+    """Who answers the bench's questions; None where a virtual operator does.
+
+    Args:
+        spec: of the laboratory.
+        paused: entered while a question is open.
+    """
+    from actors.bench.open_wired import needs_person
+    from orchestrator.terminal_operator import TerminalOperator
+
+    if not needs_person(spec) or spec.arm is None:
+        return None
+    return TerminalOperator(spec.operator, paused=paused)
+
+
+def check_somebody_is_there(spec: LaboratorySpec) -> None:
+    """A bench that asks a person needs a terminal to ask at.
+
+    Raises:
+        RefusalError: there is none (exit code 2).
+    """
+    from actors.bench.open_wired import needs_person
+    from orchestrator.terminal_operator import somebody_at_the_terminal
+
+    if needs_person(spec) and not somebody_at_the_terminal():
+        raise RefusalError(
+            f"laboratory {spec.name} asks a person (operator: answers: person), and there is no terminal to ask at; "
+            "run this in a terminal, with nothing piped into it",
+            BAD_INPUT,
+        )
 
 
 def _way_on(directory: Path, again: str) -> str:

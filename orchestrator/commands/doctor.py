@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import getpass
-import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,10 +12,10 @@ from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_
 from orchestrator.commands.doctor_arm import judge
 from orchestrator.commands.doctor_balance import look_at_balance
 from orchestrator.commands.doctor_look import Check, Findings, look_at
+from orchestrator.commands.hands_on import reached
 from orchestrator.safety import SafetyRecord, SafetyRecordError, read_record, record_path, write_record
 
 if TYPE_CHECKING:
-    from actors.arm.spec import UrArmSpec
     from actors.spec import LaboratorySpec
 
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
@@ -56,7 +53,7 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
         if not accept_safety:
             raise RefusalError(str(error), BAD_INPUT) from None
         record = None
-    with _site(spec) as ready:
+    with reached(spec) as ready:
         assert ready.arm is not None
         found = look_at(ready.arm.address)
         if virtual:
@@ -106,41 +103,6 @@ def print_table(checks: list[Check]) -> None:
         table.add_row(Text(mark, style=style), Text(check.name), said)
     console = Console(highlight=False)
     (console if console.is_terminal else Console(highlight=False, width=1000)).print(table)
-
-
-@contextlib.contextmanager
-def _site(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
-    """The laboratory with its addresses: on hardware its own, else those of what is started for as long as this."""
-    if spec.mode == "hardware":
-        yield spec
-        return
-    from actors.bench.site import VirtualSite
-
-    assert spec.arm is not None
-    site = VirtualSite(spec.arm, spec.balance)
-    try:
-        where = site.addresses()
-        arm = dataclasses.replace(spec.arm, address=where.controller)
-        _install(arm)
-        balance = spec.balance
-        if balance is not None and balance.serial is not None:
-            serial = dataclasses.replace(balance.serial, port=where.port)
-            balance = dataclasses.replace(balance, serial=serial)
-        yield dataclasses.replace(spec, arm=arm, balance=balance)
-    finally:
-        site.close()
-
-
-def _install(arm: UrArmSpec) -> None:
-    """On a real controller somebody has set TCP and payload in the installation; on a fresh virtual one nobody has."""
-    from actors.arm.survey import SCRIPTS
-
-    tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
-    centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
-    program = f"def install():\n  set_tcp(p[{tool}])\n  set_payload({arm.payload!r}, [{centre}])\nend\n"
-    with socket.create_connection((arm.address, SCRIPTS), timeout=5.0) as connection:
-        connection.sendall(program.encode("ascii"))
-        time.sleep(0.3)
 
 
 def _virtual_record(found: Findings) -> SafetyRecord | None:

@@ -1,0 +1,131 @@
+"""An arm for one command at the terminal: connected, its safety settings compared, stopped when somebody says so."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from actors.arm.checksum import ChecksumError
+from orchestrator.commands.common import BAD_INPUT, RefusalError, say
+from orchestrator.safety import SafetyRecordError, read_record
+
+if TYPE_CHECKING:
+    from actors.arm.spec import UrArmSpec
+    from actors.arm.ur.driver import UrArm
+    from actors.arm.ur.facts import ArmFacts
+    from actors.spec import LaboratorySpec
+
+T = TypeVar("T")
+
+
+@contextlib.contextmanager
+def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
+    """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this."""
+    if spec.mode == "hardware":
+        yield spec
+        return
+    from actors.bench.site import VirtualSite
+
+    assert spec.arm is not None
+    site = VirtualSite(spec.arm, spec.balance)
+    try:
+        where = site.addresses()
+        arm = dataclasses.replace(spec.arm, address=where.controller)
+        _install(arm)
+        balance = spec.balance
+        if balance is not None and balance.serial is not None:
+            serial = dataclasses.replace(balance.serial, port=where.port)
+            balance = dataclasses.replace(balance, serial=serial)
+        yield dataclasses.replace(spec, arm=arm, balance=balance)
+    finally:
+        site.close()
+
+
+def _install(arm: UrArmSpec) -> None:
+    """On a real controller somebody has set TCP and payload in the installation; on a fresh virtual one nobody has."""
+    from actors.arm.survey import SCRIPTS
+
+    tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
+    centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
+    program = f"def install():\n  set_tcp(p[{tool}])\n  set_payload({arm.payload!r}, [{centre}])\nend\n"
+    with socket.create_connection((arm.address, SCRIPTS), timeout=5.0) as connection:
+        connection.sendall(program.encode("ascii"))
+        time.sleep(0.3)
+
+
+@contextlib.contextmanager
+def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[UrArm, ArmFacts]]:
+    """The arm's driver, connected and locked; it is stopped and let go of in any case.
+
+    Args:
+        spec: of a laboratory that was reached.
+        accepted: checksum of the safety settings that people have accepted; not asked for where nothing is hardware.
+
+    Raises:
+        RefusalError: the arm isn't ready, or its safety settings are others.
+        LaboratoryError: it can't be reached.
+    """
+    from actors.arm.accepted import AcceptedArm
+    from actors.arm.ur.driver import UrArm
+
+    assert spec.arm is not None
+    arm = AcceptedArm(spec.arm, accepted or "") if spec.mode == "hardware" else UrArm(spec.arm)
+    try:
+        try:
+            facts = arm.connect()
+        except ChecksumError as error:
+            raise RefusalError(str(error), BAD_INPUT) from None
+        if facts.robot_mode != "running" or facts.safety_mode not in ("normal", "reduced"):
+            raise RefusalError(
+                f"arm at {spec.arm.address}: {facts.robot_mode}, safety {facts.safety_mode}; 'decant doctor' says what "
+                "to do about it"
+            )
+        yield arm, facts
+    finally:
+        arm.close()
+
+
+def accepted_for(path: Path) -> str | None:
+    """The checksum that people have accepted for a laboratory's file; None if none was.
+
+    Raises:
+        RefusalError: the record can't be read (exit code 2).
+    """
+    try:
+        record = read_record(path)
+    except SafetyRecordError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    return None if record is None else record.checksum
+
+
+def stoppable(arm: UrArm, motion: Callable[[], T]) -> T:
+    """Do something that moves the arm; Ctrl-C stops it, and the error that the stop causes is raised.
+
+    The motion runs in a thread: an interrupt must reach the arm as an order to stop, not tear the driver apart.
+    """
+    result: list[T] = []
+    failure: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            result.append(motion())
+        except BaseException as error:
+            failure.append(error)
+
+    thread = threading.Thread(target=work, name="motion", daemon=True)
+    thread.start()
+    while thread.is_alive():
+        try:
+            thread.join(0.1)
+        except KeyboardInterrupt:
+            say("\nstopping the arm …")
+            arm.stop()
+    if failure:
+        raise failure[0]
+    return result[0]

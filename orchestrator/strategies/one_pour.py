@@ -1,0 +1,74 @@
+"""A single pour that a person has chosen."""
+
+from __future__ import annotations
+
+from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.strategies.seeds import SeedStream
+from sim_engine.action import Action
+from sim_engine.losses import normalised_spillage
+from sim_engine.outcome import PourMeasurement
+from sim_engine.task import Scene
+
+
+class OnePour:
+    """Pour once, and keep what was weighed.
+
+    Args:
+        scene: to pour in.
+        action: how.
+        seed: of a virtual bench's chance.
+    """
+
+    def __init__(self, scene: Scene, action: Action, seed: int) -> None:
+        self._request = Pour(scene.name, action, 1, SeedStream(seed, "one pour").next())
+        self._asked = False
+        self._outcome: PourMeasurement | Failed | None = None
+        self.decisions = [Decision(f"one pour, as it was asked for: {action.display()}")]
+
+    @property
+    def finished(self) -> bool:
+        """It was poured, or came to nothing."""
+        return self._outcome is not None
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The pour, once."""
+        if self._asked or slots.pours < 1:
+            return []
+        self._asked = True
+        return [self._request]
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of it.
+
+        Raises:
+            ValueError: it was not asked for.
+        """
+        if request != self._request or not self._asked:
+            raise ValueError(f"this pour was not asked for: {request}")
+        match outcome:
+            case Poured(measurement):
+                self._outcome = measurement
+            case Failed():
+                self._outcome = outcome
+            case _:
+                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+
+    def progress(self) -> tuple[int, int]:
+        """Pours done, pours in all."""
+        return int(self.finished), 1
+
+    def result(self) -> dict[str, object]:
+        """Masses [kg], fractions, and r = spilled / poured; or why there are none."""
+        match self._outcome:
+            case PourMeasurement() as measured:
+                fractions = measured.fractions
+                return {
+                    "loaded": measured.loaded,
+                    "spilled": measured.spilled,
+                    "retained": measured.retained,
+                    "poured_fraction": fractions.poured,
+                    "spillage": normalised_spillage(fractions),
+                }
+            case Failed(kind, reason):
+                return {"failed": f"{kind}: {reason}"}
+        return {}

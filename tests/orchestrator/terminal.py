@@ -1,0 +1,89 @@
+"""A `decant` command in a real terminal, for tests: typed into, read from, ended with the test."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+from types import TracebackType
+
+
+class Terminal:
+    """A command at a pseudo-terminal of its own; a context manager.
+
+    Args:
+        arguments: of `decant`.
+        cwd: folder to run in.
+    """
+
+    def __init__(self, *arguments: str, cwd: str | None = None) -> None:
+        self._keys, theirs = pty.openpty()
+        code = "import sys; sys.argv[0] = 'decant'; from orchestrator.cli import main; main()"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code, *arguments],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            cwd=cwd,
+            env={**os.environ, "TERM": "dumb", "COLUMNS": "200", "PYTHONPATH": os.getcwd()},
+            start_new_session=True,
+        )
+        os.close(theirs)
+        self.screen = ""
+        self._seen = 0
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(15)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        os.close(self._keys)
+
+    def expect(self, text: str, patience: float = 40.0) -> None:
+        """Read until the screen shows it, after what was expected before."""
+        end = time.monotonic() + patience
+        while text not in self.screen[self._seen :]:
+            if time.monotonic() > end or not self._read(0.2):
+                raise AssertionError(f"'{text}' did not come; the screen:\n{self.screen}")
+        self._seen = self.screen.index(text, self._seen) + len(text)
+
+    def type(self, text: str) -> None:
+        """Type a line; keys typed before the program reads are thrown away, so expect its prompt first."""
+        time.sleep(0.15)
+        os.write(self._keys, text.encode() + b"\n")
+
+    def interrupt(self) -> None:
+        """Ctrl-C, as the terminal would send it."""
+        os.kill(self.process.pid, signal.SIGINT)
+
+    def end(self, patience: float = 40.0) -> int:
+        """Wait for the command's end, and give its exit code."""
+        end = time.monotonic() + patience
+        while time.monotonic() < end:
+            if not self._read(0.2):
+                break
+        return self.process.wait(max(end - time.monotonic(), 1.0))
+
+    def _read(self, wait: float) -> bool:
+        """Take what has come; False once nothing more can."""
+        ready, _, _ = select.select([self._keys], [], [], wait)
+        if not ready:
+            return self.process.poll() is None
+        with contextlib.suppress(OSError):
+            if data := os.read(self._keys, 65536):
+                self.screen += data.decode("utf-8", "replace").replace("\r\n", "\n")
+                return True
+        return False
