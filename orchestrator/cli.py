@@ -41,6 +41,14 @@ Answer = Annotated[
     ),
 ]
 Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
+]
+SceneName = Annotated[
+    str | None,
+    typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),
+]
 Arm = Annotated[
     bool,
     typer.Option(
@@ -191,20 +199,14 @@ def plan(
 )
 def simulate(
     campaign: Campaign,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
-    ] = None,
+    assignments: Assignments = None,
     parameters: Parameters = None,
     receiver: Receiver = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the initial positions; the first of several.")] = 0,
     seeds: Annotated[
         int, typer.Option(min=1, max=1000, help="How many seeds: SEED, SEED + 1, … Their spread is told.")
     ] = 3,
-    scene: Annotated[
-        str | None,
-        typer.Option(help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),
-    ] = None,
+    scene: SceneName = None,
     as_json: Json = False,
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
     png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
@@ -305,6 +307,56 @@ def jog(laboratory: Laboratory, arm: Arm = False) -> None:
     from orchestrator.commands import jog as verb
 
     _call(verb.jog, laboratory, armed=arm)
+
+
+@app.command(
+    epilog=examples(
+        "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
+        "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --arm",
+        "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
+    )
+)
+def pour(
+    campaign: Campaign,
+    assignments: Assignments = None,
+    scene: SceneName = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Plan and check the whole path of the arm, show it, and move nothing.")
+    ] = False,
+    connect: Annotated[
+        bool, typer.Option("--connect", help="With --dry-run: also read whether the arm stands at home.")
+    ] = False,
+    png: Annotated[
+        Path | None, typer.Option(help="Draw the arm's path, from the side and from above.", show_default=False)
+    ] = None,
+    empty: Annotated[
+        bool, typer.Option("--empty", help="The whole cycle with an empty pourer, and nothing weighed.")
+    ] = False,
+    slow: Annotated[float, typer.Option(min=0.05, max=1.0, help="With --empty: fraction of the planned speed.")] = 1.0,
+    in_process: InProcess = False,
+    arm: Arm = False,
+    as_json: Json = False,
+) -> None:
+    """Pour once, with an action of your own, on the campaign's bench; or only plan it, or try it with an empty pourer.
+
+    A pour with liquid is journalled and weighed as a small run of its own; `--empty` leaves a record, pour.json.
+    """
+    from orchestrator.commands import pour as verb
+
+    _call(
+        verb.pour,
+        campaign,
+        assignments=assignments or [],
+        scene_name=scene,
+        dry_run=dry_run,
+        connect=connect,
+        png=png,
+        empty=empty,
+        slow=slow,
+        armed=arm,
+        in_process=in_process,
+        as_json=as_json,
+    )
 
 
 @app.command(

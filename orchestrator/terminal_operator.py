@@ -224,7 +224,8 @@ def _worded(question: Question) -> str:
     if question.problem:
         rows.append(textwrap.fill(f"Once more: {question.problem}", _WIDTH))
     rows.append(textwrap.fill(question.text, _WIDTH))
-    rows += [f"  {name}: {value}" for name, value in question.details.items()]
+    for name, value in question.details.items():
+        rows.append(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
     return "\n".join(rows)
 
 

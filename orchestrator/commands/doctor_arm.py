@@ -51,7 +51,7 @@ def judge(spec: UrArmSpec, found: Findings, record: SafetyRecord | None, *, acce
     if found.dashboard is not None:
         checks += _dashboard(spec, found, found.dashboard)
     if found.state is not None:
-        checks += [_checksum(found, record, accept), _tool(spec, found.state), _home(spec, found.state)]
+        checks += [_checksum(found, record, accept), _tool(spec, found.state), home_check(spec, found.state)]
         checks += _limits(spec, found.state)
     if found.exchange is not None:
         checks += [_payload(spec, found.exchange), _network(found.exchange)]
@@ -230,7 +230,8 @@ def _payload(spec: UrArmSpec, exchange: Exchange) -> Check:
     )
 
 
-def _home(spec: UrArmSpec, state: RobotState) -> Check:
+def home_check(spec: UrArmSpec, state: RobotState) -> Check:
+    """Whether the arm stands where it waits."""
     away = [abs(a - b) for a, b in zip(state.joints, spec.home, strict=True)]
     worst = max(range(6), key=away.__getitem__)
     if away[worst] <= HOME_TOLERANCE:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import socket
+import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -129,3 +131,17 @@ def stoppable(arm: UrArm, motion: Callable[[], T]) -> T:
     if failure:
         raise failure[0]
     return result[0]
+
+
+def typed_line(prompt: str) -> str:
+    """A line from the terminal; keys pressed before it was asked for are thrown away: they meant something else.
+
+    Raises:
+        EOFError: there are no more.
+    """
+    termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    print(prompt, end="", file=sys.stderr, flush=True)
+    line = sys.stdin.readline()
+    if not line:
+        raise EOFError
+    return line

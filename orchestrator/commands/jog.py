@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import sys
-import termios
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from actors.protocols import LaboratoryError
 from orchestrator.commands.arming import confirm, require_flag
 from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, say
 from orchestrator.commands.doctor import read_laboratory
-from orchestrator.commands.hands_on import accepted_for, connected, reached, stoppable
+from orchestrator.commands.hands_on import accepted_for, connected, reached, stoppable, typed_line
 
 if TYPE_CHECKING:
     from actors.arm.ur.driver import UrArm
@@ -236,16 +235,6 @@ def jog(path: Path, *, armed: bool) -> None:
             arm_spec = replace(ready.arm, announcement=ANNOUNCEMENT)
             with connected(replace(ready, arm=arm_spec), accepted) as (arm, facts):
                 say(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed")
-                Jogging(arm, arm_spec, _typed).run()
+                Jogging(arm, arm_spec, typed_line).run()
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None
-
-
-def _typed(prompt: str) -> str:
-    """A line from the terminal; keys pressed before it was asked for are thrown away: they meant something else."""
-    termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
-    print(prompt, end="", file=sys.stderr, flush=True)
-    line = sys.stdin.readline()
-    if not line:
-        raise EOFError
-    return line

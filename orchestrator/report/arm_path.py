@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _STAND = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-_WAYS = (("approach", style.GREY), ("pour", style.POURER), ("retreat", style.PALE))
+_WAYS = (("approach", "way there and back", style.GREY), ("pour", "pour", style.POURER))
 
 
-def path_png(file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str) -> Path:
+def path_png(
+    file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
+) -> Path:
     """Draw a path.
 
     Args:
@@ -36,6 +38,7 @@ def path_png(file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiv
         spec: of the arm and its cell.
         pourer, receiver: geometry.
         title: first line.
+        note: below the picture.
 
     Returns:
         `file`.
@@ -43,7 +46,7 @@ def path_png(file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiv
     from actors.arm.path.frames import cell_frames
     from actors.arm.path.stretch import Stretch
 
-    stretches = [Stretch.of(name, getattr(path, name), spec) for name, _ in _WAYS]
+    stretches = [Stretch.of(name, getattr(path, name), spec) for name, _, _ in _WAYS]
     world = cell_frames(spec).world.inverse
     box = world.apply(np.array(list(itertools.product(*zip(spec.limits.box_low, spec.limits.box_high, strict=True)))))
     base, table = world.apply(np.zeros((1, 3)))[0], world.apply(np.array([[0.0, 0.0, spec.cell.table]]))[0, 2]
@@ -51,7 +54,7 @@ def path_png(file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiv
     figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.01, ha="left")
     for axes, across, name in ((side, 2, "z: up"), (top, 1, "y")):
         _outline(axes, box[:, [0, across]], label="box of the laboratory's file")
-        for stretch, (way, colour) in zip(stretches, _WAYS, strict=True):
+        for stretch, (_, way, colour) in zip(stretches, _WAYS, strict=True):
             tool = world.apply(stretch.tool)
             axes.plot(1e3 * tool[:, 0], 1e3 * tool[:, across], color=colour, linewidth=1.2, label=f"tool, {way}")
             place_ = stretch.poses
@@ -74,6 +77,8 @@ def path_png(file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiv
     _vessels_from_above(top, stretches[1], pourer, receiver)
     handles, labels = side.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
+    if note:
+        figure.supxlabel(note, fontsize=8.5, color=style.GREY, x=0.01, ha="left")
     return style.save(figure, file)
 
 

@@ -1,0 +1,295 @@
+"""`decant pour`: one pour that a person has chosen; planned only, with an empty pourer and slowly, or for real."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from actors.arm.joint_path import JointPath, PathReport, PourPath
+from orchestrator.commands.arming import accepted, confirm, report_lines, require_flag
+from orchestrator.commands.common import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    check_output,
+    check_somebody_is_there,
+    print_json,
+    read_campaign,
+    say,
+)
+from orchestrator.commands.single import scene_to_simulate
+
+if TYPE_CHECKING:
+    from orchestrator.plan import CampaignPlan
+    from orchestrator.stages import StageDefinition
+    from sim_engine.action import Action
+    from sim_engine.task import Scene
+
+STAGE = "pour"
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """One pour, planned.
+
+    Attributes:
+        plan: the campaign that it is taken from.
+        path: of the arm; None on a bench of numbers.
+    """
+
+    plan: CampaignPlan
+    scene: Scene
+    action: Action
+    path: PourPath | None
+
+
+def pour(
+    path: Path,
+    *,
+    assignments: list[str],
+    scene_name: str | None,
+    dry_run: bool,
+    connect: bool,
+    png: Path | None,
+    empty: bool,
+    slow: float,
+    armed: bool,
+    in_process: bool,
+    as_json: bool,
+) -> None:
+    """One pour.
+
+    Args:
+        path: campaign.
+        assignments: of the action, `name=value`.
+        scene_name: 'calibration', 'transfer' or a receiver's name; the first receiver if not given.
+        dry_run: plan and check the whole path, and move nothing.
+        connect: with `dry_run`: also read where the arm stands.
+        png: picture of the path.
+        empty: the whole cycle with an empty pourer, nothing weighed.
+        slow: with `empty`, fraction of the planned speed.
+        armed: whether `--arm` was given.
+        in_process: without Ray.
+        as_json: print the result as JSON.
+
+    Raises:
+        RefusalError: it can't be made (exit code 2), or did not go as it should (1).
+    """
+    _check_options(dry_run=dry_run, connect=connect, empty=empty, slow=slow)
+    check_output(png, "--png", ".png")
+    chosen = _chosen(path, assignments, scene_name)
+    laboratory = chosen.plan.laboratory
+    if chosen.path is None and (dry_run or empty or png is not None):
+        raise RefusalError(
+            f"laboratory {laboratory.name} has no arm whose path could be planned; its bench is made of numbers",
+            BAD_INPUT,
+        )
+    if png is not None:
+        _draw(chosen, png)
+    if dry_run:
+        _dry_run(chosen, connect=connect, as_json=as_json)
+        return
+    again = f"decant pour {path} … --arm"
+    require_flag(laboratory, armed=armed, again=again)
+    if empty:
+        from orchestrator.commands.pour_empty import pour_empty
+
+        assert chosen.path is not None
+        pour_empty(chosen.plan, chosen.action, slowed(chosen.path, slow), slow=slow, as_json=as_json)
+        return
+    _pour(chosen, in_process=in_process, again=f"decant pour {path} … (pours anew)", as_json=as_json)
+
+
+def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) -> None:
+    if connect and not dry_run:
+        raise RefusalError("--connect: goes with --dry-run; any other pour connects anyway", BAD_INPUT)
+    if dry_run and empty:
+        raise RefusalError("--dry-run moves nothing, --empty moves the arm: choose one", BAD_INPUT)
+    if slow != 1.0 and not empty:
+        raise RefusalError(
+            "--slow: goes with --empty; a pour with liquid is as fast as its action says: choose a slower action",
+            BAD_INPUT,
+        )
+
+
+def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chosen:
+    """The pour that is asked for, its path planned and checked.
+
+    Raises:
+        RefusalError: it can't be made (exit code 2).
+    """
+    from actors.protocols import InvalidActionError
+    from orchestrator.config.assignments import assigned_action
+    from orchestrator.config.check import check_vessels
+    from orchestrator.config.errors import shown_path
+
+    plan = read_campaign(path)
+    scene, space = scene_to_simulate(plan, scene_name)
+    try:
+        action = assigned_action(assignments, fixed=scene.fixed, space=space)
+    except ValueError as error:
+        raise RefusalError(f"--set: {error}", BAD_INPUT) from None
+    problems = check_vessels(scene)
+    if problems:
+        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+    if not plan.laboratory.pours:
+        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
+    planned = None
+    if plan.laboratory.arm is not None:
+        from actors.bench.planning import planner
+
+        try:
+            planned = planner(plan.laboratory.arm)(scene, action)
+        except (InvalidActionError, ValueError) as error:
+            raise RefusalError(f"{action.display()}: {error}", BAD_INPUT) from None
+    return Chosen(plan, scene, action, planned)
+
+
+def slowed(path: PourPath, factor: float) -> PourPath:
+    """The same way, with all its times divided by a factor in (0, 1]."""
+    if factor == 1.0:
+        return path
+
+    def slow(part: JointPath) -> JointPath:
+        return JointPath(part.times / factor, part.joints)
+
+    r = path.report
+    return PourPath(
+        slow(path.approach),
+        slow(path.pour),
+        slow(path.retreat),
+        path.tilts,
+        tuple((name, start / factor, end / factor) for name, start, end in path.phases),
+        dataclasses.replace(
+            r,
+            joint_speed=factor * r.joint_speed,
+            tool_speed=factor * r.tool_speed,
+            tilt_speed=factor * r.tilt_speed,
+            duration=r.duration / factor,
+        ),
+    )
+
+
+def report_json(report: PathReport) -> dict[str, Any]:
+    """SI units."""
+    return dataclasses.asdict(report)
+
+
+def _draw(chosen: Chosen, png: Path) -> None:
+    from orchestrator.report.arm_path import path_png
+    from sim_engine.vessel.build import build_vessel
+
+    assert chosen.path is not None
+    assert chosen.plan.laboratory.arm is not None
+    pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
+    drawn = path_png(
+        png,
+        chosen.path,
+        chosen.plan.laboratory.arm,
+        pourer,
+        receiver,
+        title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
+        note=chosen.action.display(),
+    )
+    say(f"picture: {drawn}")
+
+
+def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
+    planned, laboratory = chosen.path, chosen.plan.laboratory
+    assert planned is not None
+    assert laboratory.arm is not None
+    say(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
+    home = _stands_at_home(chosen) if connect else None
+    if as_json:
+        print_json(
+            {
+                "mode": laboratory.mode,
+                "action": chosen.action.values(),
+                "report": report_json(planned.report),
+                "phases": [{"name": n, "start": a, "end": b} for n, a, b in planned.phases],
+                "at_home": home,
+            }
+        )
+    else:
+        for line in [*report_lines(planned.report), *_way_lines(planned)]:
+            print(line)
+    say("nothing was moved")
+
+
+def _way_lines(planned: PourPath) -> list[str]:
+    tilts = "  ".join(f"{name} {end - start:.2f} s" for name, start, end in planned.phases)
+    return [
+        f"approach       {planned.approach.duration:.1f} s",
+        f"pour           {planned.pour.duration:.1f} s: {tilts}",
+        f"retreat        {planned.retreat.duration:.1f} s",
+    ]
+
+
+def _stands_at_home(chosen: Chosen) -> bool:
+    """Read where the arm stands.
+
+    Raises:
+        RefusalError: it can't be read.
+    """
+    from actors.arm.survey import read_state
+    from actors.protocols import LaboratoryError
+    from orchestrator.commands.doctor_arm import home_check
+    from orchestrator.commands.hands_on import reached
+
+    try:
+        with reached(chosen.plan.laboratory) as ready:
+            assert ready.arm is not None
+            check = home_check(ready.arm, read_state(ready.arm.address))
+    except LaboratoryError as error:
+        raise RefusalError(str(error), FAILED) from None
+    say(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
+    return check.state == "ok"
+
+
+def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> None:
+    """As a small run of its own: journalled, with the operator's questions, weighed."""
+    from orchestrator.commands.campaigns import run_directory
+    from orchestrator.commands.common import check_laboratory_answers, run_in_front_of_people
+    from orchestrator.stages import StageDefinition
+    from orchestrator.strategies.one_pour import OnePour
+
+    plan = dataclasses.replace(
+        chosen.plan,
+        name=f"{chosen.plan.name}-pour",
+        outputs=dataclasses.replace(chosen.plan.outputs, figures=False),
+    )
+    build: Callable[..., OnePour] = lambda results, seed: OnePour(chosen.scene, chosen.action, seed)  # noqa: E731
+    stages: list[StageDefinition] = [StageDefinition(STAGE, build, pours=True)]
+    checksum = None
+    if plan.laboratory.mode == "hardware":
+        assert chosen.path is not None
+        checksum = accepted(chosen.plan)
+        confirm(plan.laboratory, ["pours          1", *report_lines(chosen.path.report)])
+    check_somebody_is_there(plan.laboratory)
+    check_laboratory_answers(plan, stages, in_process=in_process)
+    directory = run_directory(plan, resume=False, run_id=None)
+    finished = run_in_front_of_people(
+        plan, directory, resume=False, stages=stages, in_process=in_process, again=again, checksum=checksum
+    )
+    result = finished.result.results[STAGE]
+    if "failed" in result:
+        raise RefusalError(str(result["failed"]), FAILED)
+    if as_json:
+        print_json({"run": str(directory), "mode": plan.laboratory.mode, "action": chosen.action.values(), **result})
+    else:
+        print(told(result))
+
+
+def told(result: dict[str, Any]) -> str:
+    """What was weighed, in a line."""
+    spillage = result["spillage"]
+    r = (
+        "too little was poured to speak of spillage"
+        if spillage is None
+        else f"spillage {100 * spillage:.2f} % of poured"
+    )
+    masses = ", ".join(f"{name} {1e3 * result[name]:.1f} g" for name in ("loaded", "spilled", "retained"))
+    return f"{masses}; {r}"
