@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from actors.arm.virtual_arm import VirtualArm
 from actors.balance.virtual_balance import BalanceSettings, VirtualBalance
 from actors.bench.bench import VirtualBench
+from actors.bench.open_wired import WiredRooms, needs_person, open_wired
 from actors.bench.spec import VirtualBenchSpec
 from actors.device import Device, LocalDevice
+from actors.operator import Operator
 from actors.optimizer.actor import DeviceOptimizer, Proposer
 from actors.protocols import (
     Bench,
@@ -47,7 +49,11 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
 
 
 def open_laboratory(
-    spec: LaboratorySpec, *, need_bench: bool, make: Callable[[], Simulator] = pour_simulator
+    spec: LaboratorySpec,
+    *,
+    need_bench: bool,
+    make: Callable[[], Simulator] = pour_simulator,
+    operator: Operator | None = None,
 ) -> Laboratory:
     """A laboratory, to be entered with `async with`; nothing starts before that.
 
@@ -55,18 +61,22 @@ def open_laboratory(
         spec: where to run.
         need_bench: whether pours will be asked for.
         make: makes simulators, where they run.
+        operator: who answers questions, where a person does.
 
     Raises:
-        LaboratoryError: a bench is needed and there is none, or the mode is not known.
+        LaboratoryError: a bench is needed and there is none, or nobody to stand beside it, or the mode is not known.
     """
-    if spec.mode != "virtual":
-        raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not available; 'virtual' is")
-    if need_bench and spec.bench is None:
+    if spec.mode not in ("virtual", "hardware"):
+        raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not known; 'virtual' and 'hardware' are")
+    if need_bench and not spec.pours:
         raise LaboratoryError(f"laboratory {spec.name} has no bench, but the campaign pours: add a 'bench' to it")
-    bench = spec.bench if need_bench else None
+    if need_bench and operator is None and needs_person(spec):
+        raise LaboratoryError(
+            f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
+        )
     if spec.in_process:
-        return InProcessLaboratory(bench, make)
-    return RayLaboratory(spec, bench, make)
+        return InProcessLaboratory(spec if need_bench else None, make, operator)
+    return RayLaboratory(spec, make, need_bench=need_bench, operator=operator)
 
 
 class _ClosablePool(SimulatorPool, Protocol):
@@ -90,6 +100,7 @@ class _Rooms:
         self._pool: _ClosablePool | None = None
         self._world: _ClosablePool | None = None
         self._devices: list[Device] = []
+        self._wired: WiredRooms | None = None
         self._optimizer: Optimizer | None = None
         self._bench: Bench | None = None
         self._bench_problem: str | None = None
@@ -130,7 +141,15 @@ class _Rooms:
             raise LaboratoryError("the laboratory is not open: use 'async with'")
         return self._optimizer
 
+    @property
+    def wired(self) -> WiredRooms | None:
+        """What is behind a bench with wires; None where there is none."""
+        return self._wired
+
     async def _close_rooms(self) -> None:
+        wired, self._wired = self._wired, None
+        if wired is not None:
+            await wired.close()
         pools = [pool for pool in (self._pool, self._world) if pool is not None]
         await asyncio.gather(
             *(pool.close() for pool in pools), *(device.close() for device in self._devices), return_exceptions=True
@@ -146,26 +165,49 @@ class InProcessLaboratory(_Rooms):
     while the bench computes its liquid. Outcomes are those of `RayLaboratory`.
 
     Args:
-        bench: None where no pours are needed.
+        spec: of the bench; None where no pours are needed.
         make: makes the simulator.
+        operator: a person, where one answers.
     """
 
-    def __init__(self, bench: VirtualBenchSpec | None, make: Callable[[], Simulator] = pour_simulator) -> None:
+    def __init__(
+        self,
+        spec: LaboratorySpec | None,
+        make: Callable[[], Simulator] = pour_simulator,
+        operator: Operator | None = None,
+    ) -> None:
         super().__init__()
-        self._bench_spec, self._make = bench, make
+        self._spec, self._make, self._operator = spec, make, operator
 
     async def __aenter__(self) -> InProcessLaboratory:
         self._pool = InProcessSimulatorPool(make=self._make)
         proposer = LocalDevice("optimiser", Proposer)
         self._devices.append(proposer)
         self._optimizer = DeviceOptimizer(proposer)
-        if self._bench_spec is not None:
-            spec = self._bench_spec
+        try:
+            await self._open_bench(self._pool)
+        except BaseException:
+            await self._close_rooms()
+            raise
+        return self
+
+    async def _open_bench(self, pool: SimulatorPool) -> None:
+        if self._spec is None:
+            return
+        if self._spec.arm is not None:
+
+            def device(name: str, cls: type[Any], *args: Any) -> Device:
+                return LocalDevice(name, lambda: cls(*args))
+
+            self._wired = await open_wired(self._spec, device, pool, self._operator, self._tell)
+            self._devices += self._wired.devices
+            self._bench = self._wired.bench
+        elif self._spec.bench is not None:
+            spec = self._spec.bench
             arm = LocalDevice("arm", lambda: VirtualArm(spec.time_scale))
             balance = LocalDevice("balance", lambda: VirtualBalance(_balance_settings(spec)))
             self._devices += [arm, balance]
-            self._bench = VirtualBench(spec, self._pool, arm, balance)
-        return self
+            self._bench = VirtualBench(spec, pool, arm, balance)
 
     async def __aexit__(self, *exc: object) -> None:
         await self._close_rooms()
@@ -175,19 +217,23 @@ class RayLaboratory(_Rooms):
     """Everything in processes of its own: on this machine, or on the machines of a cluster.
 
     Args:
-        spec: size of the pool, memory, the cluster if there is one.
-        bench: None where no pours are needed.
+        spec: size of the pool, memory, the cluster if there is one; the bench.
         make: makes simulators, in their processes.
+        need_bench: whether pours are needed.
+        operator: a person, where one answers.
     """
 
     def __init__(
         self,
         spec: LaboratorySpec,
-        bench: VirtualBenchSpec | None,
         make: Callable[[], Simulator] = pour_simulator,
+        *,
+        need_bench: bool = False,
+        operator: Operator | None = None,
     ) -> None:
         super().__init__()
-        self._spec, self._bench_spec, self._make = spec, bench, make
+        self._spec, self._make, self._operator = spec, make, operator
+        self._needs_bench = need_bench and spec.pours
         self._site: Site | None = None
         self._liquid: RaySimulatorPool | None = None
 
@@ -209,14 +255,14 @@ class RayLaboratory(_Rooms):
                 from actors.cluster.site import Site
 
                 self._site = Site(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
-                await self._site.open(need_bench=self._bench_spec is not None)
-            self._open_rooms()
+                await self._site.open(need_bench=self._needs_bench)
+            await self._open_rooms()
         except BaseException:
             await self.__aexit__()
             raise
         return self
 
-    def _open_rooms(self) -> None:
+    async def _open_rooms(self) -> None:
         from actors.device import RayDevice
 
         here = None if self._site is None else self._site.here
@@ -224,12 +270,23 @@ class RayLaboratory(_Rooms):
         proposer = RayDevice("optimiser", Proposer, place=here)
         self._devices.append(proposer)
         self._optimizer = DeviceOptimizer(proposer)
-        if self._bench_spec is not None:
-            spec, place = self._bench_spec, None if self._site is None else self._site.bench
+        if not self._needs_bench:
+            return
+        place, spec = None if self._site is None else self._site.bench, self._spec.bench
+        if spec is not None:
+            self._world = self._liquid = self._open_world()
+        if self._spec.arm is not None:
+
+            def device(name: str, cls: type[Any], *args: Any) -> Device:
+                return RayDevice(name, cls, *args, place=place)
+
+            self._wired = await open_wired(self._spec, device, self._liquid, self._operator, self._tell)
+            self._devices += self._wired.devices
+            self._bench = self._wired.bench
+        elif spec is not None and self._liquid is not None:
             arm = RayDevice("arm", VirtualArm, spec.time_scale, place=place)
             balance = RayDevice("balance", VirtualBalance, _balance_settings(spec), place=place)
             self._devices += [arm, balance]
-            self._world = self._liquid = self._open_world()
             self._bench = VirtualBench(spec, self._liquid, arm, balance)
 
     def _open_pool(self) -> RaySimulatorPool:

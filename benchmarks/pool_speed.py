@@ -237,7 +237,7 @@ async def first_answer(particles: int, begun: float) -> dict[str, float]:
         begun: `time.monotonic()` when the process was started, by its parent's clock.
     """
     marks = {"program": time.monotonic()}
-    async with RayLaboratory(LaboratorySpec("benchmark", simulators=1), None) as laboratory:
+    async with RayLaboratory(LaboratorySpec("benchmark", simulators=1)) as laboratory:
         marks["ray"] = time.monotonic()
         pool = cast(RaySimulatorPool, laboratory.simulators)
         await pool.pids()

@@ -59,6 +59,7 @@ class Kind(StrEnum):
     STARTED = "started"  # id
     FINISHED = "finished"  # id, outcome, seconds
     POUR_STARTED = "pour.started"  # id, attempt
+    POUR_WITHDRAWN = "pour.withdrawn"  # id, reason: nothing was poured, it may be poured later
     POUR_FINISHED = "pour.finished"  # id, outcome, seconds
     TOLD = "told"  # id
     DECISION = "decision"  # text, values
@@ -67,7 +68,7 @@ class Kind(StrEnum):
     NOTE = "note"  # text
 
 
-_DURABLE = frozenset({Kind.POUR_STARTED, Kind.POUR_FINISHED, Kind.OPERATOR_ANSWERED})
+_DURABLE = frozenset({Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED, Kind.OPERATOR_ANSWERED})
 
 
 class JournalError(RunError):

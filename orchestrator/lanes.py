@@ -17,8 +17,10 @@ from actors.protocols import (
     InvalidActionError,
     Laboratory,
     LaboratoryError,
+    NotPouredError,
     ProgressCallback,
     SimulationError,
+    UnknownPourError,
 )
 from orchestrator.errors import RunError
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
@@ -27,6 +29,18 @@ from sim_engine.task import PourTask, Scene
 
 class LaneError(RunError):
     """The laboratory can't serve the campaign any longer, or was asked for something it can't know."""
+
+
+class PourNotMadeError(LaneError):
+    """A pour did not begin, and somebody has to see to that: nothing is lost, and resuming asks for it again."""
+
+    exit_code = 3
+
+
+class PourUnknownError(LaneError):
+    """A pour began and broke off: a person has to say what came of it."""
+
+    exit_code = 3
 
 
 @dataclass(frozen=True)
@@ -38,15 +52,15 @@ class Deadlines:
             hour means that the pool is dead, not slow.
         suggest: a fit to some hundred points takes seconds. Longer than the optimiser's own deadline with all retries
             (`actors.optimizer.actor`), since only those replace a process that hangs.
-        pour: 90 s in a laboratory, but an operator may be fetched from another room first. After it the outcome is
-            not waited for and the pour counts as failed.
+        pour: 90 s in a laboratory, but an operator may be fetched from another room for each of its steps, and these
+            have deadlines of their own. After it the outcome is not waited for and the pour counts as failed.
         pour_grace: how long a pause waits for a pour that has begun.
         cleanup: how long cancelled requests may take to let go.
     """
 
     simulate: float = 1800.0
     suggest: float = 2000.0
-    pour: float = 3600.0
+    pour: float = 6.0 * 3600.0
     pour_grace: float = 300.0
     cleanup: float = 20.0
 
@@ -90,16 +104,25 @@ class Lanes:
             return Failed("simulation", result.outcome.invalid), result.frames
         return Simulated(result.outcome), result.frames
 
-    async def pour(self, request: Pour, *, started: Callable[[], None], progress: ProgressCallback) -> Outcome:
+    async def pour(
+        self,
+        request: Pour,
+        *,
+        started: Callable[[], None],
+        withdrawn: Callable[[str], None] = lambda reason: None,
+        progress: ProgressCallback,
+    ) -> Outcome:
         """Pour once.
 
         Args:
             started: called when nothing stands between the request and the arm any more; must have made a durable
                 record of it when it returns.
+            withdrawn: called when the bench says that nothing was poured, with the reason; likewise.
             progress: handed to the bench.
 
         Raises:
             LaneError: there is no bench, or it was lost during the pour, whose outcome nobody knows then.
+            PourNotMadeError: nothing was poured. PourUnknownError: nobody knows what was.
             BenchLostError: it was lost before.
         """
         bench, scene = self.bench, self._scene(request.scene)
@@ -110,6 +133,13 @@ class Lanes:
                     measurement = await bench.pour(scene, request.action, seed=request.seed, progress=progress)
             except InvalidActionError as error:
                 return Failed("invalid_action", str(error))
+            except NotPouredError as error:
+                withdrawn(str(error))
+                _raise_if_cancelled()
+                raise PourNotMadeError(f"{error}; see to it, then resume the run") from error
+            except UnknownPourError as error:
+                _raise_if_cancelled()
+                raise PourUnknownError(f"{error}; resuming asks what came of it") from error
             except BenchLostError as error:
                 # No outcome: a person has to look, and there is nothing left to pour with.
                 _raise_if_cancelled()

@@ -44,6 +44,7 @@ class StageHistory:
         outcomes: outcome by id, in the order in which they were finished.
         finished_at: when they were, by id (seconds since 1970).
         pour_attempts: how often each pour was begun.
+        withdrawn: pours that were begun last without pouring anything.
         decisions: number of decisions written.
         result: of a closed stage.
     """
@@ -54,6 +55,7 @@ class StageHistory:
     outcomes: dict[int, Outcome] = field(default_factory=dict)
     finished_at: dict[int, float] = field(default_factory=dict)
     pour_attempts: dict[int, int] = field(default_factory=dict)
+    withdrawn: set[int] = field(default_factory=set)
     decisions: int = 0
     result: dict[str, Any] | None = None
 
@@ -68,7 +70,7 @@ class StageHistory:
 
     def unknown_pours(self) -> list[int]:
         """Pours that had begun and have no outcome."""
-        return [key for key in self.pour_attempts if key not in self.outcomes]
+        return [key for key in self.pour_attempts if key not in self.outcomes and key not in self.withdrawn]
 
 
 def read_history(journal: JournalReader, stage: str) -> StageHistory:
@@ -85,6 +87,9 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
                 history.requests[body["id"]] = body["request"]
             case Kind.POUR_STARTED:
                 history.pour_attempts[body["id"]] = body["attempt"]
+                history.withdrawn.discard(body["id"])
+            case Kind.POUR_WITHDRAWN:
+                history.withdrawn.add(body["id"])
             case Kind.FINISHED | Kind.POUR_FINISHED:
                 history.outcomes[body["id"]] = decode_outcome(body["outcome"])
                 history.finished_at[body["id"]] = entry.t

@@ -209,7 +209,11 @@ class StageScheduler:
                     event = PourProgressed(stage=self._stage, id=flight.id, number=request.number, progress=p)
                     self._watchers.emit(event)
 
-                outcome = await self._lanes.pour(request, started=started, progress=progress)
+                def withdrawn(reason: str) -> None:
+                    self._append(Kind.POUR_WITHDRAWN, {"id": flight.id, "reason": reason})
+                    flight.started = False
+
+                outcome = await self._lanes.pour(request, started=started, withdrawn=withdrawn, progress=progress)
             case Suggest():
 
                 def retrying(text: str) -> None:

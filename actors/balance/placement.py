@@ -90,7 +90,7 @@ class _Plan:
 _POUR = Step("pour", "The arm pours.", "pour")
 _DRY = "Put the empty, dry pourer on the balance, alone."
 _FULL = "Fill the pourer and put it on the balance."
-_PUT_BACK = " Then give it to the gripper."
+_GRIP = "Give the pourer to the gripper. "
 _LOADED = {"pourer_full": 1.0, "pourer_empty": -1.0}
 _RETAINED = {"pourer_after": 1.0, "pourer_empty": -1.0}
 
@@ -104,8 +104,12 @@ _PLANS: dict[Placement, _Plan] = {
         (
             _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
             Step("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
-            Step("weigh", "Fill the pourer and put it on the tray." + _PUT_BACK, "before", "pourer_full"),
-            _tare("set_up", "Wipe the tray, and put the receiver on its stand; it must not touch the tray.", "before"),
+            Step("weigh", "Fill the pourer and put it on the tray.", "before", "pourer_full"),
+            _tare(
+                "set_up",
+                _GRIP + "Wipe the tray, and put the receiver on its stand; it must not touch the tray.",
+                "before",
+            ),
             _POUR,
             Step("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled", hands=False),
             _tare("spill_left", "Leave the spill on the tray.", "after", hands=False),
@@ -117,8 +121,8 @@ _PLANS: dict[Placement, _Plan] = {
         (
             _tare("cleared", "Take everything off the balance.", "before"),
             Step("weigh", _DRY, "once", "pourer_empty"),
-            Step("weigh", _FULL + _PUT_BACK, "before", "pourer_full"),
-            _tare("set_up", "Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
+            Step("weigh", _FULL, "before", "pourer_full"),
+            _tare("set_up", _GRIP + "Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
             _POUR,
             Step("weigh", "Touch nothing: what is in the receiver is weighed.", "after", "received", hands=False),
             _tare("cleared_after", "Take everything off the balance, and wipe its pan.", "after"),
@@ -135,8 +139,10 @@ _PLANS: dict[Placement, _Plan] = {
         (
             _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
             Step("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
-            Step("weigh", "Fill the pourer and put it on the tray." + _PUT_BACK, "before", "pourer_full"),
-            Step("weigh", "Put the empty receiver on the tray, where it will stand.", "before", "receiver_empty"),
+            Step("weigh", "Fill the pourer and put it on the tray.", "before", "pourer_full"),
+            Step(
+                "weigh", _GRIP + "Put the empty receiver on the tray, where it will stand.", "before", "receiver_empty"
+            ),
             _tare("set_up", "Leave tray and receiver as they are.", "before", hands=False),
             _POUR,
             Step("weigh", "Touch nothing: what was poured is weighed.", "after", "poured", hands=False),
@@ -156,8 +162,8 @@ _PLANS: dict[Placement, _Plan] = {
     Placement.MANUAL: _Plan(
         (
             Step("weigh", "Weigh the empty, dry pourer.", "once", "pourer_empty", "operator"),
-            Step("weigh", "Fill the pourer and weigh it." + _PUT_BACK, "before", "pourer_full", "operator"),
-            Step("weigh", "Wipe the tray, weigh it, and put it under.", "before", "tray_before", "operator"),
+            Step("weigh", "Fill the pourer and weigh it.", "before", "pourer_full", "operator"),
+            Step("weigh", _GRIP + "Wipe the tray, weigh it, and put it under.", "before", "tray_before", "operator"),
             _POUR,
             Step("weigh", "Weigh the tray with what was spilled on it.", "after", "tray_after", "operator"),
             Step("weigh", "Weigh the pourer with what is left in it.", "after", "pourer_after", "operator"),
@@ -249,7 +255,7 @@ def weighing_uncertainty(step: float, repeatability: float, *, tared: bool = Tru
 def _elsewhere(step: Step) -> Step:
     texts = {
         "pourer_empty": "Weigh the empty, dry pourer on the other balance.",
-        "pourer_full": "Fill the pourer and weigh it on the other balance." + _PUT_BACK,
+        "pourer_full": "Fill the pourer and weigh it on the other balance.",
         "pourer_after": "Weigh the pourer with what is left in it on the other balance.",
     }
     return Step("weigh", texts[step.key], step.when, step.key, "operator")

@@ -76,6 +76,20 @@ class Weighings:
         for step in self._steps[: self._pour]:
             await self._do(step)
 
+    async def at_once(self) -> None:
+        """Of the steps after the pour the weighings that need no hands, once and without asking anybody.
+
+        For a pour that was broken off: so that a weight is kept that may be lost later.
+
+        Raises:
+            BalanceError: the first that failed.
+        """
+        for step in self._steps[self._pour + 1 :]:
+            if step.do != "weigh" or step.hands:
+                return
+            if step.key not in self._weighed:
+                await self._read(step)
+
     async def after(self) -> None:
         """All steps after the pour; raises as `before`."""
         for step in self._steps[self._pour + 1 :]:

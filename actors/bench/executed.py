@@ -43,9 +43,8 @@ def unpack(data: dict[str, Any]) -> ExecutedPath:
     try:
         raw = zlib.decompress(base64.b85decode(data["packed"]))
         steps = np.frombuffer(raw, "<i4").reshape(7, int(data["samples"])).T
-        whole = np.cumsum(steps, axis=0, dtype=np.int64)
-        return ExecutedPath(
-            whole[:, 0] * TIME_UNIT, whole[:, 1:] * JOINT_UNIT, bool(data["completed"]), dict(data["tracking"])
-        )
+        whole = np.cumsum(steps, axis=0)
+        times, joints = whole[:, 0].astype(float) * TIME_UNIT, whole[:, 1:].astype(float) * JOINT_UNIT
+        return ExecutedPath(times, joints, bool(data["completed"]), dict(data["tracking"]))
     except (KeyError, TypeError, zlib.error) as error:
         raise ValueError(f"no executed path: {error!r}") from error

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
+from actors.arm.joint_path import PourPath
+from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from sim_engine.action import Action
 from sim_engine.motion import PourMotion, plan_motion
@@ -38,3 +41,22 @@ def plan_pour(scene: Scene, action: Action) -> PourMotion:
     except (ValueError, OSError) as error:
         raise InvalidActionError(str(error)) from error
     return motion
+
+
+def planner(spec: UrArmSpec) -> Callable[[Scene, Action], PourPath]:
+    """What plans whole pours for an arm.
+
+    Args:
+        spec: of the arm and its cell.
+
+    Returns:
+        A function of scene and action; it raises `InvalidActionError` with everything that is wrong with the pour.
+    """
+
+    def plan(scene: Scene, action: Action) -> PourPath:
+        from actors.arm.path.plan import plan_path
+
+        motion = plan_pour(scene, action)
+        return plan_path(motion, spec, _vessel(scene.pourer), _vessel(scene.receiver))
+
+    return plan

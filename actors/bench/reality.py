@@ -7,6 +7,8 @@ on while the pourer stands tilted.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import math
 from dataclasses import dataclass, replace
 
@@ -19,8 +21,7 @@ from actors.arm.spec import UrArmSpec
 from actors.bench.place import Site
 from actors.bench.site import History
 from actors.bench.spec import VirtualBenchSpec
-from actors.bench.things import Things
-from actors.bench.virtual_operator import VirtualOperator
+from actors.bench.virtual_operator import Hands
 from actors.bench.world import ATTEMPTS, draw_pose_error, spill_of, stream
 from actors.protocols import InvalidActionError, LaboratoryError, SimulatorPool
 from sim_engine.action import Action
@@ -33,8 +34,15 @@ AT_START = 2e-3
 AT_REST = 1e-6
 """Joints that change by less from sample to sample stand still [rad]."""
 
+UPRIGHT = math.radians(0.5)
+"""Below this tilt [rad] a pourer is upright; ways to and from a pour keep it so."""
+
 LONGEST_REST = 6.0
 """Rest in the middle of a motion is simulated for so long [s]: what runs out meanwhile has run out by then."""
+
+
+NOTING_INTERVAL = 40.0
+"""Between two looks at what the controller did [s of its time]; it remembers two minutes."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +61,8 @@ class Reality:
     Args:
         spec: what is hidden.
         arm: the cell as everybody believes it to be.
-        things: what stands where.
         site: controller and balance.
-        operator: whose hand fills the pourer; None if a person plays on the virtual bench.
+        hands: that fill the pourer, and know what stands where.
         simulators: a pool of its own for the hidden liquid.
     """
 
@@ -63,34 +70,42 @@ class Reality:
         self,
         spec: VirtualBenchSpec,
         arm: UrArmSpec,
-        things: Things,
         site: Site,
-        operator: VirtualOperator | None,
+        hands: Hands,
         simulators: SimulatorPool,
     ) -> None:
         self._spec, self._arm, self._simulators = spec, arm, simulators
-        self.things, self.site, self._operator = things, site, operator
+        self.site, self.things, self._hands = site, hands.things, hands
+        self._noting = asyncio.Lock()
         self._pour: PourAsk | None = None
         self._times: list[float] = []
         self._joints: list[tuple[float, ...]] = []
         self._since = 0.0
+        self._settled = False
 
     async def prepare(self, pour: PourAsk) -> None:
         """A pour is about to be prepared by the operator."""
         self._pour = pour
-        if self._operator is not None:
-            self._operator.prepare(pour.scene.liquid.mass, stream(pour.seed, "arm"))
+        self._hands.prepare(pour.scene.liquid.mass, stream(pour.seed, "arm"))
         await self.site.prepare(stream(pour.seed, "balance"))
         await self.site.put(self.things.carried)
 
     async def begin(self) -> None:
         """The arm is about to leave home."""
-        self._times, self._joints = [], []
+        self._times, self._joints, self._settled = [], [], False
         self._since = (await self.site.history(math.inf)).now
 
     async def note(self) -> None:
         """Take down what the arm did since; to be called within two minutes of the controller's time."""
-        self._take(await self.site.history(self._since))
+        async with self._noting:
+            self._take(await self.site.history(self._since))
+
+    async def follow(self) -> None:
+        """Note again and again, for as long as the arm is away from home; ends by being cancelled."""
+        while True:
+            await asyncio.sleep(NOTING_INTERVAL / self._arm.time_scale)
+            with contextlib.suppress(LaboratoryError):  # what matters is noted once more at the end
+                await self.note()
 
     def _take(self, history: History) -> None:
         last = self._times[-1] if self._times else -math.inf
@@ -101,13 +116,16 @@ class Reality:
         self._since = max(self._since, (self._times[-1] if self._times else 0.0))
 
     async def settle(self) -> None:
-        """Let the liquid follow what the arm did, and have the balance carry what became of it.
+        """Let the liquid follow what the arm did, once, and have the balance carry what became of it.
 
         Raises:
             LaboratoryError: with the errors of this pour's placement the vessels would touch, or the liquid could not
                 be simulated.
         """
         assert self._pour is not None
+        if self._settled:
+            return
+        self._settled = True
         error = draw_pose_error(self._spec, self._pour.seed)
         motion = self._motion(error.tilt)
         if motion is not None:
@@ -125,7 +143,11 @@ class Reality:
         if cut is None:
             return None
         times, joints = cut
-        return pourer_motion(joints, times, self._arm, grip_tilt=grip_tilt)
+        tilted = np.flatnonzero(pourer_motion(joints, times, self._arm).tilt(times) > UPRIGHT)
+        if len(tilted) == 0:
+            return None
+        end = min(int(tilted[-1]) + 2, len(times))  # what follows is the way home
+        return pourer_motion(joints[:end], times[:end], self._arm, grip_tilt=grip_tilt)
 
     async def _simulate(self, pour: PourAsk, motion: SampledMotion, error: PoseError) -> tuple[float, float]:
         """Masses spilled and retained [kg]; same motion, same seed, same masses."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from actors.bench.things import Things
-from actors.operator import Question
+from actors.operator import Operator, Question
 
 SCATTER = 1e-3
 """Standard deviation of a filling by hand [kg]."""
@@ -37,62 +39,108 @@ Put = Callable[[float], Awaitable[None]]
 """Puts a mass [kg] on the virtual balance, in place of what was there."""
 
 
-class VirtualOperator:
-    """See `actors.operator.Operator`.
+class Hands:
+    """Move things about on a virtual bench.
 
     Args:
-        things: that it moves about.
+        things: what stands where.
         put: changes what is on the balance; None where there is none.
-        time: for all of one pour [s of the clock].
-        late: extra time [s of the clock] for the first question about something; inf: never answers.
-        answers: given in place of its own, first to last, to questions about something.
     """
 
-    def __init__(
-        self,
-        things: Things,
-        put: Put | None,
-        time: float,
-        *,
-        late: Mapping[str, float] | None = None,
-        answers: Mapping[str, Sequence[str]] | None = None,
-    ) -> None:
-        self._things, self._put, self._time = things, put, time
-        self._late = dict(late or {})
-        self._answers = {about: list(given) for about, given in (answers or {}).items()}
+    def __init__(self, things: Things, put: Put | None) -> None:
+        self.things, self._put = things, put
         self._rng = np.random.default_rng(0)
         self._load = 0.0
-        self.heard: list[Question] = []
-        self.told: list[str] = []
 
     def prepare(self, load: float, seed: tuple[int, ...]) -> None:
         """The next pour begins.
 
         Args:
             load: to refill to [kg].
-            seed: of its unsteady hand.
+            seed: of their unsteadiness.
         """
         self._load, self._rng = load, np.random.default_rng(seed)
+
+    async def do(self, question: Question) -> None:
+        """What a question asks for."""
+        self.things.do(question.about, self._load + float(self._rng.normal(0.0, SCATTER)))
+        if self._put is not None and question.wants == "done":
+            await self._put(self.things.carried)
+
+
+class VirtualOperator:
+    """See `actors.operator.Operator`.
+
+    Args:
+        hands: that it works with.
+        time: for all of one pour [s of the clock].
+    """
+
+    def __init__(self, hands: Hands, time: float) -> None:
+        self._hands, self._time = hands, time
+        self._late: dict[str, float] = {}
+        self._answers: dict[str, list[str]] = {}
+        self.heard: list[Question] = []
+        self.told: list[str] = []
+
+    def script(self, answers: Mapping[str, Sequence[str]], late: Mapping[str, float]) -> None:
+        """Be as people are, for tests.
+
+        Args:
+            answers: given in place of its own, first to last, to questions about something; nothing is done then.
+            late: extra time for the next question about something [s of the clock]; inf: it is never answered.
+        """
+        self._answers = {about: list(given) for about, given in answers.items()}
+        self._late = dict(late)
 
     async def ask(self, question: Question) -> str:
         """See `Operator.ask`."""
         self.heard.append(question)
         about = question.about
         late = self._late.pop(about, 0.0)
-        if late == float("inf"):
+        if math.isinf(late):
             await asyncio.Event().wait()
-        share = SHARES.get(about, GLANCE) / sum(SHARES.values()) if about in SHARES else GLANCE
+        share = SHARES[about] / sum(SHARES.values()) if about in SHARES else GLANCE
         await asyncio.sleep(share * self._time + late)
         scripted = self._answers.get(about)
         if scripted:
             return scripted.pop(0)
-        self._things.do(about, self._load + float(self._rng.normal(0.0, SCATTER)))
-        if question.wants == "weight":
-            return self._things.typed(about, TYPED_STEP)
-        if self._put is not None:
-            await self._put(self._things.carried)
-        return "done" if question.wants == "done" else "yes"
+        await self._hands.do(question)
+        match question.wants:
+            case "weight":
+                return self._hands.things.typed(about, TYPED_STEP)
+            case "done":
+                return "done"
+        return "yes"
 
     async def tell(self, text: str) -> None:
         """See `Operator.tell`."""
         self.told.append(text)
+
+
+class PlayedOperator:
+    """A person who tries the procedure out on a virtual bench: answers, and invisible hands do it.
+
+    Args:
+        person: who is asked.
+        hands: that do what was asked.
+    """
+
+    def __init__(self, person: Operator, hands: Hands) -> None:
+        self._person, self._hands = person, hands
+
+    async def ask(self, question: Question) -> str:
+        """See `Operator.ask`."""
+        if question.wants == "weight":  # there is no scale to look at
+            await self._hands.do(question)
+            shown = self._hands.things.typed(question.about, TYPED_STEP)
+            question = replace(question, text=f"{question.text} (The virtual scale shows {shown}.)")
+            return await self._person.ask(question)
+        answer = await self._person.ask(question)
+        if answer == "done":
+            await self._hands.do(question)
+        return answer
+
+    async def tell(self, text: str) -> None:
+        """See `Operator.tell`."""
+        await self._person.tell(text)

@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from actors.laboratory import open_laboratory
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.protocols import LaboratoryError
 from actors.spec import LaboratorySpec
+from orchestrator.config.load import load_laboratory
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask
@@ -38,8 +40,14 @@ def test_a_campaign_that_pours_is_refused_a_laboratory_without_a_bench():
 
 
 def test_an_unknown_mode_is_refused_before_anything_starts():
-    with pytest.raises(LaboratoryError, match="mode 'hardware' is not available"):
-        open_laboratory(LaboratorySpec("desk", mode="hardware"), need_bench=False)
+    with pytest.raises(LaboratoryError, match="mode 'dream' is not known"):
+        open_laboratory(LaboratorySpec("desk", mode="dream"), need_bench=False)
+
+
+def test_an_arm_of_hardware_is_not_opened_without_a_person_to_ask():
+    spec = load_laboratory(Path(__file__).parents[2] / "configs" / "laboratories" / "ur10-kern.yaml")
+    with pytest.raises(LaboratoryError, match="ur10-kern needs a person beside it who answers questions"):
+        open_laboratory(spec, need_bench=True)
 
 
 def test_no_bench_is_made_where_none_is_needed(fake, bench_spec, task):

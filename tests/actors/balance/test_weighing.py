@@ -51,7 +51,7 @@ class Operator:
                 return str(answer)
         text = question.text.lower()
         pourer = 0.0
-        if "pourer" in text and "give it" not in text:
+        if "pourer" in text and "gripper" not in text:
             pourer = POURER + (RETAINED if self.poured else 0.0)
         if "fill the pourer" in text:
             pourer = POURER + LOADED
@@ -123,8 +123,8 @@ def test_what_needs_no_hands_is_not_asked_for(virtual):
     assert [q.text for q in operator.asked] == [
         "Leave the wiped tray on the balance, with nothing on it.",
         "Put the empty, dry pourer on the tray.",
-        "Fill the pourer and put it on the tray. Then give it to the gripper.",
-        "Wipe the tray, and put the receiver on its stand; it must not touch the tray.",
+        "Fill the pourer and put it on the tray.",
+        "Give the pourer to the gripper. Wipe the tray, and put the receiver on its stand; it must not touch the tray.",
         "Put the pourer on the tray, beside what lies there.",
     ]
 

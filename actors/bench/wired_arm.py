@@ -1,0 +1,114 @@
+"""The arm over its wires, from the event loop: the driver's calls with their deadlines."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+
+from actors.arm.joint_path import ExecutedPath, PourPath
+from actors.arm.protocol import ArmState
+from actors.arm.spec import UrArmSpec
+from actors.arm.ur.errors import ArmError
+from actors.arm.ur.facts import ArmFacts
+from actors.device import Device
+from actors.protocols import LaboratoryError
+
+PATIENCE = 60.0
+"""Longest wait for what moves nothing [s]: a process starts, a controller is asked some questions."""
+
+POWER_TIME = 180.0
+"""Longest wait for power and brakes after an emergency stop [s of controller time]."""
+
+LOOK_INTERVAL = 0.1
+"""Between two looks at a moving arm [s]."""
+
+Follow = Callable[[ArmState], None]
+
+
+class WiredArm:
+    """`actors.arm.ur.driver.UrArm` over a `Device`.
+
+    Args:
+        device: that holds the driver.
+        spec: of the arm.
+    """
+
+    def __init__(self, device: Device, spec: UrArmSpec) -> None:
+        self.device, self._spec = device, spec
+
+    async def ready(self) -> ArmFacts:
+        """Connected, and who is there; nothing moves."""
+        await self.device.revive()
+        try:
+            facts: ArmFacts = await self.device.call("facts", deadline=PATIENCE)
+        except ArmError:
+            facts = await self.device.call("connect", deadline=PATIENCE)
+        return facts
+
+    async def hands_in(self) -> None:
+        """See to it that no program runs on the controller and the arm stands, and read both back."""
+        await self.device.call("hands_in", deadline=PATIENCE)
+
+    async def release(self) -> None:
+        """A person has said that it may move."""
+        await self.device.call("release", deadline=PATIENCE, urgent=True)
+
+    async def move_to_start(self, path: PourPath) -> None:
+        """From home to the pour's start."""
+        await self.device.call("move_to_start", path, deadline=self._deadline(path.approach.duration))
+
+    async def execute(self, path: PourPath, follow: Follow) -> ExecutedPath:
+        """Tilt, hold, return.
+
+        Args:
+            path: whose start it stands at.
+            follow: told now and then where it is.
+        """
+        watching = asyncio.create_task(self._watch(follow))
+        try:
+            deadline = self._deadline(path.pour.duration)
+            executed: ExecutedPath = await self.device.call("execute", path, deadline=deadline)
+            return executed
+        finally:
+            watching.cancel()
+            await asyncio.gather(watching, return_exceptions=True)
+
+    async def retreat(self, path: PourPath) -> None:
+        """Home, from wherever on the ways to and from the pour it stands upright."""
+        await self.device.call("retreat", path, deadline=self._deadline(3.0 * path.retreat.duration))
+
+    async def untilt(self, path: PourPath) -> None:
+        """Slowly upright again, after that pour was stopped."""
+        slow = 4.0 * self._spec.limits.tilt / self._spec.untilt_speed
+        await self.device.call("untilt", path, deadline=self._deadline(slow))
+
+    async def recover(self) -> str:
+        """After a stop whose cause a person has seen to: connected and ready, not released; says what was done."""
+        await self.device.revive()
+        await self.release()
+        done: str = await self.device.call("recover", deadline=self._deadline(POWER_TIME))
+        return done
+
+    async def stop(self) -> None:
+        """Stop what moves; it stays locked."""
+        await self.device.call("stop", deadline=PATIENCE, urgent=True)
+
+    async def state(self) -> ArmState:
+        """Where it is."""
+        state: ArmState = await self.device.call("state", deadline=PATIENCE, urgent=True)
+        return state
+
+    async def close(self) -> None:
+        """Let go of the controller."""
+        await self.device.call("close", deadline=PATIENCE)
+
+    def _deadline(self, seconds: float) -> float:
+        """For something that takes so long on the controller [s]: twice that, for a lost arm must be noticed."""
+        return PATIENCE + 2.0 * seconds / self._spec.time_scale
+
+    async def _watch(self, follow: Follow) -> None:
+        while True:
+            await asyncio.sleep(LOOK_INTERVAL)
+            with contextlib.suppress(LaboratoryError):
+                follow(await self.state())

@@ -1,0 +1,211 @@
+"""A wired bench in this process: real wires, a cheap liquid that follows what the arm executed, a scripted operator."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from actors.balance.placement import Placement
+from actors.bench.place import Site
+from actors.bench.things import Things
+from actors.bench.virtual_operator import VirtualOperator
+from actors.bench.wired import WiredBench
+from actors.laboratory import InProcessLaboratory
+from actors.operator import OperatorSpec, Question
+from actors.protocols import Notice
+from actors.spec import LaboratorySpec
+from orchestrator.config.load import load_laboratory
+from sim_engine.action import DEG, Action
+from sim_engine.liquid import Liquid
+from sim_engine.outcome import PourOutcome
+from sim_engine.task import PourTask, Scene
+from sim_engine.vessel.spec import cylinder
+
+LABORATORIES = Path(__file__).parents[3] / "configs" / "laboratories"
+
+PACE = 30.0
+"""Bench seconds per second in these tests, unless they say otherwise."""
+
+FULL_TILT = 100 * DEG
+
+
+class Trickle:
+    """A liquid of one rule: a pourer tilted to `FULL_TILT` is empty, one less tilted keeps what it can; a twentieth of
+    what leaves it misses the receiver."""
+
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimpleNamespace:
+        assert task.motion is not None, "the wired bench simulates what was executed"
+        tilt = float(np.max(task.motion.tilt(task.motion.times)))
+        poured = min(max((tilt - 30 * DEG) / (FULL_TILT - 30 * DEG), 0.0), 1.0)
+        outcome = PourOutcome(
+            received=0.95 * poured,
+            spilled=0.05 * poured,
+            retained=1.0 - poured,
+            in_flight=0.0,
+            escaped=0.0,
+            particles=100,
+            spacing=4e-3,
+            density_error=0.01,
+            simulated_time=task.motion.duration,
+            steps=100,
+            cpu_s=0.1,
+            seed=task.seed,
+            curve_times=(0.0, 1.0),
+            curve_poured=(0.0, poured),
+            curve_spilled=(0.0, 0.05 * poured),
+        )
+        return SimpleNamespace(outcome=outcome, frames=None)
+
+    def close(self) -> None:
+        pass
+
+
+SCENE = Scene(
+    name="tumbler",
+    pourer=cylinder("beaker", inner_radius=0.035, inner_height=0.1),
+    receiver=cylinder("tumbler", inner_radius=0.04, inner_height=0.1),
+    liquid=Liquid(mass=0.2),
+)
+
+ACTION = Action(
+    angular_velocity=60 * DEG,
+    x_offset=0.1,
+    height=0.1,
+    max_angle=90 * DEG,
+    hold_time=0.8,
+    return_velocity=60 * DEG,
+    angular_acceleration=600 * DEG,
+)
+
+
+@dataclass
+class Stage:
+    """A laboratory that is open, and everything that was said in it."""
+
+    laboratory: InProcessLaboratory
+    bench: WiredBench = field(init=False)
+    site: Site = field(init=False)
+    operator: VirtualOperator = field(init=False)
+    things: Things = field(init=False)
+    notices: list[Notice] = field(default_factory=list)
+    before: dict[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
+    """Done before the next question about something is answered."""
+    answered_at: dict[str, float] = field(default_factory=dict)
+    """Controller time at which the last question about something was answered [s]."""
+    unsafe: list[str] = field(default_factory=list)
+    """Questions that invited hands in while a program ran or a joint moved."""
+
+    def attend(self) -> None:
+        """Stand beside the operator, and look at the controller whenever it is asked something."""
+        rooms = self.laboratory.wired
+        assert rooms is not None
+        assert rooms.site is not None
+        assert rooms.bench.reality is not None
+        assert isinstance(rooms.operator, VirtualOperator)
+        self.bench, self.site, self.operator = rooms.bench, rooms.site, rooms.operator
+        self.things = rooms.bench.reality.things
+        ask = self.operator.ask
+
+        async def attended(question: Question) -> str:
+            state = await self.site.fault("state")
+            if question.hands and (state["runtime_state"] != "STOPPED" or max(map(abs, state["speeds"])) > 1e-3):
+                self.unsafe.append(question.about)
+            if (hook := self.before.pop(question.about, None)) is not None:
+                await hook()
+            answer = await ask(question)
+            self.answered_at[question.about] = await self.now()
+            return answer
+
+        self.operator.ask = attended  # type: ignore[method-assign]
+
+    @property
+    def heard(self) -> list[str]:
+        """What the operator was asked about, in order."""
+        return [question.about for question in self.operator.heard]
+
+    def said(self, level: str) -> str:
+        return "\n".join(notice.text for notice in self.notices if notice.level == level)
+
+    async def pour(self, **changes: Any) -> Any:
+        return await self.bench.pour(SCENE, ACTION, seed=5, **changes)
+
+    async def moved(self, since: float) -> float:
+        """How far any joint has moved since a controller time [rad]."""
+        history = await self.site.history(since)
+        joints = np.array(history.joints)
+        return 0.0 if len(joints) < 2 else float(np.max(np.ptp(joints, axis=0)))
+
+    async def now(self) -> float:
+        """Of the controller [s]."""
+        return float((await self.site.fault("state"))["time"])
+
+
+def wired_spec(
+    placement: Placement = Placement.TRAY, pace: float = PACE, operator: OperatorSpec | None = None
+) -> LaboratorySpec:
+    """The shipped virtual laboratory, quicker, its balance less noisy than a drop."""
+    spec = load_laboratory(LABORATORIES / "virtual.yaml")
+    assert spec.arm is not None
+    assert spec.balance is not None
+    assert spec.balance.serial is not None
+    assert spec.balance.virtual is not None
+    assert spec.bench is not None
+    serial = replace(spec.balance.serial, time_scale=pace, answer_time=0.3, reconnect_time=1.0)
+    virtual = replace(spec.balance.virtual, noise=0.0, drift=0.0, settling_time=0.5)
+    manual = placement is Placement.MANUAL
+    return replace(
+        spec,
+        in_process=True,
+        arm=replace(spec.arm, time_scale=pace),
+        balance=replace(
+            spec.balance,
+            placement=placement,
+            serial=None if manual else serial,
+            virtual=None if manual else virtual,
+        ),
+        bench=replace(spec.bench, time_scale=pace),
+        operator=operator or OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
+    )
+
+
+OpenStage = Callable[..., contextlib.AbstractAsyncContextManager[Stage]]
+
+
+@pytest.fixture
+def open_stage() -> OpenStage:
+    """Opens a wired bench around the cheap liquid, with an operator that does as it is told."""
+
+    @contextlib.asynccontextmanager
+    async def open_it(
+        spec: LaboratorySpec | None = None,
+        *,
+        answers: Mapping[str, Sequence[str]] | None = None,
+        late: Mapping[str, float] | None = None,
+        **changes: Any,
+    ) -> AsyncIterator[Stage]:
+        laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle)
+        stage = Stage(laboratory)
+        laboratory.listen(stage.notices.append)
+        async with laboratory:
+            stage.attend()
+            stage.operator.script(answers or {}, late or {})
+            yield stage
+
+    return open_it
+
+
+async def reach(seen: list[Any], checkpoint: str, patience: float = 60.0) -> None:
+    """Wait until a pour's progress has come to a checkpoint."""
+    end = time.monotonic() + patience
+    while not seen or seen[-1].checkpoint != checkpoint:
+        assert time.monotonic() < end, f"never reached {checkpoint}; was at {seen[-1:]}"
+        await asyncio.sleep(0.01)
