@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.joint_path import JointPath, PathReport
-from actors.arm.path.kinematics import beyond_reach
+from actors.arm.path.kinematics import beyond_reach, posture
 from actors.arm.path.limits import JOINT_NAMES, UPRIGHT
 from actors.arm.path.solids import Nearest, hull, nearest_links, nearest_to_receiver
 from actors.arm.path.stretch import Stretch
@@ -22,28 +22,23 @@ FloatArray = NDArray[np.float64]
 SLACK = 1e-6
 """Relative: a path planned at a limit may lie above it by rounding."""
 
+THROUGH = 0.02
+"""Nearer to a singularity than this a path goes through it, as far as speeds are concerned."""
+
 LARGEST_STEP = math.radians(15.0)
 """Of a joint between two waypoints [rad]: more is no path but a jump."""
 
 
 def check_stretch(stretch: Stretch, pourer: Vessel, receiver: Vessel) -> list[str]:
     """What is wrong with a stretch, other than the distance of the pourer from the receiver."""
-    of_joints = (
-        []
-        if stretch.unreached
-        else [
-            *_ranges(stretch),
-            *_joint_speeds(stretch),
-            *_singular(stretch),
-            *_links(stretch, receiver),
-        ]
-    )
-    return [
-        *of_joints,
-        *_speeds(stretch, hull(pourer)),
-        *_tilts(stretch),
-        *_places(stretch, hull(pourer)),
-    ]
+    points = hull(pourer)
+    problems = [*_tilts(stretch), *_places(stretch, points)]
+    if stretch.unreached is not None:
+        return [*_speeds(stretch, points), *problems]
+    problems = [*_ranges(stretch), *_singular(stretch), *problems, *_links(stretch, receiver)]
+    if stretch.margins.min() < THROUGH:
+        return problems  # joints then race, but that is not what to mend
+    return [*_joint_speeds(stretch), *_speeds(stretch, points), *problems]
 
 
 def check_clearance(stretch: Stretch, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
@@ -65,20 +60,21 @@ def check_clearance(stretch: Stretch, until: float, pourer: Vessel, receiver: Ve
 
 
 def check_reach(unreached: Stretch) -> str:
-    """What to say about a stretch of which some poses can't be reached, in any posture or in home's."""
+    """What to say about a stretch of which some poses can't be reached in the posture of home."""
+    home = posture(np.array(unreached.spec.home), unreached.model)
     beyond = beyond_reach(unreached.flange.rotation, unreached.flange.position, unreached.model)
-    worst = int(np.argmax(np.abs(beyond)))
+    worst = int(np.argmax(np.abs(beyond[:, home])))
     # a way that can't be made has no pace yet
     when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)
-    distance = 1e3 * float(beyond[worst])
-    if distance > 0.0:
-        return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer to the base"
-    if distance < 0.0:
-        return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it"
-    return (
-        f"the {unreached.name} can be made in another posture of the arm only, not in that of 'home'; "
-        "choose a 'home' with elbow or wrist bent the other way"
+    distance = 1e3 * float(beyond[worst, home])
+    another = (
+        "; another posture of the arm would reach it: wait at a 'home' with the wrist bent the other way"
+        if np.any(np.all(beyond == 0.0, axis=0))
+        else ""
     )
+    if distance > 0.0:
+        return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer to the base{another}"
+    return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it{another}"
 
 
 def report(stretches: list[Stretch], clearance: float, pourer: Vessel, deviation: float) -> PathReport:
@@ -144,9 +140,15 @@ def refusal(problems: list[str]) -> str:
     return "the arm can't make this pour:\n" + "\n".join(f"  - {problem}" for problem in problems)
 
 
+def _first_worst(values: FloatArray) -> int:
+    """Where the largest value is reached first: a hold keeps it to within rounding."""
+    most = float(values.max())
+    return int(np.argmax(values >= most - 1e-6 * abs(most) - 1e-9))
+
+
 def _ranges(s: Stretch) -> Iterator[str]:
     for k, (name, most) in enumerate(zip(JOINT_NAMES, s.model.joint_range, strict=True)):
-        worst = int(np.argmax(np.abs(s.joints[:, k])))
+        worst = _first_worst(np.abs(s.joints[:, k]))
         angle = float(s.joints[worst, k])
         if abs(angle) > most:
             yield (
@@ -158,7 +160,7 @@ def _ranges(s: Stretch) -> Iterator[str]:
 def _joint_speeds(s: Stretch) -> Iterator[str]:
     for k, (name, own) in enumerate(zip(JOINT_NAMES, s.model.joint_speed, strict=True)):
         most = min(own, s.spec.limits.joint_speed)
-        worst = int(np.argmax(s.joint_speeds[:, k]))
+        worst = _first_worst(s.joint_speeds[:, k])
         speed = float(s.joint_speeds[worst, k])
         if speed > most * (1.0 + SLACK):
             yield (
@@ -195,13 +197,13 @@ def _singular(s: Stretch) -> Iterator[str]:
 
 def _speeds(s: Stretch, points: FloatArray) -> Iterator[str]:
     speeds = s.point_speeds(points)
-    worst = int(np.argmax(speeds))
+    worst = _first_worst(speeds)
     if speeds[worst] > s.spec.limits.tool_speed * (1.0 + SLACK):
         yield (
             f"tool or pourer would move at {speeds[worst]:.2f} m/s, {s.when(worst)}; "
             f"{s.spec.limits.tool_speed:.2f} m/s are allowed"
         )
-    worst = int(np.argmax(s.turning))
+    worst = _first_worst(s.turning)
     if s.turning[worst] > s.spec.limits.tilt_speed * (1.0 + 1e-4):
         yield (
             f"the pourer would turn at {math.degrees(s.turning[worst]):.0f} deg/s, {s.when(worst)}; "
@@ -210,7 +212,7 @@ def _speeds(s: Stretch, points: FloatArray) -> Iterator[str]:
 
 
 def _tilts(s: Stretch) -> Iterator[str]:
-    worst = int(np.argmax(s.tilts))
+    worst = _first_worst(s.tilts)
     # on its way the pourer is full: what a pour may is not what an approach may
     most = UPRIGHT if s.name == "approach" else s.spec.limits.tilt
     if s.tilts[worst] > most * (1.0 + SLACK):
@@ -242,10 +244,10 @@ def _beyond(s: Stretch, normal: FloatArray, offset: float, points: FloatArray) -
     """What would leave normal · point ≥ offset the farthest: its name, sample, and normal · point [m]."""
     tool = s.tool @ normal
     if tool.min() < offset:
-        yield "the tool", int(np.argmin(tool)), float(tool.min())
+        yield "the tool", _first_worst(-tool), float(tool.min())
     least, lowest = _support(s, normal, points)
     if least.min() < offset:
-        where = int(np.argmin(least))
+        where = _first_worst(-least)
         rim = points[lowest[where], 2] > 0.5 * points[:, 2].max() > 0.0
         yield f"the pourer's {'rim' if rim else 'underside'}", where, float(least.min())
 

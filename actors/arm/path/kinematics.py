@@ -120,17 +120,17 @@ def singularities(q: FloatArray, m: RobotModel) -> FloatArray:
 
 
 def beyond_reach(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatArray:
-    """By how much a pose lies out of reach, shape (T,) [m], in the posture that comes nearest; 0 within reach.
+    """By how much poses lie out of reach, shape (T, 8) [m], in every posture as `inverse` counts; 0 within reach.
 
-    Negative where it is too near for the arm to fold or, inside the base's own cylinder, to get the wrist there.
+    Negative where a pose is too near for the arm to fold or, inside the base's own cylinder, to get the wrist there.
     """
-    distances = np.stack([np.hypot(u, v) for *_, u, v in _wrists(rotation, position, m)])
+    distances = np.stack([np.hypot(u, v) for *_, u, v in _wrists(rotation, position, m)], axis=-1)
     too_far = distances - abs(m.a2) - abs(m.a3)
     too_near = distances - abs(abs(m.a2) - abs(m.a3))
-    beyond = np.where(too_far > 0.0, too_far, np.minimum(too_near, 0.0))
-    best = np.take_along_axis(beyond, np.argmin(np.where(np.isnan(beyond), np.inf, np.abs(beyond)), axis=0)[None], 0)[0]
     w = position - m.d6 * rotation[:, :, 2]
-    return np.where(np.isnan(best), np.hypot(w[:, 0], w[:, 1]) - m.d4, best)
+    inside = (np.hypot(w[:, 0], w[:, 1]) - m.d4)[:, None]
+    beyond = np.where(too_far > 0.0, too_far, np.minimum(too_near, 0.0))
+    return np.repeat(np.where(np.isnan(distances), inside, beyond), 2, axis=-1)
 
 
 def link_points(q: FloatArray, m: RobotModel) -> FloatArray:

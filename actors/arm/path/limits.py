@@ -61,11 +61,12 @@ def _receiver(spec: UrArmSpec) -> list[str]:
     beside = np.array([[-0.1, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]])
     flange = flange_poses(beside, spec)
     if not np.isfinite(inverse(flange.rotation, flange.position, model)).any():
-        beyond = float(beyond_reach(flange.rotation, flange.position, model)[0])
+        beyond = beyond_reach(flange.rotation, flange.position, model)[0]
+        least = 1e3 * float(beyond[np.argmin(np.abs(beyond))])
         text = (
-            f"out of reach by {1e3 * beyond:.0f} mm; move the receiver nearer"
-            if beyond > 0.0
-            else ("too near to the base; move the receiver farther away")
+            f"out of reach by {least:.0f} mm; move the receiver nearer to the base"
+            if least > 0.0
+            else f"{-least:.0f} mm too near to the arm's base; move the receiver away from it"
         )
         problems.append(
             f"cell.receiver: an upright pourer beside it, 100 mm up, is {text}, or turn 'direction' or 'grip'"

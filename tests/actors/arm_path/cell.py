@@ -1,0 +1,82 @@
+"""A UR10e beside a receiver, and pours for it. The pourer is gripped from the side, so that wrist 3 tilts it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.path.travel import follow
+from actors.arm.spec import ArmLimits, Cell, Pose, UrArmSpec
+from orchestrator.config.load import load_vessel
+from sim_engine.action import DEG, Action
+from sim_engine.liquid import Liquid
+from sim_engine.motion import PourMotion, plan_motion
+from sim_engine.task import Pivot, Scene
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+LIMITS = ArmLimits(
+    box_low=(0.25, -0.6, 0.0), box_high=(1.0, 0.4, 0.9), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3
+)
+SPEC = UrArmSpec(
+    model="ur10e",
+    limits=LIMITS,
+    cell=Cell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
+    home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
+    tool=Pose(z=0.17),
+    grip=Pose(y=-0.06, rx=-90 * DEG),
+)
+ACTION = Action(
+    angular_velocity=60 * DEG,
+    x_offset=0.098,
+    height=0.1,
+    max_angle=110 * DEG,
+    angular_acceleration=600 * DEG,
+    hold_time=0.5,
+    return_velocity=90 * DEG,
+)
+
+
+@cache
+def vessel(name: str) -> Vessel:
+    """A shipped vessel."""
+    return build_vessel(load_vessel(CONFIGS / "vessels" / f"{name}.yaml"))
+
+
+def motion(action: Action = ACTION, receiver: str = "tumbler", pivot: Pivot | None = None) -> PourMotion:
+    """Out of the beaker."""
+    scene = Scene("s", vessel("beaker").spec, vessel(receiver).spec, Liquid(name="water", mass=0.2), pivot or Pivot())
+    return plan_motion(scene, action, vessel("beaker"), vessel(receiver))
+
+
+def limited(**changes: Any) -> UrArmSpec:
+    """The cell with other limits."""
+    return replace(SPEC, limits=replace(LIMITS, **changes))
+
+
+def placed(**changes: Any) -> UrArmSpec:
+    """The cell with other things in it."""
+    return replace(SPEC, cell=replace(SPEC.cell, **changes))
+
+
+def waiting_at(x: float, y: float, z: float) -> UrArmSpec:
+    """The cell with a home that has the pourer upright at a place of the world, in the same posture."""
+    pose = np.array([[x, y, z, 1.0, 0.0, 0.0, 0.0]])
+    q = follow(pose, np.array(SPEC.home), SPEC)[0]
+    return replace(SPEC, home=(q[0], q[1], q[2], q[3], q[4], q[5]))
+
+
+def turned(rotations: FloatArray, others: FloatArray) -> FloatArray:
+    """Angles between rotation matrices, shape (T,) [rad]."""
+    chord = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)
+    return 2.0 * np.arcsin(np.minimum(chord, 1.0))
