@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import math
 import os
+import re
 import sys
 import termios
 import textwrap
@@ -31,6 +32,7 @@ _WORDS = {
     "done": {"done": "done", "d": "done"},
     "yes or no": {"yes": "yes", "y": "yes", "no": "no", "n": "no"},
 }
+_ANNOUNCED = re.compile(r"moves in (\d+(?:\.\d+)?) s")
 _WIDTH = 100
 _ENDS_OF_INPUT = 3
 """Ctrl-D once is a slip; so many in a row mean that the terminal is gone."""
@@ -61,6 +63,7 @@ class TerminalOperator:
         self._one_question = asyncio.Lock()
         self._open: Question | None = None
         self._reminded = 0.0
+        self._counting: asyncio.Task[None] | None = None
 
     async def ask(self, question: Question) -> str:
         """See `Operator.ask`.
@@ -70,6 +73,8 @@ class TerminalOperator:
         """
         async with self._one_question:
             with self._paused(), _Lines(self._stdin) as lines:
+                if self._counting is not None:
+                    self._counting.cancel()  # whatever was announced is over: somebody is asked again
                 self._write(f"\a\n{_worded(question)}\n{self._expected(question)}\n> ")
                 self._open, self._reminded = question, asyncio.get_running_loop().time()
                 try:
@@ -78,12 +83,25 @@ class TerminalOperator:
                     self._open = None
 
     async def tell(self, text: str) -> None:
-        """See `Operator.tell`. What is said while a question is open is a reminder: it rings, and asks again."""
+        """See `Operator.tell`. What is said while a question is open is a reminder: it rings, and asks again.
+
+        That something 'moves in 3 s' is counted down.
+        """
         if self._open is None:
             self._write(f"{text}\n")
+            if announced := _ANNOUNCED.search(text):
+                self._counting = asyncio.create_task(self._count_down(float(announced[1])))
             return
         self._reminded = asyncio.get_running_loop().time()
         self._write(f"\a\n{text}\n{_EXPECTED[self._open.wants]}\n> ")
+
+    async def _count_down(self, seconds: float) -> None:
+        end = asyncio.get_running_loop().time() + seconds
+        for left in range(math.ceil(seconds) - 1, 0, -1):
+            await asyncio.sleep(max(end - left - asyncio.get_running_loop().time(), 0.0))
+            self._write(f"\a  {left} …\n")
+        await asyncio.sleep(max(end - asyncio.get_running_loop().time(), 0.0))
+        self._write("\a  now\n")
 
     async def _answer(self, question: Question, lines: _Lines) -> str:
         loop = asyncio.get_running_loop()

@@ -38,7 +38,7 @@ def path_png(
         spec: of the arm and its cell.
         pourer, receiver: geometry.
         title: first line.
-        note: below the picture.
+        note: second line.
 
     Returns:
         `file`.
@@ -51,7 +51,7 @@ def path_png(
     box = world.apply(np.array(list(itertools.product(*zip(spec.limits.box_low, spec.limits.box_high, strict=True)))))
     base, table = world.apply(np.zeros((1, 3)))[0], world.apply(np.array([[0.0, 0.0, spec.cell.table]]))[0, 2]
     figure, (side, top) = style.new_figure(1, 2, size=(12.5, 6.2))
-    figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.01, ha="left")
+    figure.suptitle(f"{title}\n{note}".strip(), fontsize=10.5, color=style.INK, x=0.01, ha="left")
     for axes, across, name in ((side, 2, "z: up"), (top, 1, "y")):
         _outline(axes, box[:, [0, across]], label="box of the laboratory's file")
         for stretch, (_, way, colour) in zip(stretches, _WAYS, strict=True):
@@ -77,8 +77,6 @@ def path_png(
     _vessels_from_above(top, stretches[1], pourer, receiver)
     handles, labels = side.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
-    if note:
-        figure.supxlabel(note, fontsize=8.5, color=style.GREY, x=0.01, ha="left")
     return style.save(figure, file)
 
 

@@ -7,6 +7,7 @@ import contextlib
 import io
 import os
 import pty
+import re
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
@@ -158,6 +159,27 @@ def test_what_is_said_while_a_question_is_open_rings_and_counts_as_a_reminder(ke
         assert keyboard.screen.getvalue().endswith("> ")
         keyboard.type("done\n")
         assert await asking == "done"
+
+    played(scene)
+
+
+def test_announced_movement_is_counted_down(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        await keyboard.operator().tell("The arm moves in 3 s. Keep out of its way.")
+        assert "…" not in keyboard.screen.getvalue()
+        await keyboard.shows("now")
+
+    played(scene)
+    assert re.findall(r"(\d) …|now", keyboard.screen.getvalue()) == ["2", "1", ""]
+
+
+def test_numbers_that_belong_to_a_question_are_short(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        asking = asyncio.create_task(
+            keyboard.operator().ask(Question("May it?", "yes or no", details={"s": 8.0277592}))
+        )
+        await keyboard.shows("s: 8.028\n")
+        asking.cancel()
 
     played(scene)
 
