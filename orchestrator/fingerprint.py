@@ -9,6 +9,7 @@ from typing import Any, cast
 from orchestrator.codec import to_json
 from orchestrator.plan import CampaignPlan
 from sim_engine.liquid import Liquid
+from sim_engine.task import Scene
 from sim_engine.vessel.spec import MeshShape
 
 _FREE = ("source", "outputs", "resolved", "on_unknown")
@@ -23,7 +24,7 @@ _MACHINE = ("simulators", "in_process", "object_store_mb", "ray", "operator", "a
 _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "handshake", "reconnect_time")}
 """Of its parts: a controller may get another address, a balance another socket."""
 
-_YOUNGER: dict[str, dict[str, Any]] = {"calibration": {"grid": {}, "thetas": 0}}
+_YOUNGER: dict[str, dict[str, Any]] = {"calibration": {"grid": {}, "thetas": 0}, "deployment": {"data": None}}
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
 
 
@@ -52,6 +53,15 @@ def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
         if data["laboratory"].get(part) is None:
             data["laboratory"].pop(part, None)
     return cast("dict[str, Any]", _by_content(data))
+
+
+def scene_by_content(scene: Scene) -> dict[str, Any]:
+    """A scene as fingerprints have it: comparable with one in the header of a journal.
+
+    Raises:
+        OSError: a mesh file can't be read.
+    """
+    return cast("dict[str, Any]", _by_content(to_json(scene, Scene)))
 
 
 def _by_content(data: Any) -> Any:

@@ -48,7 +48,7 @@ class RecordSet:
     """Weighed pours in one scene.
 
     Attributes:
-        path: the CSV file.
+        path: the CSV file, or the journal of the run that made them.
         lip_radius: what turned the file's lip_to_receiver_axis_mm into x_offset [m]; None if it has x_offset_mm.
         columns: columns that have another name in the file, {name that Decant knows: name in the file}.
     """
@@ -56,6 +56,26 @@ class RecordSet:
     scene: Scene
     pours: tuple[RecordedPour, ...]
     path: Path
+    lip_radius: float | None = None
+    columns: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ExistingPours:
+    """Pours weighed before the campaign, from which deployment learns as from its own.
+
+    Attributes:
+        pours: by the name of the scene they were made in; all inside the action space.
+        path: the CSV file, or the journal of the run that made them.
+        counts: whether they count against the budget of pours.
+        left_out: why others of the file or run were not used, one text each.
+        lip_radius, columns: as in `RecordSet`.
+    """
+
+    pours: dict[str, tuple[RecordedPour, ...]]
+    path: Path
+    counts: bool = False
+    left_out: tuple[str, ...] = ()
     lip_radius: float | None = None
     columns: dict[str, str] = field(default_factory=dict)
 
@@ -113,6 +133,7 @@ class DeploymentPlan:
         kappa: κ of the lower confidence bound.
         initial: actions drawn evenly before the surrogate takes over.
         on_failed_pour: how a failed pour enters the data.
+        data: D2, D3: pours of before the campaign.
     """
 
     strategy: DeploymentName
@@ -128,6 +149,7 @@ class DeploymentPlan:
     kappa: float = 2.0
     initial: int = 3
     on_failed_pour: Literal["penalise", "ignore"] = "penalise"
+    data: ExistingPours | None = None
 
 
 @dataclass(frozen=True)

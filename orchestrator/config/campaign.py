@@ -39,7 +39,7 @@ class TransferSection(Section):
 
 
 class PoursSection(Section):
-    """Pours to calibrate on: to be made (`count`), or weighed already (`from`)."""
+    """Pours to calibrate on: to be made (`count`), or weighed already (`from`, `from_run`)."""
 
     count: PositiveCount | None = None
     """Pours to make on the bench."""
@@ -49,6 +49,9 @@ class PoursSection(Section):
 
     source: Text | None = Field(default=None, alias="from")
     """CSV file of weighed pours; its column `split` says which are kept for testing."""
+
+    from_run: Text | None = None
+    """Folder of a former run: its weighed pours in the same scene, with the splits that they had there."""
 
     lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
     """The pourer's inner radius at the lip, where the CSV has lip_to_receiver_axis_mm in place of x_offset_mm."""
@@ -107,6 +110,28 @@ class CalibrationSection(Section):
 
     random_baseline: Count = 0
     """Random parameters that are scored for comparison."""
+
+
+class DataSection(Section):
+    """Pours of before the campaign that deployment learns from: in a CSV file, or made by a former run."""
+
+    source: Text | None = Field(default=None, alias="from")
+    """CSV file of weighed pours, with the columns of calibration's `pours`; `split` may be left out."""
+
+    run: Text | None = None
+    """Folder of a former run: its weighed pours in the same scenes, whatever they were made for."""
+
+    receiver: Text | None = None
+    """Name of the receiver that the CSV file is about, where there are several."""
+
+    counts: Switch = False
+    """Whether these pours count against the budget."""
+
+    lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
+    """The pourer's inner radius at the lip, where the CSV has lip_to_receiver_axis_mm in place of x_offset_mm."""
+
+    columns: dict[Text, Text] = Field(default_factory=dict)
+    """Columns that have another name in the CSV: {name that Decant knows: name in the file}."""
 
 
 class LossSection(Section):
@@ -171,6 +196,9 @@ class DeploymentSection(Section):
 
     on_failed_pour: Literal["penalise", "ignore"] = "penalise"
     """How a failed pour enters the data."""
+
+    data: DataSection | None = None
+    """D2, D3: pours of before the campaign."""
 
 
 class SimulatorSection(Section):

@@ -74,7 +74,12 @@ class Row:
 
 
 def read_records(
-    path: Path, *, loaded: float, lip_radius: float | None = None, columns: Mapping[str, str] | None = None
+    path: Path,
+    *,
+    loaded: float,
+    lip_radius: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    split: str | None = None,
 ) -> Table:
     """Read weighed pours.
 
@@ -88,6 +93,7 @@ def read_records(
         loaded: mass in the pourer before each pour [kg].
         lip_radius: the pourer's inner radius at the lip [m].
         columns: names that the file has in place of the above, {above: in the file}.
+        split: of all pours where the file has no such column; it must have one unless given.
 
     Returns:
         The table; its `problems` say what is wrong with the file.
@@ -109,7 +115,7 @@ def read_records(
     header = [cell.strip() for cell in next(reader, [])]
     names = {theirs: ours for ours, theirs in (columns or {}).items()}
     header = [names.get(cell, cell) for cell in header]
-    _check_header(table, path, header, lines[0] if lines else "", lip_radius)
+    _check_header(table, path, header, lines[0] if lines else "", lip_radius, needs_split=split is None)
     if table.problems:
         return table
     table.dimensions = tuple(
@@ -119,7 +125,9 @@ def read_records(
     )
     for cells in reader:
         if any(cell.strip() for cell in cells):
-            row = _read_row(table, path, header, cells, reader.line_num, lines[reader.line_num - 1], loaded, lip_radius)
+            row = _read_row(
+                table, path, header, cells, reader.line_num, lines[reader.line_num - 1], loaded, lip_radius, split
+            )
             if row is not None:
                 table.rows.append(row)
     if not table.rows and not table.problems:
@@ -127,7 +135,9 @@ def read_records(
     return table
 
 
-def _check_header(table: Table, path: Path, header: list[str], line: str, lip_radius: float | None) -> None:
+def _check_header(
+    table: Table, path: Path, header: list[str], line: str, lip_radius: float | None, *, needs_split: bool
+) -> None:
     known = (*DIMENSION_COLUMNS, LIP_COLUMN, *MASS_COLUMNS, "split")
 
     def add(name: str, message: str) -> None:
@@ -141,7 +151,7 @@ def _check_header(table: Table, path: Path, header: list[str], line: str, lip_ra
             add(name, f"unknown column; {hint}")
         elif header.count(name) > 1:
             add(name, "stands twice in the header; keep one")
-    for name in (*MASS_COLUMNS, "split"):
+    for name in (*MASS_COLUMNS, *(["split"] if needs_split else [])):
         if name not in header:
             add("", f"column '{name}' is missing")
     if not any(name in DIMENSION_COLUMNS or name == LIP_COLUMN for name in header):
@@ -162,6 +172,7 @@ def _read_row(
     line: str,
     loaded: float,
     lip_radius: float | None,
+    usual_split: str | None,
 ) -> Row | None:
     before = len(table.problems)
 
@@ -184,7 +195,7 @@ def _read_row(
                 raise ValueError
         except ValueError:
             add(name, f"{cell.strip()!r} is not a number" if cell.strip() else "is empty; every pour needs a value")
-    split = cells[header.index("split")].strip()
+    split = cells[header.index("split")].strip() if "split" in header else str(usual_split)
     if split not in SPLITS:
         add("split", f"{split!r} is not known; should be one of {', '.join(SPLITS)}")
     action: dict[str, float] = {}

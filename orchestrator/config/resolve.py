@@ -6,24 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from actors.spec import LaboratorySpec
-from orchestrator.config.campaign import CampaignFile, DeploymentSection
+from orchestrator.config.campaign import CampaignFile
 from orchestrator.config.motion import ParametersBase
 from orchestrator.config.references import References
 from orchestrator.config.resolve_calibration import resolve_calibration
+from orchestrator.config.resolve_deployment import resolve_deployment
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place, Report
-from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.plan import CampaignPlan, OutputPlan
 from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
-
-BELONGS_TO = {
-    "iterations": ("D1",),
-    "simulations_per_iteration": ("D1",),
-    "prior_simulations": ("D3",),
-    "per_pour": ("D3",),
-    "mean": ("D2",),
-}
-"""Deployment keys that only some strategies use: given to another, they were misunderstood."""
 
 
 def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> CampaignPlan | None:
@@ -47,7 +38,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
             file.calibration, builder, fixed, searched, root.at("calibration"), laboratory
         )
     if file.deployment is not None:
-        deployment = _deployment(file.deployment, builder, root.at("deployment"), laboratory)
+        deployment = resolve_deployment(file.deployment, builder, root.at("deployment"), laboratory)
     broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
     if file.calibration is None and file.deployment is None and not broken:
         report.add(root, "there is nothing to do; add a 'calibration' or a 'deployment' section")
@@ -103,63 +94,3 @@ def _check_ranges(file: CampaignFile, searched: dict[str, Any], root: Place, rep
             "for example 'cohesion: [0 N/m, 0.1 N/m]'",
             key=True,
         )
-
-
-def _deployment(
-    section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySpec | None
-) -> DeploymentPlan | None:
-    report = builder.report
-    strategy = section.strategy
-    pourer = builder.pourer(section.pourer, place)
-    receivers = builder.receivers(section, place)
-    actions = builder.space(section.actions, section.motion, place)
-    for key, strategies in BELONGS_TO.items():
-        if strategy is not None and section.value(key) is not None and strategy not in strategies:
-            report.add(place.at(key), f"belongs to {' and '.join(strategies)}, not to {strategy}; remove it", key=True)
-    pours = section.pours
-    if pours is None and strategy == "D1":
-        pours = 1
-    if pours is None and strategy is not None and not report.is_broken(place.at("pours")):
-        report.add(
-            place, f"key 'pours' is missing; {strategy} learns on real pours, add for example 'pours: 15'", key=True
-        )
-    if pours == 0 and strategy in ("D2", "D3"):
-        report.add(place.at("pours"), f"{strategy} learns on real pours; at least 1 (D1 plans without any)")
-    if pours and laboratory is not None and not laboratory.pours:
-        at = place.at("pours") if section.pours is not None else place
-        hint = "'pours: 0' only plans" if strategy == "D1" else "name one with a bench"
-        report.add(at, f"laboratory '{laboratory.name}' has no bench to pour on; {hint}")
-    loss = section.loss
-    if loss.retained_weight is not None and loss.name != "spilled_and_retained":
-        report.add(
-            place.at("loss", "retained_weight"), f"belongs to spilled_and_retained, not to {loss.name}", key=True
-        )
-    scenes = []
-    for receiver in receivers or [None]:
-        name = "deployment" if receiver is None else f"deployment-{receiver.name}"
-        motions = ((section.motion, place.at("motion")),)
-        scene = builder.scene(
-            name, pourer, receiver, motions, () if actions is None else actions.names, place, recorded=pours == 0
-        )
-        scenes.append(scene)
-        if scene is None:
-            break  # one cause, one message
-    complete = tuple(scene for scene in scenes if scene is not None)
-    if len(complete) < len(receivers) or actions is None or strategy is None or pours is None:
-        return None
-    per_pour = section.per_pour if section.per_pour is not None else 2
-    return DeploymentPlan(
-        strategy=strategy,
-        scenes=complete,
-        actions=actions,
-        loss=Loss(loss.name, 1.0 if loss.retained_weight is None else loss.retained_weight),
-        pours=pours,
-        iterations=section.iterations or 15,
-        simulations_per_iteration=section.simulations_per_iteration or 2,
-        prior_simulations=37 if section.prior_simulations is None else section.prior_simulations,
-        per_pour=(None if per_pour == "free" else int(per_pour)) if strategy == "D3" else 0,
-        mean=section.mean or "constant",
-        kappa=section.kappa,
-        initial=section.initial,
-        on_failed_pour=section.on_failed_pour,
-    )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign import CalibrationSection
 from orchestrator.config.records_resolve import read_table, resolve_records
+from orchestrator.config.resolve_data import records_of_run
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place, Report
 from orchestrator.plan import CalibrationPlan, RecordSet
@@ -58,7 +59,8 @@ def resolve_calibration(
     """
     report = builder.report
     pours, at = section.pours, place.at("pours")
-    recorded = pours is not None and pours.source is not None
+    from_file = pours is not None and pours.source is not None
+    from_run = None if pours is None else pours.from_run
     pourer = builder.pourer(section.pourer, place)
     receiver = builder.receiver(section.receiver, place)
     actions = builder.space(section.actions, section.motion, place)
@@ -67,26 +69,44 @@ def resolve_calibration(
     table = read_table(pours, pours.source, at.at("from"), builder) if pours is not None else None
     constants = {} if table is None else table.constants()
     scene = builder.scene(
-        "calibration", pourer, receiver, motions, searched_actions, place, recorded=recorded, constants=constants
+        "calibration",
+        pourer,
+        receiver,
+        motions,
+        searched_actions,
+        place,
+        recorded=from_file or from_run is not None,
+        constants=constants,
     )
     records = transfer = None
     count = holdout = 0
-    if pours is not None and recorded:
+    if pours is not None and (from_file or from_run is not None):
+        source = "a file" if from_file else "a run"
         for key in ("count", "holdout"):
             if pours.value(key) is not None:
                 report.add(
-                    at.at(key), "belongs to pours that are still to be made; these are read 'from' a file", key=True
+                    at.at(key), f"belongs to pours that are still to be made; these are read 'from' {source}", key=True
                 )
-        records, transfer = resolve_records(pours, at, builder, table, actions, scene, pourer, motions)
-    elif pours is not None:
+    if pours is not None and not from_file:
         for key in ("lip_radius", "transfer", "columns"):
             if at.at(key).loc in at.document.marks:
                 report.add(at.at(key), "belongs to pours that are read 'from' a CSV file", key=True)
+    if pours is not None and from_file:
+        if from_run is not None:
+            report.add(at.at("from_run"), "stands beside 'from'; keep one of them", key=True)
+        records, transfer = resolve_records(pours, at, builder, table, actions, scene, pourer, motions)
+    elif from_run is not None:
+        if scene is not None and actions is not None:
+            records = records_of_run(from_run, at.at("from_run"), scene, actions, laboratory, report)
+    elif pours is not None:
         count = pours.count or 0
-        if not count and not report.is_broken(at) and not any(report.is_broken(at.at(k)) for k in ("count", "from")):
-            report.add(
-                at, "needs 'count' (pours to make on the bench) or 'from' (a CSV file of weighed pours)", key=True
-            )
+        if (
+            not count
+            and not report.is_broken(at)
+            and not any(report.is_broken(at.at(k)) for k in ("count", "from", "from_run"))
+        ):
+            text = "needs 'count' (pours to make on the bench), 'from' (a CSV file of weighed pours) or 'from_run'"
+            report.add(at, text, key=True)
         holdout = max(1, count // 8) if pours.holdout is None and count > 1 else pours.holdout or 0
         if count and holdout >= count:
             report.add(at.at("holdout"), f"keeps {holdout} of {count} pours for testing, so that none is left to fit")

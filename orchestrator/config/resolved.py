@@ -7,7 +7,8 @@ from typing import Any
 from orchestrator.config.laboratory import laboratory_as_file
 from orchestrator.config.motion import fixed_as_file, space_as_file, value_as_file
 from orchestrator.config.vessel import liquid_as_file, vessel_as_file
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.journal import JOURNAL_NAME
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, ExistingPours
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
@@ -92,6 +93,8 @@ def _budget(plan: CalibrationPlan) -> dict[str, object]:
 def _pours(plan: CalibrationPlan) -> dict[str, object]:
     if plan.records is None:
         return {"count": plan.pour_count, "holdout": plan.holdout}
+    if plan.records.path.name == JOURNAL_NAME:
+        return {"from_run": str(plan.records.path.parent)}
     pours: dict[str, object] = {"from": str(plan.records.path)}
     if plan.records.lip_radius is not None:
         pours["lip_radius"] = f"{plan.records.lip_radius!r} m"
@@ -124,6 +127,8 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
         "initial": plan.initial,
         "on_failed_pour": plan.on_failed_pour,
     }
+    if plan.data is not None:
+        table["data"] = _data(plan.data, plan)
     match plan.strategy:
         case "D1":
             table |= {"iterations": plan.iterations, "simulations_per_iteration": plan.simulations_per_iteration}
@@ -133,3 +138,13 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
             table["prior_simulations"] = plan.prior_simulations
             table["per_pour"] = "free" if plan.per_pour is None else plan.per_pour
     return table
+
+
+def _data(data: ExistingPours, plan: DeploymentPlan) -> dict[str, object]:
+    if data.path.name == JOURNAL_NAME:
+        return {"run": str(data.path.parent), "counts": data.counts}
+    receivers = [scene.receiver.name for scene in plan.scenes if scene.name in data.pours]
+    table: dict[str, object] = {"from": str(data.path), "receiver": receivers[0], "counts": data.counts}
+    if data.lip_radius is not None:
+        table["lip_radius"] = f"{data.lip_radius!r} m"
+    return table | ({"columns": dict(data.columns)} if data.columns else {})

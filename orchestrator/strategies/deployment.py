@@ -81,12 +81,18 @@ class Deployment(ABC):
         self._trials = Trials()
         self._width_known = False
         self._pours: list[PourTrial] = []
+        self._former = self._existing()
         self._queued_pour: Pour | None = None
         self._pouring: Pour | None = None
         self._final: Suggestion | None = None
         self._latest_map: Suggestion | None = None
         self._finished = False
         self.decisions: list[Decision] = []
+        if plan.data is not None:
+            text = (
+                f"{len(self._former)} former pours enter the data ({plan.data.path.parent.name}/{plan.data.path.name})"
+            )
+            self.decisions.append(Decision("; left out: ".join([text, *plan.data.left_out])))
 
     # -- asking and listening --------------------------------------------------------------------------------------
 
@@ -183,15 +189,27 @@ class Deployment(ABC):
         simulation from seed to seed, as fitted; None without a surrogate."""
         return (suggestion.hyperparameters or {}).get("noise")
 
+    def _existing(self) -> list[tuple[Point, float]]:
+        """Place and cost of the pours of before the campaign in this scene."""
+        pours = () if self._plan.data is None else self._plan.data.pours.get(self._scene.name, ())
+        space, found = self._plan.actions, []
+        for pour in pours:
+            unit = space.encode({name: getattr(pour.action, name) for name in space.names})
+            point = tuple(min(max(float(u), 0.0), 1.0) for u in unit)
+            measured = PourMeasurement(pour.poured + pour.retained, pour.spilled, pour.retained)
+            found.append((point, self._costing.poured(measured)))
+        return found
+
     def _real(self) -> Data:
-        """Observations of the real cost."""
-        observed = [(p.point, p.cost) for p in self._pours if p.cost is not None]
+        """Observations of the real cost, those of before the campaign first."""
+        observed = [*self._former, *((p.point, p.cost) for p in self._pours if p.cost is not None)]
         return Data(tuple(point for point, _ in observed), tuple(cost for _, cost in observed))
 
     @property
     def _counted(self) -> int:
         """Pours that count against the budget."""
-        return sum(p.status in ("weighed", "failed") for p in self._pours)
+        former = len(self._former) if self._plan.data is not None and self._plan.data.counts else 0
+        return former + sum(p.status in ("weighed", "failed") for p in self._pours)
 
     @property
     def _refused(self) -> int:
@@ -229,7 +247,7 @@ class Deployment(ABC):
 
     def progress(self) -> tuple[int, int]:
         """Steps done, steps in all."""
-        return self._counted, self._plan.pours
+        return min(self._counted, self._plan.pours), self._plan.pours
 
     def result(self) -> dict[str, object]:
         """What was learnt so far; actions in display units and in SI."""
@@ -241,6 +259,7 @@ class Deployment(ABC):
             "simulations": self._trials.answered,
             "simulations_lost": self._trials.lost,
             "pours": [self._row(p) for p in self._pours if p.status != "pouring"],
+            "former_pours": len(self._former),
             "refused_pours": self._refused,
             "failed_pours": sum(p.status == "failed" for p in self._pours),
             "trust": self._trust(weighed),

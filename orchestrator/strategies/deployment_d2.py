@@ -22,9 +22,10 @@ class RealOnly(Deployment):
             return
         if self._pours_left:
             data = self._real()
-            if len(self._pours) < min(self._plan.initial, self._plan.pours):
+            known = [*(point for point, _ in self._former), *(p.point for p in self._pours)]
+            if len(known) < min(self._plan.initial, self._plan.pours):
                 # one Sobol sequence, point by point, each far from those poured
-                tried = Data(tuple(p.point for p in self._pours), tuple(0.0 for _ in self._pours))
+                tried = Data(tuple(known), tuple(0.0 for _ in known))
                 self._questions.put(self._problem(tried, acquisition="sobol"), "start", self._start)
             else:
                 problem = self._problem(data, mean=self._plan.mean, map_resolution=MAP_RESOLUTION)

@@ -50,7 +50,7 @@ class Hybrid(Deployment):
         """The next pour, and with it the simulations that run beside it."""
         problem = self._hybrid(
             count=1 + (self._plan.per_pour or 0),
-            acquisition="lcb" if self._pours else "posterior_minimum",
+            acquisition="lcb" if self._pours or self._former else "posterior_minimum",
             map_resolution=MAP_RESOLUTION,
         )
 
@@ -77,4 +77,4 @@ class Hybrid(Deployment):
         beside = self._plan.pours * (self._plan.per_pour or 0)
         simulations = self._plan.prior_simulations + beside
         done = min(self._trials.answered, simulations) if self._plan.per_pour is None else self._trials.answered
-        return done + self._counted, simulations + self._plan.pours
+        return done + min(self._counted, self._plan.pours), simulations + self._plan.pours
