@@ -23,14 +23,15 @@ class RunNotFoundError(JournalError):
 
 
 def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
-    """Make the directory of a new run: ROOT/NAME-DATE-N, N counting the day's runs.
+    """Make the directory of a new run: ROOT/NAME-DATE-N (NAME-hardware-DATE-N), N counting the day's.
 
     Args:
         root: where runs are kept; the plan's output directory if not given.
     """
     parent = root or plan.outputs.directory
     parent.mkdir(parents=True, exist_ok=True)
-    stem = f"{plan.name}-{time.strftime('%Y%m%d')}"
+    name = plan.name if plan.laboratory.mode == "virtual" else f"{plan.name}-{plan.laboratory.mode}"
+    stem = f"{name}-{time.strftime('%Y%m%d')}"
     number = 1 + max(
         (int(m[1]) for p in parent.iterdir() if (m := re.fullmatch(rf"{re.escape(stem)}-(\d+)", p.name))), default=0
     )

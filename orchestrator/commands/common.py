@@ -322,6 +322,7 @@ def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finishe
         not_covered=_worked_out(regimes.campaign_warnings, plan),
         best_not_covered=_worked_out(regimes.best_action_warnings, plan, result.results),
         totals={
+            "mode": plan.laboratory.mode,
             "simulations": result.simulations,
             "pours": result.pours,
             "cpu_s": result.cpu_s,

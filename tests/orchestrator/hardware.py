@@ -50,3 +50,31 @@ def install(controller: VirtualController, tool: float = 0.17, payload: float = 
     with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
         connection.sendall(program.encode())
         time.sleep(0.2)
+
+
+CAMPAIGN = """\
+name: rigged
+seed: 3
+laboratory: rig.yaml
+liquid: {name: water, mass: 100 g}
+pourer: beaker.yaml
+motion: {hold_time: 0.3 s, return_velocity: 90 deg/s, max_angle: 110 deg, height: 60 mm}
+simulator: {parameters: {particles: 300}}
+deployment:
+  strategy: D2
+  receiver: narrow.yaml
+  actions: {angular_velocity: [20 deg/s, 60 deg/s], x_offset: [70 mm, 100 mm]}
+  pours: 3
+outputs: {directory: runs, rrd: false}
+"""
+
+
+def write_rig(folder: Path, address: str) -> Path:
+    """A campaign of pours on hardware, with its laboratory and vessels; returns the campaign's file."""
+    from tests.end_to_end import small
+
+    path = small.write_campaign(folder)
+    write_laboratory(folder / "rig.yaml", address)
+    path = folder / "rigged.yaml"
+    path.write_text(CAMPAIGN, encoding="utf-8")
+    return path

@@ -1,0 +1,125 @@
+"""`decant pour`: what a careful person tries first. Planned without moving, with an empty pourer, slowly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from math import degrees, radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from actors.virtual_ur.launcher import VirtualController
+from orchestrator.cli import app
+from orchestrator.safety import SafetyRecord, write_record
+from tests.orchestrator import hardware
+from tests.orchestrator.terminal import Terminal
+
+ADDRESS = "127.84.3.2"
+ACTION = ("--set", "angular_velocity=30", "--set", "x_offset=80")
+
+
+@pytest.fixture
+def controller() -> Iterator[VirtualController]:
+    with VirtualController.start(ADDRESS, "ur10", joints=[radians(q) for q in hardware.HOME]) as started:
+        yield started
+
+
+def decant(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+
+
+def test_dry_run_tells_and_draws_the_whole_path_and_connects_to_nobody(tmp_path: Path) -> None:
+    campaign = hardware.write_rig(tmp_path, "127.84.3.9")  # nobody is there
+    png = tmp_path / "path.png"
+    result = decant("pour", str(campaign), *ACTION, "--dry-run", "--png", str(png))
+    assert result.exit_code == 0, result.output
+    for line in ("box            x ", "mm/s", "tilt           up to 110 deg", "approach", "retreat", "pour "):
+        assert line in result.stdout
+    assert "nothing was moved" in result.stderr
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "runs").exists()
+    report = json.loads(decant("pour", str(campaign), *ACTION, "--dry-run", "--json").stdout)
+    assert report["mode"] == "hardware"
+    assert degrees(report["report"]["tilt"]) == pytest.approx(110.0, abs=0.1)
+    assert report["at_home"] is None
+
+
+def test_dry_run_can_look_where_the_arm_stands(tmp_path: Path, controller: VirtualController) -> None:
+    campaign = hardware.write_rig(tmp_path, controller.address)
+    before = controller.fault("state")
+    at_home = decant("pour", str(campaign), *ACTION, "--dry-run", "--connect", "--json")
+    assert json.loads(at_home.stdout)["at_home"] is True
+    after = controller.fault("state")
+    assert after["joints"] == before["joints"]
+    assert after["program"] == before["program"]
+    assert (
+        decant("pour", str(hardware.write_rig(tmp_path, "127.84.3.9")), *ACTION, "--dry-run", "--connect").exit_code
+        == 1
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--set", "angular_velocity=30", "--dry-run"], "x_offset has no value"),
+        ([*ACTION, "--connect"], "goes with --dry-run"),
+        ([*ACTION, "--slow", "0.5"], "goes with --empty"),
+        ([*ACTION, "--dry-run", "--empty"], "choose one"),
+        ([*ACTION, "--dry-run", "--scene", "transfer"], "no such scene"),
+        (["--set", "angular_velocity=200", "--set", "x_offset=80", "--dry-run"], "deg/s"),  # beyond the file's limits
+        (["--set", "angular_velocity=30", "--set", "x_offset=10", "--dry-run"], "touch"),
+    ],
+)
+def test_pours_that_can_t_be_are_refused_before_anything_is_reached(
+    tmp_path: Path, options: list[str], said: str
+) -> None:
+    result = decant("pour", str(hardware.write_rig(tmp_path, "127.84.3.9")), *options)
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert not (tmp_path / "runs").exists()
+
+
+def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_record(
+    tmp_path: Path, controller: VirtualController
+) -> None:
+    campaign = hardware.write_rig(tmp_path, controller.address)
+    checksum = controller.fault("state")["checksum"]
+    write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
+    arguments = ("pour", str(campaign), "--set", "angular_velocity=60", "--set", "x_offset=80")
+    with Terminal(*arguments, "--empty", "--slow", "0.5", "--arm", cwd=str(tmp_path)) as terminal:
+        terminal.expect("EMPTY pourer, at 50 %")
+        terminal.expect("> ")
+        terminal.type("rig")
+        terminal.expect("Emergency stop in hand?")
+        terminal.expect("> ")
+        terminal.type("yes")
+        for line in ("moves in 3 s", "moves in 2 s", "moves in 1 s", "approach …", "pour …", "retreat …"):
+            terminal.expect(line)
+        terminal.expect("the cycle was completed")
+        assert terminal.end() == 0
+    record = json.loads(next((tmp_path / "runs").glob("rigged-empty-hardware-*/pour.json")).read_text())
+    assert (record["mode"], record["slow"], record["robot"]["checksum"]) == ("hardware", 0.5, checksum)
+    done = controller.fault("history", since=0.0)
+    joints, times = np.array(done["joints"]), np.array(done["times"])
+    fastest = np.abs(np.diff(joints, axis=0) / np.diff(times)[:, None]).max()
+    assert degrees(fastest) < 50.0  # 90 deg/s of the return, halved
+    assert np.ptp(joints[:, 5]) > radians(60.0) or np.ptp(joints, axis=0).max() > radians(60.0)
+    assert joints[-1] == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)
+
+
+def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, controller: VirtualController) -> None:
+    campaign = hardware.write_rig(tmp_path, controller.address)
+    checksum = controller.fault("state")["checksum"]
+    write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
+    before = controller.fault("state")["joints"]
+    with Terminal("pour", str(campaign), *ACTION, "--empty", "--slow", "0.2", "--arm", cwd=str(tmp_path)) as terminal:
+        terminal.expect("> ")
+        terminal.type("rig")
+        terminal.expect("> ")
+        terminal.type("")
+        assert terminal.end() == 1
+    assert "nothing has moved" in terminal.screen
+    assert controller.fault("state")["joints"] == before
