@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
-from scipy.stats import qmc
 
+from actors.optimizer.core.region import Feasibility, Region
 from actors.optimizer.core.surrogate import Surrogate
 
 Array = NDArray[np.float64]
@@ -28,27 +28,47 @@ def lower_confidence_bound(surrogate: Surrogate, kappa: float) -> Score:
     return score
 
 
-def penalised(score: Score, surrogate: Surrogate, busy: Array, candidates: Array) -> Score:
-    """A score that also stays away from points whose answers are still out.
+def penalised(
+    score: Score, surrogate: Surrogate, busy: Array, candidates: Array, feasibility: Feasibility | None = None
+) -> Score:
+    """A score that also stays away from points whose answers are still out, and from where a refusal is likely.
 
     Around each busy point lies a ball in which, judging by the surrogate's steepest slope, the minimum can't be; the
-    score is divided by the probability of being outside it. No cost has to be invented for the busy points.
+    score is divided by the probability of being outside it, and by that of not being refused. No cost has to be
+    invented for the busy points, nor for the refused ones.
 
     Args:
         score: to be minimised.
         surrogate: of the cost.
         busy: (b, dimension).
         candidates: (m, dimension), from which slope, lowest mean and the score's range are estimated.
+        feasibility: of requests; None while nothing was refused.
 
     Returns:
-        A new score to be minimised: −log(softplus(−score)) − Σ log φ_j, score in units of its spread.
+        A new score to be minimised: −log(softplus(−score)) − Σ log φ_j − log P, score in units of its spread.
 
     Source: González et al., Batch Bayesian Optimization via Local Penalization, AISTATS 2016.
     """
-    if len(busy) == 0:
+    if len(busy) == 0 and feasibility is None:
         return score
     base = score(candidates)
     centre, spread = float(np.median(base)), max(float(np.std(base)), 1e-12)
+    outside = _outside(surrogate, busy, candidates) if len(busy) else None
+
+    def divided(points: Array) -> Array:
+        reward = np.logaddexp(0.0, -(score(points) - centre) / spread)  # softplus: positive, as a product needs
+        result = -np.log(np.maximum(reward, 1e-300))
+        if outside is not None:
+            result = result - outside(points)
+        if feasibility is not None:
+            result = result - feasibility.log_probability(points)
+        return np.asarray(result)
+
+    return divided
+
+
+def _outside(surrogate: Surrogate, busy: Array, candidates: Array) -> Score:
+    """Logarithm of the probability of being outside all balls."""
     mean, deviation = surrogate.predict(busy)
     all_means = surrogate.predict(candidates)[0]
     lowest = min(float(all_means.min()), float(mean.min()))
@@ -58,49 +78,49 @@ def penalised(score: Score, surrogate: Surrogate, busy: Array, candidates: Array
     # where the surrogate is sure of itself the ball would vanish, and two identical trials be asked for
     deviation = np.maximum(deviation, max(0.05 * relief, 1e-9))
 
-    def divided(points: Array) -> Array:
-        reward = np.logaddexp(0.0, -(score(points) - centre) / spread)  # softplus: positive, as a product needs
+    def log_probability(points: Array) -> Array:
         distance = np.linalg.norm(points[:, None, :] - busy[None, :, :], axis=2)
-        outside = log_ndtr((slope * distance - (mean - lowest)[None, :]) / deviation[None, :])
-        return np.asarray(-np.log(np.maximum(reward, 1e-300)) - outside.sum(axis=1))
+        return np.asarray(log_ndtr((slope * distance - (mean - lowest)[None, :]) / deviation[None, :]).sum(axis=1))
 
-    return divided
-
-
-def sobol_points(count: int, dimension: int, rng: np.random.Generator) -> Array:
-    """(count, dimension) points of a scrambled Sobol sequence."""
-    exponent = max(0, int(np.ceil(np.log2(max(count, 1)))))
-    return np.asarray(qmc.Sobol(dimension, scramble=True, rng=rng).random_base2(exponent)[:count], dtype=np.float64)
+    return log_probability
 
 
-def spread_out(count: int, taken: Array, dimension: int, rng: np.random.Generator) -> Array:
-    """(count, dimension) Sobol points; where points are taken already (k, dimension), those farthest from them."""
+def spread_out(
+    count: int, taken: Array, region: Region, rng: np.random.Generator, feasibility: Feasibility | None = None
+) -> Array:
+    """(count, dimension) Sobol points; where points are taken already (k, dimension), those farthest from them.
+
+    With refusals the distance counts by the probability of not being refused.
+    """
     if len(taken) == 0:
-        return sobol_points(count, dimension, rng)
-    candidates = sobol_points(max(64, 4 * count), dimension, rng)
+        return region.draw(count, rng, even=True)
+    candidates = region.draw(max(64, 4 * count), rng, even=True)
+    weight = 1.0 if feasibility is None else np.exp(feasibility.log_probability(candidates))
     chosen: list[Array] = []
     distance = np.linalg.norm(candidates[:, None, :] - taken[None, :, :], axis=2).min(axis=1)
     for _ in range(count):
-        point = candidates[int(np.argmax(distance))]
+        point = candidates[int(np.argmax(distance * weight))]
         chosen.append(point)
         distance = np.minimum(distance, np.linalg.norm(candidates - point, axis=1))
-    return np.array(chosen).reshape(count, dimension)
+    return np.array(chosen).reshape(count, candidates.shape[1])
 
 
-def search_candidates(dimension: int, around: Sequence[Array], rng: np.random.Generator) -> Array:
-    """Places to score first: a Sobol cover of the cube, and clouds around known good points. (m, dimension)."""
-    cover = sobol_points(512 if dimension <= 2 else 1024, dimension, rng)
-    clouds = [_cloud(point, spread, 16, rng) for point in around for spread in (0.1, 0.02)]
+def search_candidates(region: Region, dimension: int, around: Sequence[Array], rng: np.random.Generator) -> Array:
+    """Places to score first: a Sobol cover of the region, and clouds around known good points. (m, dimension)."""
+    cover = region.draw(512 if dimension <= 2 else 1024, rng, even=True)
+    clouds = [_cloud(region, point, spread, 16, rng) for point in around for spread in (0.1, 0.02)]
     return np.concatenate([cover, *clouds])
 
 
-def minimise(score: Score, candidates: Array, rng: np.random.Generator) -> Array:
-    """Minimiser of a score over the cube: the best candidates, then shrinking clouds around them. (dimension,)."""
+def minimise(score: Score, candidates: Array, region: Region, rng: np.random.Generator) -> Array:
+    """Minimiser of a score over the region: the best candidates, then shrinking clouds around them. (dimension,)."""
     values = score(candidates)
     leaders = candidates[np.argsort(values, kind="stable")[:3]]
     best, lowest = leaders[0], float(values.min())
     for spread in (0.04, 0.015, 0.005, 0.0015):
-        cloud = np.concatenate([_cloud(leader, spread, 24, rng) for leader in leaders])
+        cloud = np.concatenate([_cloud(region, leader, spread, 24, rng) for leader in leaders])
+        if len(cloud) == 0:
+            continue
         values = score(cloud)
         if float(values.min()) < lowest:
             best, lowest = cloud[int(np.argmin(values))], float(values.min())
@@ -108,8 +128,10 @@ def minimise(score: Score, candidates: Array, rng: np.random.Generator) -> Array
     return np.asarray(best)
 
 
-def _cloud(point: Array, spread: float, count: int, rng: np.random.Generator) -> Array:
-    return np.clip(point + spread * rng.standard_normal((count, len(point))), 0.0, 1.0)
+def _cloud(region: Region, point: Array, spread: float, count: int, rng: np.random.Generator) -> Array:
+    """At most `count` allowed points around one."""
+    cloud = region.snap(np.clip(point + spread * rng.standard_normal((count, len(point))), 0.0, 1.0))
+    return cloud[region.allows(cloud)]
 
 
 def _steepest_slope(surrogate: Surrogate, points: Array, step: float = 1e-3) -> float:

@@ -10,8 +10,9 @@ from sim_engine.space import Space
 Point = tuple[float, ...]
 """A point of the unit cube."""
 
-MeanName = Literal["constant", "zero", "simulated"]
+MeanName = Literal["constant", "zero", "simulated", "pooled", "scaled"]
 AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol"]
+NoiseName = Literal["constant", "varying"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,19 @@ class Data:
 
 
 @dataclass(frozen=True)
+class Linear:
+    """A constraint Σ weight · value ≤ upper on the values of named axes.
+
+    Attributes:
+        weights: pairs of an axis' name and its weight.
+        upper: largest allowed sum, in the unit that weights and values [SI] give.
+    """
+
+    weights: tuple[tuple[str, float], ...]
+    upper: float
+
+
+@dataclass(frozen=True)
 class SuggestProblem:
     """Everything that a proposal depends on; the optimiser actor keeps no state that matters.
 
@@ -49,8 +63,9 @@ class SuggestProblem:
         count: how many points are wanted; 0 asks for `best_point`, map and predictions only.
         seed: of every random choice in the answer.
         mean: prior mean of the surrogate: 'constant' (fitted), 'zero' (the paper's), 'simulated' (posterior mean of a
-            GP over `simulated`, the paper's D3).
-        simulated: cheap observations of the same cost, for `mean='simulated'`.
+            GP over `simulated`, the paper's D3), 'pooled' (`simulated` and `data` in one GP, simulations with a noise
+            and an offset of their own), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once).
+        simulated: cheap observations of the same cost, for the last three.
         acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
             answer the penalised 'lcb'); 'random' and 'sobol' only draw.
         kappa: κ of the lower confidence bound, constant as in the paper.
@@ -61,6 +76,10 @@ class SuggestProblem:
             (in calibration: c_r − c_s, and the action that was simulated), and what is minimised is the mean of their
             absolute values over these places of the context's unit cube. The points of `data` then have
             `space.dimension` coordinates followed by those of the context.
+        infeasible: places where a request was refused. They say nothing about the cost; proposals keep away from places
+            where another refusal is likely.
+        constraints: that every proposal meets.
+        noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
     """
 
     space: Space
@@ -75,6 +94,9 @@ class SuggestProblem:
     map_resolution: int = 0
     predict_at: tuple[Point, ...] = ()
     context: tuple[Point, ...] = ()
+    infeasible: tuple[Point, ...] = ()
+    constraints: tuple[Linear, ...] = ()
+    noise: NoiseName = "constant"
 
 
 @dataclass(frozen=True)
@@ -122,6 +144,8 @@ class Suggestion:
         predictions: posterior means at `SuggestProblem.predict_at`; empty without a surrogate.
         prediction_deviations: their standard deviations.
         seconds: CPU seconds it took.
+        noises: standard deviations of single real observations at the proposals; empty without a surrogate.
+        feasibilities: probabilities that the proposals are not refused; empty while nothing was.
     """
 
     points: tuple[Point, ...]
@@ -135,3 +159,5 @@ class Suggestion:
     seconds: float = 0.0
     predictions: tuple[float, ...] = ()
     prediction_deviations: tuple[float, ...] = ()
+    noises: tuple[float, ...] = ()
+    feasibilities: tuple[float, ...] = ()

@@ -1,13 +1,8 @@
-"""Gaussian-process surrogates of a noisy cost on the unit cube: fitted by MAP, bounded, always finite.
-
-The kernels and the marginal likelihood are scikit-learn's; the priors over hyperparameters, the prior means and the
-noise-free predictions are ours.
-"""
+"""Gaussian-process surrogates of a noisy cost on the unit cube: fitted by MAP, bounded, always finite."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -15,13 +10,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
 from scipy.special import ndtr
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import ConstantKernel, Kernel, Matern, WhiteKernel
+
+from actors.optimizer.core.covariance import Covariance, HyperPrior
+from actors.optimizer.core.fitting import maximum_a_posteriori
 
 Array = NDArray[np.float64]
+Mean = Callable[[Array], Array]
 
 
 class Surrogate(Protocol):
@@ -39,62 +34,14 @@ class Surrogate(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class HyperPrior:
-    """Log-normal priors over the hyperparameters, in units of the cube (lengths) and of the cost's scale (the others).
-
-    Each pair is (median, standard deviation of the logarithm). With few observations the maximum of the likelihood
-    alone is unreliable: on a plateau its lengthscales grow without bound and the model claims to know everything.
-
-    Attributes:
-        length: of each axis' lengthscale.
-        signal: of the signal's standard deviation.
-        noise: of the observations' standard deviation.
-    """
-
-    length: tuple[float, float] = (0.35, 0.7)
-    signal: tuple[float, float] = (1.0, 0.5)
-    noise: tuple[float, float] = (0.1, 1.0)
-
-
-LENGTH_BOUNDS = (0.03, 5.0)
-SIGNAL_BOUNDS = (0.05, 6.0)
-NOISE_BOUNDS = (1e-3, 3.0)
-
 CONSTANT_PRIOR = HyperPrior()
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 """Of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
 
+JOINT_PRIOR = HyperPrior()
 
-class SimulatedCovariance(Kernel):  # type: ignore[misc]
-    """Posterior covariance of a fitted surrogate, as a prior covariance without free hyperparameters.
-
-    In units of `scale`². It says how little the simulated surrogate itself knows where few simulations were run.
-    """
-
-    def __init__(self, process: GaussianProcess, scale: float) -> None:
-        self.process = process
-        self.scale = scale
-        self._last: tuple[Array, Array] | None = None
-
-    def __call__(self, X: Array, Y: Array | None = None, eval_gradient: bool = False) -> Any:
-        """Covariances (m, k) between points (m, dimension) and (k, dimension); as scikit-learn wants it."""
-        if Y is None and self._last is not None and self._last[0] is X:
-            K = self._last[1]  # a fit asks for the same matrix again and again
-        else:
-            K = self.process.covariance(X, X if Y is None else Y) / self.scale**2
-            if Y is None:
-                self._last = (X, K)
-        return (K, np.empty((len(X), len(X), 0))) if eval_gradient else K
-
-    def diag(self, X: Array) -> Array:
-        """Posterior variances (m,)."""
-        deviation = self.process.predict(np.asarray(X))[1]
-        return (deviation / self.scale) ** 2
-
-    def is_stationary(self) -> bool:
-        """It depends on where the simulations were run."""
-        return False
+VARYING_FROM = 20
+"""Observations below which the noise is taken for constant: fewer can't tell."""
 
 
 class GaussianProcess:
@@ -104,72 +51,131 @@ class GaussianProcess:
         points: (n, dimension) of the observations.
         lengths: (dimension,) fitted lengthscales.
         signal: fitted standard deviation of the signal, in the cost's unit.
-        noise: fitted standard deviation of the observations, in the cost's unit.
+        noise: fitted standard deviation of the real observations, in the cost's unit; where it varies, its
+            geometric mean over them.
+        hyperparameters: what else was fitted, by name.
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, chapters 2 and 5.
     """
 
     def __init__(
         self,
-        points: Array,
         costs: Array,
+        covariance: Covariance,
         *,
-        mean: Callable[[Array], Array],
+        mean: Mean,
         scale: float,
-        prior: HyperPrior = CONSTANT_PRIOR,
-        covariance: Kernel | None = None,
+        growth: NoiseGrowth | None = None,
+        start: Array | None = None,
     ) -> None:
         """Fit.
 
         Args:
-            points: (n, dimension), n ≥ 1.
-            costs: (n,), finite.
+            costs: (n,), finite, n ≥ 1.
+            covariance: of the observations, in units of scale².
             mean: prior mean of the cost at points (m, dimension) → (m,).
             scale: unit in which the priors are meant, in the cost's unit.
-            prior: over hyperparameters.
-            covariance: further prior covariance, in units of scale².
+            growth: what the covariance's noise grows with.
+            start: hyperparameters to start from; None: their priors' centre, and more noise than that.
         """
-        self.points = points
-        self.mean = mean
-        self.scale = scale
-        dimension = points.shape[1]
-        signal = ConstantKernel(prior.signal[0] ** 2, tuple(b**2 for b in SIGNAL_BOUNDS)) * Matern(
-            np.full(dimension, prior.length[0]), LENGTH_BOUNDS, nu=2.5
-        )
-        noise = WhiteKernel(prior.noise[0] ** 2, tuple(b**2 for b in NOISE_BOUNDS))
-        regressor = GaussianProcessRegressor(
-            signal + noise if covariance is None else covariance + signal + noise,
-            alpha=1e-8,
-            optimizer=_maximum_a_posteriori(prior, dimension),
-            copy_X_train=False,
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # an optimum at a bound is what the bounds are for
-            regressor.fit(points, (costs - mean(points)) / scale)
-        summed = regressor.kernel_
-        self._kernel = summed.k1
-        matern = self._kernel if covariance is None else self._kernel.k2
-        self.lengths: Array = np.atleast_1d(matern.k2.length_scale)
-        self.signal = math.sqrt(matern.k1.constant_value) * scale
-        self.noise = math.sqrt(summed.k2.noise_level) * scale
-        self._L: Array = regressor.L_
-        self._alpha: Array = regressor.alpha_.ravel()
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> GaussianProcess:
-        return self  # never changed after the fit; scikit-learn copies what kernels hold
+        self.points, self.mean, self.scale, self.growth = covariance.points, mean, scale, growth
+        starts = [start]
+        if start is None:
+            noisy = covariance.centre.copy()
+            noisy[[i for i, name in enumerate(covariance.names) if name in ("length", "noise")]] += 0.5
+            noisy[covariance.names.index("noise")] += 1.0
+            starts = [covariance.centre, noisy]
+        residuals = (costs - mean(self.points)) / scale
+        fitted = maximum_a_posteriori(covariance, residuals, [s for s in starts if s is not None])
+        self._covariance, self._fitted = covariance, fitted
+        theta = fitted.theta
+        self.lengths: Array = covariance.lengths(theta)
+        self.signal = covariance.value(theta, "signal") * scale
+        self.noise = covariance.value(theta, "noise") * scale
+        self.log_likelihood = fitted.log_likelihood
+        self.theta = theta
+        self.hyperparameters: dict[str, float] = {
+            name: covariance.value(theta, name) * (1.0 if name in ("rho", "delta_length") else scale)
+            for name in ("simulated_noise", "offset", "rho", "delta_signal", "delta_length")
+            if name in covariance.names
+        }
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """See `Surrogate.predict`. The deviation leaves the observations' noise out."""
-        K = self._kernel(points, self.points)
-        V = solve_triangular(self._L, K.T, lower=True, check_finite=False)
-        variance = self._kernel.diag(points) - np.einsum("ij,ij->j", V, V)
-        return self.mean(points) + self.scale * (K @ self._alpha), self.scale * np.sqrt(np.maximum(variance, 1e-12))
+        K = self._covariance.cross(self._fitted.theta, points)
+        V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
+        prior = self._covariance.variance(self._fitted.theta, points)
+        variance = prior - np.einsum("ij,ij->j", V, V)
+        mean = self.mean(points) + self.scale * (K @ self._fitted.alpha)
+        return mean, self.scale * np.sqrt(np.maximum(variance, 1e-12))
+
+    def noise_at(self, points: Array) -> Array:
+        """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
+        if self.growth is None or len(points) == 0:
+            return np.full(len(points), self.noise)
+        return self.noise * np.exp(self.growth.features(points) @ self._covariance.growth(self.theta))
 
     def covariance(self, first: Array, second: Array) -> Array:
         """Posterior covariance of the noise-free cost between points (m, d) and (k, d): (m, k), in its unit squared."""
-        V = solve_triangular(self._L, self._kernel(first, self.points).T, lower=True, check_finite=False)
-        W = V if second is first else solve_triangular(self._L, self._kernel(second, self.points).T, lower=True)
-        return np.asarray(self.scale**2 * (self._kernel(first, second) - V.T @ W))
+        theta, L = self._fitted.theta, self._fitted.L
+        V = solve_triangular(L, self._covariance.cross(theta, first).T, lower=True, check_finite=False)
+        W = V
+        if second is not first:
+            W = solve_triangular(L, self._covariance.cross(theta, second).T, lower=True, check_finite=False)
+        return np.asarray(self.scale**2 * (self._covariance.between(theta, first, second) - V.T @ W))
+
+
+@dataclass(frozen=True)
+class NoiseGrowth:
+    """What the logarithm of the noise may grow with: the expected cost, linearly, and its distance from the middle.
+
+    A cup that surely spills nothing, or all, scatters less than one on the brink.
+
+    Attributes:
+        process: of the cost, fitted with constant noise.
+        low, high: range of its means at the observations.
+    """
+
+    process: GaussianProcess
+    low: float
+    high: float
+
+    def features(self, points: Array) -> Array:
+        """(m, 2) at points (m, dimension), each about −½ … ½."""
+        mean = self.process.predict(points)[0]
+        z = np.clip((mean - self.low) / max(self.high - self.low, 1e-300), 0.0, 1.0) - 0.5
+        return np.stack([z, 4.0 * z * z - 0.5], axis=1)
+
+
+def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior, **terms: Any) -> GaussianProcess:
+    """The same model with a noise that depends on the action, if the observations speak for it; else `process`.
+
+    The noise grows with the mean of `process`, as a plug-in: the first step of Kersting et al. with a parametric
+    noise. Evidence: the likelihood must gain more than what Schwarz' criterion charges for the coefficients.
+
+    Args:
+        process: fitted with constant noise.
+        costs: (n,), those of `process`.
+        prior: over the hyperparameters.
+        terms: of `Covariance`, those of `process`.
+
+    Source: Kersting et al., Most likely heteroscedastic Gaussian process regression, ICML 2007; Schwarz, Estimating
+        the dimension of a model, 1978.
+    """
+    real = terms.get("real")
+    mask = np.ones(len(costs), dtype=np.bool_) if real is None else real
+    count = int(mask.sum())
+    if count < VARYING_FROM:
+        return process
+    means = process.predict(process.points[mask])[0]
+    growth = NoiseGrowth(process, float(means.min()), float(means.max()))
+    features = growth.features(process.points)
+    features[~mask] = 0.0
+    covariance = Covariance(process.points, prior, growth=features, **terms)
+    start = np.concatenate([process.theta, np.zeros(features.shape[1])])
+    varied = GaussianProcess(costs, covariance, mean=process.mean, scale=process.scale, growth=growth, start=start)
+    charge = 0.5 * features.shape[1] * math.log(count)
+    return varied if varied.log_likelihood > process.log_likelihood + charge else process
 
 
 @dataclass(frozen=True)
@@ -196,22 +202,24 @@ class AbsoluteProcess:
         return folded.mean(axis=1), np.maximum(spread.mean(axis=1), 1e-9 * self.process.scale)
 
 
-def constant_mean_process(points: Array, costs: Array) -> GaussianProcess:
+def constant_mean_process(points: Array, costs: Array, *, varying: bool = False) -> GaussianProcess:
     """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
     centre = float(costs.mean())
-    return GaussianProcess(points, costs, mean=_constant(centre), scale=_scale(costs - centre, costs))
+    return _fitted(points, costs, _constant(centre), _scale(costs - centre, costs), varying)
 
 
-def zero_mean_process(points: Array, costs: Array) -> GaussianProcess:
+def zero_mean_process(points: Array, costs: Array, *, varying: bool = False) -> GaussianProcess:
     """GP with prior mean zero, as in the paper: unexplored means 'spills nothing'.
 
     Limitations: on a cost in [0, 1] that is minimised by a lower confidence bound, it explores corners for ever and
     loses to random search. For replication.
     """
-    return GaussianProcess(points, costs, mean=_constant(0.0), scale=_scale(costs, costs))
+    return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying)
 
 
-def simulated_mean_process(simulated: GaussianProcess, points: Array, costs: Array) -> GaussianProcess:
+def simulated_mean_process(
+    simulated: GaussianProcess, points: Array, costs: Array, *, varying: bool = False
+) -> GaussianProcess:
     """GP of the real cost around a surrogate of the simulated one: f_r = f_s + δ, f_s ~ `simulated`'s posterior.
 
     The prior mean is the simulated surrogate's posterior mean, the prior covariance its posterior covariance plus that
@@ -220,17 +228,48 @@ def simulated_mean_process(simulated: GaussianProcess, points: Array, costs: Arr
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3); Kennedy & O'Hagan 2000 with ρ = 1.
     """
     scale = max(simulated.scale, 1e-9)
-    return GaussianProcess(
-        points,
-        costs,
-        mean=lambda x: simulated.predict(x)[0],
-        scale=scale,
-        prior=RESIDUAL_PRIOR,
-        covariance=SimulatedCovariance(simulated, scale),
-    )
+    terms = {"known": simulated, "unit": scale}
+    return _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, **terms)
 
 
-def _constant(value: float) -> Callable[[Array], Array]:
+def joint_process(
+    simulated: Array, simulated_costs: Array, points: Array, costs: Array, *, scaled: bool, varying: bool = False
+) -> GaussianProcess:
+    """GP of the real cost from simulations and real observations at once.
+
+    Pooled, simulations are observations of the same cost but for a constant, with a noise of their own that also holds
+    their discrepancy: f_r = f_s + β. Scaled, f_r = ρ f_s + β + δ, with ρ and δ fitted. See `covariance.py`.
+
+    Args:
+        simulated: (k, dimension), k ≥ 1, and their costs (k,).
+        points: (n, dimension), n ≥ 0, and their costs (n,).
+        scaled: which of the two.
+        varying: whether the noise of real observations may vary.
+
+    Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
+        available, Biometrika 2000.
+    """
+    both, values = np.concatenate([simulated, points]), np.concatenate([simulated_costs, costs])
+    centre = float(simulated_costs.mean())
+    terms = {"real": np.arange(len(both)) >= len(simulated), "scaled": scaled}
+    scale = _scale(values - centre, values)
+    return _fitted(both, values, _constant(centre), scale, varying, JOINT_PRIOR, **terms)
+
+
+def _fitted(
+    points: Array,
+    costs: Array,
+    mean: Mean,
+    scale: float,
+    varying: bool,
+    prior: HyperPrior = CONSTANT_PRIOR,
+    **terms: Any,
+) -> GaussianProcess:
+    process = GaussianProcess(costs, Covariance(points, prior, **terms), mean=mean, scale=scale)
+    return with_varying_noise(process, costs, prior, **terms) if varying else process
+
+
+def _constant(value: float) -> Mean:
     return lambda points: np.full(len(points), value)
 
 
@@ -239,31 +278,3 @@ def _scale(residuals: Array, costs: Array) -> float:
     size = float(np.sqrt(np.mean(residuals**2)))
     floor = 0.1 * float(np.max(np.abs(costs)))
     return max(size, floor) or 1.0
-
-
-def _maximum_a_posteriori(prior: HyperPrior, dimension: int) -> Callable[..., tuple[Array, float]]:
-    """An `optimizer` for scikit-learn's regressor that adds the log-priors to the log-likelihood.
-
-    scikit-learn's θ is (log σ_f², log ℓ_1 … log ℓ_d, log σ_n²).
-    """
-    centre = np.log([prior.signal[0] ** 2, *[prior.length[0]] * dimension, prior.noise[0] ** 2])
-    deviation = np.array([2 * prior.signal[1], *[prior.length[1]] * dimension, 2 * prior.noise[1]])
-
-    def optimise(objective: Callable[..., tuple[float, Array]], initial: Array, bounds: Any) -> tuple[Array, float]:
-        def loss(theta: Array) -> tuple[float, Array]:
-            value, gradient = objective(theta, eval_gradient=True)
-            z = (theta - centre) / deviation
-            if not (math.isfinite(value) and np.all(np.isfinite(gradient))):
-                return 1e12 + 0.5 * float(z @ z), z / deviation  # not positive definite: back towards the prior
-            return value + 0.5 * float(z @ z), gradient + z / deviation
-
-        noisy = np.clip(centre + np.array([0.0, *[0.5] * dimension, 3.0]), bounds[:, 0], bounds[:, 1])
-        best: Any = np.clip(centre, bounds[:, 0], bounds[:, 1])
-        lowest = math.inf
-        for start in (best, noisy):
-            found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": 40})
-            if math.isfinite(found.fun) and found.fun < lowest:
-                best, lowest = found.x, float(found.fun)
-        return best, lowest
-
-    return optimise

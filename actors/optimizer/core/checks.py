@@ -1,0 +1,73 @@
+"""What a question must be like to be answered."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from actors.optimizer.core.problem import Point, SuggestProblem
+
+MAX_OBSERVATIONS = 2_000
+"""Above it a fit takes minutes (O(n³)); a campaign that needs more should not use a dense GP."""
+MAX_COUNT = 256
+MAX_RESOLUTION = 200
+MAX_PREDICTIONS = 100_000
+
+
+def check(problem: SuggestProblem) -> None:
+    """Refuse what would end in NaN or never end.
+
+    Raises:
+        ValueError: which number is wrong, and what would be right.
+    """
+    dimension = problem.space.dimension
+    contexts = {len(point) for point in problem.context}
+    if len(contexts) > 1:
+        raise ValueError(f"context points of different lengths: {sorted(contexts)}")
+    if problem.context and problem.mean != "constant":
+        raise ValueError(f"a context needs mean='constant', not {problem.mean!r}")
+    _check_points("context", problem.context, contexts.pop() if contexts else 0)
+    contextual = dimension + (len(problem.context[0]) if problem.context else 0)
+    _check_points("data", problem.data.points, contextual)
+    _check_points("simulated", problem.simulated.points, dimension)
+    _check_points("pending", problem.pending, dimension)
+    _check_points("infeasible", problem.infeasible, dimension)
+    _check_points("predict_at", problem.predict_at, dimension)
+    for name, data in (("data", problem.data), ("simulated", problem.simulated)):
+        for index, cost in enumerate(data.costs):
+            if not math.isfinite(cost) or abs(cost) > 1e12:
+                raise ValueError(f"{name}: cost {index} is {cost}; leave failed trials out, or penalise them")
+    observations = len(problem.data) + len(problem.simulated) + len(problem.infeasible)
+    if observations > MAX_OBSERVATIONS:
+        raise ValueError(f"{observations} observations and refusals, but at most {MAX_OBSERVATIONS} can be fitted")
+    for name, value, limit in (
+        ("count", problem.count, MAX_COUNT),
+        ("map_resolution", problem.map_resolution, MAX_RESOLUTION),
+        ("len(predict_at)", len(problem.predict_at), MAX_PREDICTIONS),
+    ):
+        if not 0 <= value <= limit:
+            raise ValueError(f"{name} = {value} is outside 0 … {limit}")
+    if not (math.isfinite(problem.kappa) and 0.0 <= problem.kappa <= 100.0):
+        raise ValueError(f"kappa = {problem.kappa} is outside 0 … 100")
+    _check_constraints(problem)
+
+
+def _check_constraints(problem: SuggestProblem) -> None:
+    for index, constraint in enumerate(problem.constraints):
+        for name, weight in constraint.weights:
+            if name not in problem.space.names:
+                raise ValueError(
+                    f"constraints: {index} names {name!r}, but the axes are {', '.join(problem.space.names)}"
+                )
+            if not math.isfinite(weight):
+                raise ValueError(f"constraints: {index} has the weight {weight} for {name}")
+        if not math.isfinite(constraint.upper):
+            raise ValueError(f"constraints: {index} has the upper bound {constraint.upper}")
+
+
+def _check_points(name: str, points: Sequence[Point], dimension: int) -> None:
+    for index, point in enumerate(points):
+        if len(point) != dimension:
+            raise ValueError(f"{name}: point {index} has {len(point)} coordinates, expected {dimension}")
+        if not all(math.isfinite(u) and -10.0 <= u <= 11.0 for u in point):
+            raise ValueError(f"{name}: point {index} = {point} is not finite, or far outside the unit cube")

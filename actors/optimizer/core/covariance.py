@@ -1,0 +1,251 @@
+"""Prior covariance of what was observed, really and in simulation, with the gradients that a fit needs.
+
+    f_s ~ GP(0, σ² M_ℓ)                     the simulated cost
+    f_r = ρ f_s + β + δ                     the real one: β ~ N(0, τ²), δ ~ GP(0, σ_δ² M_ℓδ)
+    y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i: the source's own, and it may depend on the action
+
+M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression. Pooling has ρ = 1
+and δ = 0, and lets the simulations' n say how far they may be from the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Pullback = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class HyperPrior:
+    """Priors over the hyperparameters, in units of the cube (lengths) and of the cost's scale (the others).
+
+    Each pair is (median, standard deviation of the logarithm), but for ρ and the noise's growth (mean, standard
+    deviation). With few observations the maximum of the likelihood alone is unreliable: on a plateau its lengthscales
+    grow without bound and the model claims to know everything.
+
+    Attributes:
+        length: of each axis' lengthscale.
+        signal: of the signal's standard deviation.
+        noise: of the observations' standard deviation.
+        simulated_noise: of the simulations', discrepancy included.
+        offset: of the standard deviation of a constant between simulated and real cost.
+        rho: of the scale between simulated and real cost.
+        delta_signal: of the standard deviation of what the simulation lacks.
+        delta_length: of its lengthscale, one for all axes.
+        noise_growth: of the coefficients of the noise's logarithm.
+    """
+
+    length: tuple[float, float] = (0.35, 0.7)
+    signal: tuple[float, float] = (1.0, 0.5)
+    noise: tuple[float, float] = (0.1, 1.0)
+    simulated_noise: tuple[float, float] = (0.1, 1.0)
+    offset: tuple[float, float] = (0.2, 1.0)
+    rho: tuple[float, float] = (1.0, 0.5)
+    delta_signal: tuple[float, float] = (0.4, 0.7)
+    delta_length: tuple[float, float] = (0.4, 0.7)
+    noise_growth: tuple[float, float] = (0.0, 1.5)
+
+
+LENGTH_BOUNDS = (0.03, 5.0)
+SIGNAL_BOUNDS = (0.05, 6.0)
+NOISE_BOUNDS = (1e-3, 3.0)
+OFFSET_BOUNDS = (1e-3, 3.0)
+RHO_BOUNDS = (-1.0, 2.5)
+GROWTH_BOUNDS = (-4.0, 4.0)
+
+
+class PriorCovariance(Protocol):
+    """A known covariance to start from: that of an earlier fit."""
+
+    def covariance(self, first: Array, second: Array) -> Array:
+        """Between points (m, d) and (k, d): (m, k), in the cost's unit squared."""
+        ...
+
+    def predict(self, points: Array) -> tuple[Array, Array]:
+        """Means (m,) and standard deviations (m,) at points (m, d), in the cost's unit."""
+        ...
+
+
+def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
+    """Matérn 5/2 correlation (m, k) between points (m, d) and (k, d), and −∂/∂(r²/2) of it, r in lengthscales.
+
+    Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, equation 4.17.
+    """
+    s = np.sqrt(5.0) * cdist(first / lengths, second / lengths)
+    decay = np.exp(-s)
+    return (1.0 + s + s * s / 3.0) * decay, (5.0 / 3.0) * (1.0 + s) * decay
+
+
+class Covariance:
+    """See the module. Hyperparameters θ are logarithms, but for ρ and the noise's growth.
+
+    Attributes:
+        points: (n, dimension) of all observations.
+        names: of the hyperparameters, (p,).
+        centre: (p,), their priors' means.
+        deviation: (p,), their priors' standard deviations.
+        bounds: (p, 2).
+    """
+
+    def __init__(
+        self,
+        points: Array,
+        prior: HyperPrior,
+        *,
+        real: Mask | None = None,
+        scaled: bool = False,
+        growth: Array | None = None,
+        known: PriorCovariance | None = None,
+        unit: float = 1.0,
+    ) -> None:
+        """Which terms there are.
+
+        Args:
+            points: (n, dimension).
+            prior: over the hyperparameters.
+            real: (n,), which observations are real; None: all, and there is no simulation in the model.
+            scaled: ρ and δ are fitted; else ρ = 1 and δ = 0.
+            growth: (n, q): log n_i grows with these features; None: it does not.
+            known: further covariance of the real cost.
+            unit: in which costs are measured here, for `known`.
+        """
+        self.points = points
+        self._real = real
+        self._loads = np.ones(len(points)) if real is None else real.astype(np.float64)
+        self._mask = self._loads > 0.5
+        self._scaled, self._growth, self._known, self._unit = scaled, growth, known, unit
+        self._constant = None if known is None else known.covariance(points, points) / unit**2
+        dimension = points.shape[1]
+        rows: list[tuple[str, tuple[float, float], tuple[float, float], bool]] = [
+            ("signal", prior.signal, SIGNAL_BOUNDS, True),
+            *[("length", prior.length, LENGTH_BOUNDS, True)] * dimension,
+            ("noise", prior.noise, NOISE_BOUNDS, True),
+        ]
+        if real is not None:
+            rows += [
+                ("simulated_noise", prior.simulated_noise, NOISE_BOUNDS, True),
+                ("offset", prior.offset, OFFSET_BOUNDS, True),
+            ]
+        if scaled:
+            rows += [
+                ("rho", prior.rho, RHO_BOUNDS, False),
+                ("delta_signal", prior.delta_signal, SIGNAL_BOUNDS, True),
+                ("delta_length", prior.delta_length, LENGTH_BOUNDS, True),
+            ]
+        if growth is not None:
+            rows += [("noise_growth", prior.noise_growth, GROWTH_BOUNDS, False)] * growth.shape[1]
+        self.names = tuple(row[0] for row in rows)
+        self.centre: Array = np.array([np.log(pair[0]) if log else pair[0] for _, pair, _, log in rows])
+        self.deviation: Array = np.array([pair[1] for _, pair, _, _ in rows])
+        self.bounds: Array = np.array([np.log(limits) if log else limits for _, _, limits, log in rows])
+
+    def value(self, theta: Array, name: str) -> float:
+        """One hyperparameter as it enters the model (not its logarithm); those that are left out change nothing."""
+        if name not in self.names:
+            return {"rho": 1.0}.get(name, 0.0)
+        found = float(theta[self.names.index(name)])
+        return found if name in ("rho", "noise_growth") else float(np.exp(found))
+
+    def lengths(self, theta: Array) -> Array:
+        """(dimension,) lengthscales of the signal."""
+        return np.exp(theta[1 : 1 + self.points.shape[1]])
+
+    def growth(self, theta: Array) -> Array:
+        """(q,) coefficients of the noise's logarithm."""
+        return theta[[i for i, name in enumerate(self.names) if name == "noise_growth"]]
+
+    def noises(self, theta: Array) -> Array:
+        """(n,) standard deviations of the observations."""
+        noise = np.full(len(self.points), self.value(theta, "noise"))
+        if self._real is not None:
+            noise[~self._mask] = self.value(theta, "simulated_noise")
+        return noise if self._growth is None else noise * np.exp(self._growth @ self.growth(theta))
+
+    def observed(self, theta: Array) -> tuple[Array, Pullback]:
+        """Covariance of the observations (n, n), and the way back: symmetric W (n, n) → Σ W_ij ∂K_ij/∂θ (p,)."""
+        d, mask, real = self.points.shape[1], self._mask, self._loads
+        lengths, rho = self.lengths(theta), self.value(theta, "rho")
+        correlation, slope = matern(self.points, self.points, lengths)
+        variance = self.value(theta, "signal") ** 2
+        base = variance * correlation
+        a = np.where(mask, rho, 1.0)
+        K = base * np.outer(a, a) if self._scaled else base.copy()
+        offset = self.value(theta, "offset") ** 2
+        if self._real is not None:
+            K += offset * np.outer(real, real)
+        if self._scaled:
+            own = self.points[mask]
+            delta_length = self.value(theta, "delta_length")
+            delta, delta_slope = matern(own, own, np.full(d, delta_length))
+            delta_variance = self.value(theta, "delta_signal") ** 2
+            K[np.ix_(mask, mask)] += delta_variance * delta
+        if self._constant is not None:
+            K += self._constant
+        noise = self.noises(theta) ** 2
+        K[np.diag_indices_from(K)] += noise + 1e-8
+
+        def pullback(W: Array) -> Array:
+            weighted = W * np.outer(a, a) if self._scaled else W
+            diagonal = 2.0 * np.diagonal(W) * noise
+            gradient = [2.0 * float(np.vdot(weighted, base))]
+            gradient += list(variance * _by_length(self.points, weighted * slope) / lengths**2)
+            gradient.append(float(diagonal[mask].sum()))
+            if self._real is not None:
+                gradient += [float(diagonal[~mask].sum()), 2.0 * offset * float(real @ W @ real)]
+            if self._scaled:
+                block = W[np.ix_(mask, mask)]
+                gradient.append(2.0 * float(real @ (W * base) @ a))
+                gradient.append(2.0 * delta_variance * float(np.vdot(block, delta)))
+                by_length = _by_length(self.points[mask], block * delta_slope).sum()
+                gradient.append(delta_variance * float(by_length) / delta_length**2)
+            if self._growth is not None:
+                gradient += list(self._growth.T @ diagonal)
+            return np.array(gradient)
+
+        return K, pullback
+
+    def cross(self, theta: Array, points: Array) -> Array:
+        """Of the noise-free real cost at points (m, d) with the observations: (m, n)."""
+        rho = self.value(theta, "rho")
+        correlation = matern(points, self.points, self.lengths(theta))[0]
+        K = self.value(theta, "signal") ** 2 * rho * correlation * np.where(self._mask, rho, 1.0)
+        K += self._remainder(theta, points, self.points) * self._loads
+        return K if self._known is None else K + self._known.covariance(points, self.points) / self._unit**2
+
+    def between(self, theta: Array, first: Array, second: Array) -> Array:
+        """Of the noise-free real cost at points (m, d) and (k, d): (m, k)."""
+        correlation = matern(first, second, self.lengths(theta))[0]
+        K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * correlation
+        K += self._remainder(theta, first, second)
+        return K if self._known is None else K + self._known.covariance(first, second) / self._unit**2
+
+    def variance(self, theta: Array, points: Array) -> Array:
+        """Of the noise-free real cost at points (m, d): (m,)."""
+        value = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2
+        value += self.value(theta, "offset") ** 2 + self.value(theta, "delta_signal") ** 2
+        known = 0.0 if self._known is None else (self._known.predict(points)[1] / self._unit) ** 2
+        return np.full(len(points), value) + known
+
+    def _remainder(self, theta: Array, first: Array, second: Array) -> Array | float:
+        """Of β + δ."""
+        offset = self.value(theta, "offset") ** 2
+        if not self._scaled:
+            return offset
+        lengths = np.full(first.shape[1], self.value(theta, "delta_length"))
+        return offset + self.value(theta, "delta_signal") ** 2 * matern(first, second, lengths)[0]
+
+
+def _by_length(points: Array, G: Array) -> Array:
+    """Σ_ik G_ik (x_ij − x_kj)² for every axis j, G symmetric: (dimension,)."""
+    if len(points) == 0:
+        return np.zeros(points.shape[1])
+    centred = points - points.mean(axis=0)
+    return np.asarray(2.0 * (centred**2).T @ G.sum(axis=1) - 2.0 * np.einsum("ij,ij->j", centred, G @ centred))

@@ -1,0 +1,127 @@
+"""Where proposals may lie: whole numbers, linear constraints, and places that were refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+from scipy.special import log_ndtr
+from scipy.stats import qmc
+
+from actors.optimizer.core.covariance import Covariance, HyperPrior
+from actors.optimizer.core.problem import Linear
+from actors.optimizer.core.surrogate import GaussianProcess
+from sim_engine.space import Axis, Space
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LABEL_PRIOR = HyperPrior(length=(0.3, 0.5), signal=(1.0, 0.3), noise=(0.1, 0.5))
+_SLACK = 1e-9
+_SAME = 1e-9
+_MOST_DRAWN = 2**15
+
+
+class Region:
+    """The part of the unit cube that proposals may lie in.
+
+    Integer axes have as many places as values: what is rounded later is rounded before the surrogate sees it.
+
+    Source: Garrido-Merchán & Hernández-Lobato, Dealing with categorical and integer-valued variables in Bayesian
+        optimization with Gaussian processes, Neurocomputing 2020.
+    """
+
+    def __init__(self, space: Space, constraints: Sequence[Linear]) -> None:
+        self._space = space
+        self._integers = [(i, axis) for i, axis in enumerate(space.axes) if axis.integer]
+        index = {name: i for i, name in enumerate(space.names)}
+        self._rows = [([(index[name], weight) for name, weight in c.weights], c.upper) for c in constraints]
+
+    def snap(self, points: Array) -> Array:
+        """Points (m, ≥ dimension) with integer axes at whole numbers; further coordinates are left alone."""
+        if not self._integers:
+            return points
+        snapped = points.copy()
+        for i, axis in self._integers:
+            snapped[:, i] = np.clip(_units(axis, np.rint(_values(axis, points[:, i]))), 0.0, 1.0)
+        return snapped
+
+    def allows(self, points: Array) -> Mask:
+        """Which points (m, dimension) meet all constraints: (m,)."""
+        allowed = np.ones(len(points), dtype=np.bool_)
+        for weights, upper in self._rows:
+            parts = [weight * self._decoded(i, points[:, i]) for i, weight in weights]
+            slack = _SLACK * (abs(upper) + sum(abs(weight) for _, weight in weights))
+            allowed &= np.sum(parts, axis=0) <= upper + slack
+        return allowed
+
+    def draw(self, count: int, rng: np.random.Generator, *, even: bool) -> Array:
+        """(count, dimension) allowed points: of a scrambled Sobol sequence if `even`, else independent ones.
+
+        Raises:
+            ValueError: the constraints leave next to nothing.
+        """
+        d = self._space.dimension
+        sequence = qmc.Sobol(d, scramble=True, rng=rng) if even else None
+        drawn, found = 0, np.empty((0, d))
+        while len(found) < count:
+            if drawn >= _MOST_DRAWN:
+                raise ValueError(
+                    f"of {drawn} points of the space {len(found)} meet all constraints; {count} are needed"
+                )
+            some = 2 ** max(0, math.ceil(math.log2(max(count, drawn, 1))))
+            fresh = rng.random((some, d)) if sequence is None else np.asarray(sequence.random(some))
+            drawn += some
+            fresh = self.snap(fresh)
+            found = np.concatenate([found, fresh[self.allows(fresh)]])
+        return found[:count]
+
+    def _decoded(self, index: int, units: Array) -> Array:
+        axis = self._space.axes[index]
+        values = _values(axis, units)
+        return np.rint(values) if axis.integer else values
+
+
+class Feasibility:
+    """How likely a request at a place is not refused, from where some were and where others were not.
+
+    A GP of the label (1 fulfilled, −1 refused) with prior mean 1: what nobody asked for is taken to be allowed. The
+    probability is that of a positive latent label.
+
+    Source: least-squares classification, Rasmussen & Williams, chapter 6.5; weighing an acquisition by it: Gardner et
+        al., Bayesian optimization with inequality constraints, ICML 2014.
+    """
+
+    def __init__(self, fulfilled: Array, refused: Array) -> None:
+        """Fit to points (n, dimension) and (k ≥ 1, dimension); what is among both counts as refused."""
+        if len(fulfilled):
+            fulfilled = fulfilled[cdist(fulfilled, refused).min(axis=1) > _SAME]
+        points = np.concatenate([fulfilled, refused])
+        labels = np.where(np.arange(len(points)) < len(fulfilled), 1.0, -1.0)
+        self._process = GaussianProcess(
+            labels, Covariance(points, _LABEL_PRIOR), mean=lambda x: np.ones(len(x)), scale=1.0
+        )
+
+    def log_probability(self, points: Array) -> Array:
+        """(m,) at points (m, dimension)."""
+        mean, deviation = self._process.predict(points)
+        return np.asarray(log_ndtr(mean / np.hypot(deviation, self._process.noise)))
+
+
+def _values(axis: Axis, units: Array) -> Array:
+    """`Axis.decode` of many, not rounded."""
+    u = np.clip(units, 0.0, 1.0)
+    if axis.scale == "log":
+        return np.asarray(np.exp(math.log(axis.lower) + u * (math.log(axis.upper) - math.log(axis.lower))))
+    return np.asarray(axis.lower + u * (axis.upper - axis.lower))
+
+
+def _units(axis: Axis, values: Array) -> Array:
+    """`Axis.encode` of many."""
+    if axis.scale == "log":
+        values = np.maximum(values, 1e-300)
+        return np.asarray((np.log(values) - math.log(axis.lower)) / (math.log(axis.upper) - math.log(axis.lower)))
+    return np.asarray((values - axis.lower) / (axis.upper - axis.lower))
