@@ -152,7 +152,7 @@ class LimitsSection(Section):
     singularity: Annotated[float, Quantity("1", "0.1", 0.02, 0.9)] = _LIMITS.singularity
     """How far to stay from poses in which the arm loses a direction: sine of wrist and elbow, shoulder over reach."""
 
-    clearance: Annotated[float, Quantity("m", "5 mm", 0.0, 0.1)] = _LIMITS.clearance
+    clearance: Annotated[float, Quantity("m", "5 mm", 0.0, 0.012)] = _LIMITS.clearance
     """Between the pourer and the receiver."""
 
 

@@ -63,7 +63,7 @@ def check_reach(unreached: Stretch) -> str:
     """What to say about a stretch of which some poses can't be reached in the posture of home."""
     home = posture(np.array(unreached.spec.home), unreached.model)
     beyond = beyond_reach(unreached.flange.rotation, unreached.flange.position, unreached.model)
-    worst = int(np.argmax(np.abs(beyond[:, home])))
+    worst = _first_worst(np.abs(beyond[:, home]))
     # a way that can't be made has no pace yet
     when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)
     distance = 1e3 * float(beyond[worst, home])
@@ -73,7 +73,7 @@ def check_reach(unreached: Stretch) -> str:
         else ""
     )
     if distance > 0.0:
-        return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer to the base{another}"
+        return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer or lower{another}"
     return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it{another}"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from actors.arm.path.frames import cell_frames, flange_poses, pourer_frames
 from actors.arm.path.kinematics import MODELS, beyond_reach, forward, inverse, singularities
 from actors.arm.spec import UrArmSpec
+from sim_engine.vessel.sdf import MARGIN
 
 UPRIGHT = math.radians(3.0)
 """How far a pourer that waits or travels may lean [rad]: it is full."""
@@ -26,7 +27,7 @@ def check_limits(spec: UrArmSpec) -> list[str]:
     if np.any(low >= high):
         axis = "xyz"[int(np.argmax(low >= high))]
         return [f"limits.box: {axis} of 'low' should be smaller than that of 'high'"]
-    return [*_speeds(spec), *_receiver(spec), *_home(spec)]
+    return [*_speeds(spec), *_clearance(spec), *_receiver(spec), *_home(spec)]
 
 
 def _speeds(spec: UrArmSpec) -> list[str]:
@@ -43,6 +44,15 @@ def _speeds(spec: UrArmSpec) -> list[str]:
             f"{deg(spec.limits.tilt_speed):.4g} deg/s"
         )
     return problems
+
+
+def _clearance(spec: UrArmSpec) -> list[str]:
+    if spec.limits.clearance <= MARGIN:
+        return []
+    return [
+        f"limits.clearance: {1e3 * spec.limits.clearance:.4g} mm is more than the {1e3 * MARGIN:.0f} mm up to which "
+        "distances between vessels are known"
+    ]
 
 
 def _receiver(spec: UrArmSpec) -> list[str]:

@@ -24,6 +24,9 @@ FloatArray = NDArray[np.float64]
 ANGLE_ERROR, PLACE_ERROR = np.radians(0.1), 3e-4
 """How far linear joints between two waypoints may leave the pose that is wanted [rad], [m]."""
 
+FINEST = 8
+"""So many times the waypoints that a tilt about a wrist needs are tried, before saying that the motion can't be followed."""
+
 MOST_WAYPOINTS = 1_200
 """Of a pour: they travel to the controller as a program."""
 
@@ -75,6 +78,10 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     nearest, texts = check_clearance(during, made.phases[0].end, pourer, receiver)
     if approached >= spec.limits.clearance or nearest.index > 0:  # its first pose is the approach's last
         problems += texts
+    if pour is not None and not problems and not _follows(pour, made, spec):
+        problems.append(
+            "joints that are linear between waypoints leave the pour's poses by more than 0.1 deg or 0.3 mm"
+        )
     if pour is not None and len(pour.times) > MOST_WAYPOINTS:
         problems.append(f"the pour needs {len(pour.times)} waypoints, a controller takes {MOST_WAYPOINTS}")
     if problems or pour is None or approach is None:
@@ -134,7 +141,7 @@ def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSpec) -> JointPath:
     while True:
         times = pour_times(motion, finer)
         path = JointPath(times, follow(motion.sample(times), near, spec))
-        if finer >= 8 or _follows(path, motion, spec):
+        if finer >= FINEST or _follows(path, motion, spec):
             return path
         finer *= 2
 

@@ -13,6 +13,7 @@ from actors.arm.path.frames import cell_frames
 from actors.arm.path.kinematics import link_points
 from actors.arm.path.stretch import Stretch
 from sim_engine.contact import clearance
+from sim_engine.vessel.sdf import MARGIN
 from sim_engine.vessel.vessel import Vessel
 
 FloatArray = NDArray[np.float64]
@@ -69,10 +70,11 @@ def nearest_to_receiver(stretch: Stretch, until: float, pourer: Vessel, receiver
     way = np.concatenate([[0.0], np.cumsum(steps)])
     coarse = _every(way, COARSE)
     away = clearance(pourer, receiver, poses[coarse])
-    least = np.minimum(away[:-1], away[1:])
-    gaps = np.diff(way[coarse])
     # between two poses that are a way w apart nothing can come nearer than the nearer one less w/2
-    doubtful = least - 0.5 * gaps < max(stretch.spec.limits.clearance, float(away.min()))
+    least = np.minimum(away[:-1], away[1:]) - 0.5 * np.diff(way[coarse])
+    # what is farther off than a vessel's grid reaches is known to be no nearer than that, not how far
+    known = least - np.maximum(np.minimum(away[:-1], away[1:]) - MARGIN, 0.0)
+    doubtful = (known < stretch.spec.limits.clearance) | (least < float(away.min()))
     dense = _every(way, FINE)
     gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
     fine = dense[doubtful[gap]]

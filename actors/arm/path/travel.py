@@ -40,11 +40,11 @@ class OutOfReachError(Exception):
 
 
 def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
-    """Joints that take the pourer through poses without jumps and without a change of posture.
+    """Joints that take the pourer through poses without jumps, in the posture of home.
 
     Args:
         poses: of the pourer in the world, shape (T, 7); the first one near to where `near` has it.
-        near: joints before the first pose, shape (6,) [rad]: of their posture and full turns.
+        near: joints before the first pose, shape (6,) [rad], for their full turns.
         spec: of the arm and its cell.
 
     Returns:
@@ -55,7 +55,7 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
     """
     model = MODELS[spec.model]
     flange = flange_poses(poses, spec)
-    joints = inverse(flange.rotation, flange.position, model)[:, posture(near, model)]
+    joints = inverse(flange.rotation, flange.position, model)[:, posture(np.array(spec.home), model)]
     if np.isnan(joints).any():
         raise OutOfReachError(poses)
     return np.unwrap(np.concatenate([near[None], joints]), axis=0)[1:]

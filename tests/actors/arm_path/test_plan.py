@@ -22,7 +22,7 @@ from actors.arm.spec import Plane, UrArmSpec
 from actors.protocols import InvalidActionError
 from orchestrator.config.load import load_campaign
 from sim_engine.action import DEG
-from sim_engine.contact import first_contact, rotations
+from sim_engine.contact import clearance, first_contact, rotations
 from sim_engine.motion import plan_motion
 from sim_engine.task import Pivot
 from sim_engine.vessel.build import build_vessel
@@ -56,7 +56,7 @@ def dense(path: JointPath) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(action=actions)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_the_encoders_would_see_the_pour_that_was_asked_for(action):
     asked = motion(action)
     pour = plan_path(asked, SPEC, vessel("beaker"), vessel("tumbler")).pour
@@ -103,7 +103,7 @@ def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):
 
 
 @given(action=actions)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_the_three_parts_join_from_home_to_home(action):
     path = planned(action)
     np.testing.assert_allclose(path.approach.joints[0], SPEC.home, atol=1e-9)
@@ -120,7 +120,7 @@ def test_the_three_parts_join_from_home_to_home(action):
 
 
 @given(action=actions)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_a_full_pourer_travels_upright_and_gently(action):
     path = planned(action)
     for part in (path.approach, path.retreat):
@@ -209,6 +209,25 @@ def test_where_the_straight_way_would_sweep_through_the_receiver_the_pourer_is_l
     assert path.report.clearance >= LIMITS.clearance
     heights = pourer_frames(path.approach.joints, far).position[:, 2]
     assert heights.max() > 0.06 + vessel("tumbler").rim_height
+
+
+@given(action=actions)
+@settings(max_examples=10, deadline=None)
+def test_the_nearest_approach_of_the_vessels_is_found_among_few_poses(action):
+    spec = limited(clearance=0.0)
+    try:
+        path = planned(action, spec)
+    except InvalidActionError:
+        assume(False)
+    times = np.linspace(0.0, path.pour.duration, 300)
+    joints = path.pour.at(times)
+    everywhere = clearance(vessel("beaker"), vessel("tumbler"), pourer_motion(joints, times, spec).poses).min()
+    if everywhere < 0.012:  # beyond that it is an estimate
+        assert path.report.clearance <= everywhere + 1.5e-3  # half a step, and the grid's own error
+    near = [limit for limit in (2e-3, 5e-3, 9e-3) if everywhere < limit - 1.5e-3]
+    for limit in near:
+        with pytest.raises(InvalidActionError, match="of the receiver"):
+            planned(action, limited(clearance=limit))
 
 
 def test_other_robot_other_lengths():

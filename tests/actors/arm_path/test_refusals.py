@@ -39,15 +39,22 @@ def test_a_pour_out_of_reach_says_by_how_much():
 
 
 def test_a_tilt_that_leads_out_of_reach_is_told_with_its_moment():
-    # so high that the elbow is all but straight; the tilt lifts what is gripped still higher
+    # upright it is still in reach; the tilt lifts what is gripped
     text = refusal(open_cell(receiver=(0.75, 0.0, 0.92)))
-    assert "tilt's end, 1.93 s into the pour: out of the arm's reach by" in text or "from straight" in text
+    assert "at the tilt's end, 1.93 s into the pour: out of the arm's reach by 14 mm" in text
+    assert "approach" not in text
 
 
 def test_a_receiver_too_near_to_the_base():
     assert "the wrist 77 mm from above the base's axis, 118 mm" in refusal(open_cell(receiver=(0.45, 0.0, 0.06)))
     text = refusal(open_cell(receiver=(0.4, 0.0, 0.06)))
     assert "mm too near to the arm's base; move the receiver away from it" in text
+
+
+def test_an_almost_straight_elbow_is_told_in_degrees():
+    spec = open_cell(receiver=(1.44, 0.0, 0.06))
+    text = refusal(replace(spec, limits=replace(spec.limits, singularity=0.32)))
+    assert "elbow 16.7 deg from straight, 18.7 deg are asked for; move the receiver nearer or lower" in text
 
 
 def test_a_wrist_that_loses_a_direction():
@@ -140,13 +147,17 @@ def test_vessels_that_would_touch_or_come_too_near():
     assert "into the tilt" in through
 
 
-def test_an_arm_that_would_reach_into_the_receiver():
-    # gripped low, beside a tall receiver, the gripper stands where the receiver's wall is
-    spec = replace(SPEC, cell=replace(SPEC.cell, direction=0.0), grip=Pose(y=-0.06, rx=-90 * DEG))
-    spec = replace(spec, limits=replace(LIMITS, **WIDE, clearance=0.09), cell=SPEC.cell)
-    text = refusal(spec)
+def test_a_gripper_that_would_reach_into_the_receiver():
+    # held far from the fingers, the pourer stands beside the receiver and the gripper in it
+    spec = replace(SPEC, grip=Pose(x=-0.1, y=-0.06, rx=-90 * DEG))
+    text = refusal(replace(spec, limits=replace(LIMITS, **WIDE)), ACTION.with_values(height=-0.02))
     assert "the gripper would come within" in text
-    assert "90 mm have to stay free" in text
+    assert "mm of the receiver, " in text
+    assert "3 mm have to stay free" in text
+
+
+def test_a_clearance_that_nobody_can_measure():
+    assert "limits.clearance: 20 mm is more than the 12 mm" in refusal(limited(clearance=0.02))
 
 
 def test_a_wrist_that_would_touch_the_table():
