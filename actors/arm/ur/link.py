@@ -20,7 +20,6 @@ from actors.arm.ur.messages import (
     GO,
     HEARTBEAT,
     NUMBER,
-    SILENCE,
     STATUS,
     STOP_ORDER,
     TOOL,
@@ -30,8 +29,11 @@ from actors.arm.ur.messages import (
 
 PORTS = {30004: "RTDE", 29999: "dashboard", 30001: "primary interface"}
 PROBE_TIME = 2.0
-CONSTRUCTION_TIME = 10.0
+CONSTRUCTION_TIME = 5.0
 """After which a constructor that doesn't come back ends the process [s]: it holds the interpreter."""
+
+AT_REST = 8.0
+"""Patience with silence while nothing moves: a controller may be taking in a program."""
 
 _LOOKS = 10
 """Looks that must have found the same time before data count as stale: a late look says nothing."""
@@ -50,12 +52,13 @@ class Link:
     Args:
         address: of the controller.
         rate: of reading [Hz of the clock].
+        silence: longest time without anything new [s of the clock].
 
     Raises:
         TroubleError: it can't be reached, or the library isn't there.
     """
 
-    def __init__(self, address: str, rate: float) -> None:
+    def __init__(self, address: str, rate: float, silence: float) -> None:
         for port, name in PORTS.items():
             _probe(address, port, name)
         try:
@@ -72,14 +75,18 @@ class Link:
                 self._io: Any = RTDEIOInterface(address)
         except (RuntimeError, ValueError) as error:
             raise TroubleError("lost", f"{address}: {error}") from None
+        self._silence = silence
         self._writing = threading.Lock()
         self._last: Reading | None = None
         self._looks = 0
 
     # ---- reading
 
-    def look(self) -> Reading:
+    def look(self, patience: float = 1.0) -> Reading:
         """The latest package.
+
+        Args:
+            patience: with silence, as a multiple of the longest.
 
         Raises:
             TroubleError: the connection is lost, or its time stands still.
@@ -92,8 +99,10 @@ class Link:
             last = self._last
             if last is not None and time_before == last.time:
                 self._looks += 1
-                if self._looks >= _LOOKS and time.monotonic() - last.seen > SILENCE:
-                    raise TroubleError("lost", f"the controller has said nothing new for {SILENCE:g} s")
+                if self._looks >= _LOOKS and time.monotonic() - last.seen > patience * self._silence:
+                    raise TroubleError(
+                        "lost", f"the controller has said nothing new for {patience * self._silence:g} s"
+                    )
                 return last
             reading = Reading(
                 time=time_before,
@@ -124,13 +133,11 @@ class Link:
         """
         before = self._receive.getTimestamp()
         self._last, self._looks = None, 0
-        end = time.monotonic() + 5.0 * SILENCE
-        while time.monotonic() < end:
+        while True:
             time.sleep(0.004)
-            reading = self.look()
+            reading = self.look(AT_REST)
             if reading.time != before:
                 return reading
-        raise TroubleError("lost", f"the controller has said nothing new for {5.0 * SILENCE:g} s")
 
     # ---- writing
 

@@ -23,7 +23,7 @@ SLOWEST_HEARTBEAT = 2.0
 """A program whose heartbeat is written less often than that ends, and the arm with it [Hz of the clock]."""
 
 SILENCE = 0.2
-"""Data whose time stands still for so long are stale [s of the clock]."""
+"""Data whose time stands still for so long, while the arm moves, are stale [s of the clock]."""
 
 
 class TroubleError(Exception):
@@ -142,6 +142,7 @@ class Outcome:
         clock: time on the path where it ended [s].
         joints: where the arm stands [rad]; as last seen, if `standing` is None.
         standing: when it was first seen at rest [s of `time.monotonic`].
+        answered: when the program was first seen to have taken an order to stop [s of `time.monotonic`].
         moved: it had been told to go.
         slider: the lowest it was seen at.
     """
@@ -152,6 +153,7 @@ class Outcome:
     clock: float
     joints: tuple[float, ...]
     standing: float | None
+    answered: float | None = None
     moved: bool = True
     slider: float = 1.0
 

@@ -59,6 +59,7 @@ class Primary:
         tool: TCP in the flange's frame.
         ranges, speeds: limits of the joints [rad], [rad/s]; empty where they aren't told.
         complaints: the last things it said about programs.
+        broken: it said that a program can't be read, or can't go on.
 
     Raises:
         PrimaryError: it can't be reached, or sends no state.
@@ -70,6 +71,7 @@ class Primary:
         self.ranges: tuple[tuple[float, float], ...] = ()
         self.speeds: tuple[float, ...] = ()
         self.complaints: deque[str] = deque(maxlen=8)
+        self.broken = False
         self._rest = b""
         try:
             self._socket = socket.create_connection((address, PORT), timeout=PATIENCE)
@@ -131,6 +133,7 @@ class Primary:
             return
         kind, rest = body[9], body[10:]
         if kind == _EXCEPTION and len(rest) >= 8:
+            self.broken = True
             line = int.from_bytes(rest[:4], "big", signed=True)
             self.complaints.append(f"line {line}: {rest[8:].decode('utf-8', 'replace')}")
         elif kind == _KEY and len(rest) >= 9:

@@ -6,10 +6,9 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
-from enum import Enum, auto
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
-from actors.arm.ur.link import Link
+from actors.arm.ur.link import AT_REST, Link
 from actors.arm.ur.messages import (
     DONE,
     READY,
@@ -59,13 +58,6 @@ _ROBOT = {-1: "no controller", 0: "disconnected", 1: "safety to be confirmed", 2
 _ROBOT |= {5: "idle, brakes closed", 6: "being moved by hand", 7: "running", 8: "updating"}
 
 
-class Order(Enum):
-    """Why the loop ends a motion by itself."""
-
-    NONE = auto()
-    OPERATOR = auto()
-
-
 def why_not_ready(reading: Reading) -> str:
     """Why an arm can't move; '' if it can."""
     if reading.safety_mode != NORMAL:
@@ -109,6 +101,7 @@ class Watch:
         self._beats, self._next_beat, self._last_beat, self._longest_pause = 0, 0.0, 0.0, 0.0
         self._next_tell = 0.0
         self._standing: float | None = None
+        self._answered: float | None = None
 
     def order_stop(self) -> None:
         """Stop; from any thread."""
@@ -144,15 +137,15 @@ class Watch:
         self._beat()
         try:
             primary.upload(self._motion.program)
-            refusal = self._until_ready()
+            refusal = self._until_ready(primary)
             if refusal:
                 self._end_program()
                 said = "; ".join(primary.complaints)
                 raise TroubleError("refused", refusal + (f" (the controller says: {said})" if said else ""))
             if self._ordered.is_set():
                 return self._broken_off("operator", "stopped by the operator")
+            self._began = self._link.fresh().time
             self._went = True
-            self._began = self._link.look().time
             self._link.go(self._motion.number)
             return self._until_end(primary)
         except TroubleError as trouble:
@@ -165,7 +158,7 @@ class Watch:
 
     # ---- before the go
 
-    def _until_ready(self) -> str:
+    def _until_ready(self, primary: Primary) -> str:
         """Wait for the program, and read back what it set. Returns why it must not go on, or ''."""
         motion, settings = self._motion, self._motion.settings
         end = time.monotonic() + UPLOAD_TIME
@@ -187,7 +180,7 @@ class Watch:
                     )
             if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
                 return "the robot is not ready any more"
-            if time.monotonic() > end:
+            if primary.broken or time.monotonic() > end:
                 return "the program did not start on the controller"
             time.sleep(LOOK_INTERVAL)
 
@@ -198,6 +191,7 @@ class Watch:
         while True:
             reading = self._look()
             if reading.status == STOPPED and reading.number == motion.number:
+                self._answered = time.monotonic()
                 return self._broken_off("operator", "stopped by the operator")
             if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
                 return self._stopped_by_safety(reading)
@@ -268,13 +262,23 @@ class Watch:
             stop_program(self._address, 0.5)
 
     def _outcome(self, kind: str, text: str) -> Outcome:
-        return Outcome(kind, text, self._samples, self._clock, self._joints, self._standing, self._went, self._slider)
+        return Outcome(
+            kind,
+            text,
+            self._samples,
+            self._clock,
+            self._joints,
+            self._standing,
+            self._answered,
+            self._went,
+            self._slider,
+        )
 
     # ---- each turn
 
     def _look(self) -> Reading:
         self._beat()
-        reading = self._link.look()
+        reading = self._link.look(1.0 if self._went else AT_REST)
         self._joints = reading.joints
         if self._went:
             self._slider = min(self._slider, reading.slider)
@@ -313,7 +317,7 @@ def _elsewhere(joints: tuple[float, ...], wanted: tuple[float, ...]) -> str:
     worst = max(range(6), key=errors.__getitem__)
     if errors[worst] <= AT_START:
         return ""
-    return f"joint {worst} is {errors[worst] * 57.29578:.1f}° away from where it should be"
+    return f"joint {worst + 1} is {errors[worst] * 57.29578:.1f}° away from where it should be; stand there first"
 
 
 def _not_remote(address: str) -> str:

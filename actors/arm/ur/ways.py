@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from actors.arm.joint_path import FloatArray, JointPath, PourPath
+from actors.arm.path.frames import pourer_frames
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.errors import ArmRefusedError
 
@@ -18,6 +19,12 @@ RAMP = 0.6
 """Time to get up to speed, and down again [s]."""
 
 _GRID = 0.02
+
+
+def leans(joints: FloatArray, spec: UrArmSpec) -> FloatArray:
+    """Tilt of the pourer for joints (T, 6) [rad], shape (T,) [rad]."""
+    tilts: FloatArray = np.arccos(np.clip(pourer_frames(joints, spec).rotation[..., 2, 2], -1.0, 1.0))
+    return tilts
 
 
 def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
@@ -92,7 +99,9 @@ def way_home(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> JointPath:
     else:
         chosen, times = path.approach, _between(path.approach.times, back, 0.0)
     points = np.vstack([joints, chosen.at(times)])
-    costs = np.abs(np.diff(points, axis=0)).max(axis=1) / (0.5 * spec.approach_speed)
+    # A way back may begin tilted, after a pour without a return.
+    turning = np.abs(np.diff(leans(points, spec))) / spec.untilt_speed
+    costs = np.maximum(turning, np.abs(np.diff(points, axis=0)).max(axis=1) / (0.5 * spec.approach_speed))
     return _paced(points, np.zeros(len(points)), costs)[0]
 
 

@@ -48,8 +48,14 @@ class Worker:
     def serve(self) -> None:
         """Until the driver hangs up."""
         threading.Thread(target=self._hear, name="hear", daemon=True).start()
+        parent = os.getppid()
         while True:
-            number, method, arguments = self._requests.get()
+            try:
+                number, method, arguments = self._requests.get(timeout=1.0)
+            except queue.Empty:
+                if os.getppid() != parent:  # dead, though somebody else holds the connection's other end
+                    os._exit(0)
+                continue
             try:
                 answer = (number, True, getattr(self, method)(*arguments))
             except TroubleError as trouble:
@@ -83,10 +89,10 @@ class Worker:
 
     # ---- requests
 
-    def open(self, address: str, rate: float) -> Reading:
+    def open(self, address: str, rate: float, silence: float) -> Reading:
         """Connect; nothing moves."""
         self._address = address
-        self._link = Link(address, rate)
+        self._link = Link(address, rate, silence)
         return self._link.fresh()
 
     @property

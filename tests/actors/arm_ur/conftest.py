@@ -1,0 +1,168 @@
+"""An arm at a virtual controller of its own, and what the controller saw."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from actors.arm.joint_path import PourPath
+from actors.arm.ur.driver import UrArm
+from actors.virtual_ur import VirtualController
+
+from .pours import HOME, START, pour_path, settings
+
+SCALE = 10.0
+_numbers = itertools.count(2)
+
+
+def next_address() -> str:
+    """A loopback address that no other test, and no other test process, uses."""
+    pid, number = os.getpid(), next(_numbers)
+    return f"127.{160 + pid % 64}.{pid // 64 % 256}.{number}"
+
+
+class Call(threading.Thread):
+    """A blocking call in a thread."""
+
+    def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
+        super().__init__(daemon=True)
+        self._call, self._arguments = call, arguments
+        self.value: Any = None
+        self.error: Exception | None = None
+        self.start()
+
+    def run(self) -> None:
+        try:
+            self.value = self._call(*self._arguments)
+        except Exception as error:
+            self.error = error
+
+    def result(self, patience: float = 60.0) -> Any:
+        self.join(patience)
+        assert not self.is_alive(), "the call did not come back"
+        if self.error is not None:
+            raise self.error
+        return self.value
+
+
+class Rig:
+    """Arm, controller, and a pour to make."""
+
+    def __init__(self, controller: VirtualController, arm: UrArm, path: PourPath) -> None:
+        self.controller, self.arm, self.path = controller, arm, path
+
+    def fault(self, name: str, **arguments: Any) -> dict[str, Any]:
+        return self.controller.fault(name, **arguments)
+
+    @property
+    def now(self) -> float:
+        return float(self.fault("state")["time"])
+
+    @property
+    def joints(self) -> np.ndarray:
+        return np.array(self.fault("state")["joints"])
+
+    @property
+    def worker(self) -> int:
+        """Process id."""
+        pid = self.arm._session.pid
+        assert pid is not None
+        return pid
+
+    def history(self, since: float) -> tuple[np.ndarray, np.ndarray]:
+        kept = self.fault("history", since=since)
+        return np.array(kept["times"]), np.array(kept["joints"]).reshape(-1, 6)
+
+    def moved(self, since: float) -> float:
+        """How far any joint has moved since a time of the controller [rad]."""
+        joints = self.history(since)[1]
+        return float(np.ptp(joints, axis=0).max()) if len(joints) else 0.0
+
+    def to_start(self) -> None:
+        self.arm.release()
+        self.arm.move_to_start(self.path)
+
+    def pouring(self) -> Call:
+        """The pour, going on in a thread; at its start before."""
+        self.to_start()
+        return Call(self.arm.execute, self.path)
+
+    def await_phase(self, phase: str) -> None:
+        self.await_that(lambda: self.arm.state().phase == phase, f"phase {phase}")
+
+    def await_tilt(self, tilt: float) -> None:
+        """Until the last joint has really turned so far [rad]."""
+        self.await_that(lambda: self.joints[5] - START[5] > tilt, f"a tilt of {tilt}")
+
+    def await_rest(self) -> None:
+        self.await_that(lambda: max(map(abs, self.fault("state")["speeds"])) == 0.0, "rest")
+        time.sleep(0.1)  # joints follow their targets a few milliseconds late
+
+    @staticmethod
+    def await_that(condition: Callable[[], bool], what: str, patience: float = 20.0) -> None:
+        end = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < end, f"{what} did not come"
+            time.sleep(0.005)
+
+
+class Makers:
+    """Starts rigs, and ends them."""
+
+    def __init__(self) -> None:
+        self._made: list[Rig] = []
+
+    def __call__(self, path: PourPath | None = None, connect: bool = True, **changes: Any) -> Rig:
+        """A controller at home, and an arm that is connected to it."""
+        scale = changes.pop("time_scale", SCALE)
+        options: dict[str, Any] = {"model": "ur10e", "time_scale": scale, "joints": HOME}
+        options["frequency"] = changes.pop("frequency", 125.0)
+        controller = VirtualController.start(address=next_address(), **options)
+        arm = UrArm(settings(controller.address, time_scale=scale, **changes))
+        rig = Rig(controller, arm, path or pour_path())
+        self._made.append(rig)
+        if connect:
+            arm.connect()
+        return rig
+
+    def close(self) -> None:
+        for rig in self._made:
+            rig.arm.close()
+            rig.controller.close()
+
+
+@pytest.fixture
+def make_rig() -> Iterator[Makers]:
+    """Start controllers with arms that end with the test."""
+    makers = Makers()
+    yield makers
+    makers.close()
+
+
+@pytest.fixture
+def rig(make_rig: Makers) -> Rig:
+    return make_rig()
+
+
+@pytest.fixture(scope="module")
+def _resting() -> Iterator[Rig]:
+    makers = Makers()
+    yield makers()
+    makers.close()
+
+
+@pytest.fixture
+def resting(_resting: Rig) -> Iterator[Rig]:
+    """An arm at home that several tests share, for none of them moves it."""
+    began = _resting.now
+    yield _resting
+    assert _resting.moved(began) == 0.0
+    _resting.arm.lock()
+    _resting.fault("slider", fraction=1.0)

@@ -1,0 +1,231 @@
+"""Stops, from wherever they come: the arm holds, says where it stands, and waits for an operator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from actors.arm.ur.errors import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+
+from .conftest import Call, Rig
+from .pours import HOME, START, pour_path
+
+Make = Callable[..., Rig]
+DEG = math.radians(1.0)
+LONG_HOLD = pour_path(hold=8.0)
+"""Long enough to be met in its hold, ten times as fast as time."""
+
+
+def stopped(call: Call) -> ArmStoppedError:
+    with pytest.raises(ArmStoppedError) as caught:
+        call.result()
+    return caught.value
+
+
+def holds_until_released(rig: Rig) -> None:
+    """Nothing moves without a word of the operator's."""
+    rig.await_rest()
+    began = rig.now
+    assert rig.arm.state().stopped
+    for motion in (rig.arm.execute, rig.arm.retreat, rig.arm.move_to_start, rig.arm.untilt):
+        with pytest.raises(ArmNotReleasedError):
+            motion(rig.path)
+    rig.await_that(lambda: rig.now > began + 2.0, "time")
+    assert rig.moved(began) < 1e-6
+    assert rig.fault("state")["runtime_state"] == "STOPPED"
+
+
+def comes_home(rig: Rig) -> None:
+    """Upright by the way it came, slowly; then home."""
+    began, tilt = rig.now, rig.joints[5] - START[5]
+    rig.arm.release()
+    rig.arm.untilt()
+    times, joints = rig.history(began)
+    assert joints[:, 5].max() - START[5] < tilt + 0.02  # never more tilted than it was
+    speeds = np.abs(np.diff(joints[:, 5])) / np.diff(times)
+    assert speeds.max() < 1.3 * rig.arm._spec.untilt_speed
+    assert rig.joints == pytest.approx(START, abs=1e-3)
+    assert rig.arm.state().tilt == pytest.approx(0.0, abs=0.01)
+    with pytest.raises(ArmNotReleasedError):
+        rig.arm.retreat(rig.path)
+    rig.arm.release()
+    rig.arm.retreat(rig.path)
+    assert rig.joints == pytest.approx(HOME, abs=1e-3)
+
+
+# ---- on request
+
+
+def test_a_stop_while_tilting_takes_effect_at_once_and_can_be_untilted(make_rig: Make) -> None:
+    rig = make_rig(time_scale=1.0, frequency=500.0)
+    pouring = rig.pouring()
+    rig.await_tilt(25.0 * DEG)
+    began = rig.now
+    took = rig.arm.stop()
+    error = stopped(pouring)
+    assert (error.kind, error.phase) == ("operator", "tilt")
+    times, joints = rig.history(began)
+    at_rest = times[np.abs(joints - joints[-1]).max(axis=1) > 1e-4][-1] - began
+    assert 0.05 < at_rest < 0.8  # 50 deg/s is braked in 0.15 s; the rest is on its way, or a busy machine
+    assert took == pytest.approx(at_rest, abs=0.3)
+    assert math.degrees(error.tilt) == pytest.approx((joints[-1][5] - START[5]) / DEG, abs=1.0)
+    assert error.executed is not None
+    assert not error.executed.completed
+    assert error.executed.joints[-1] == pytest.approx(joints[-1], abs=2e-3)
+    holds_until_released(rig)
+    rig.arm.release()
+    rig.arm.stop()  # not before the slow part: un-tilting 25 deg takes three seconds
+
+
+def test_a_stop_of_an_arm_that_stands_locks_it(resting: Rig) -> None:
+    resting.arm.release()
+    assert resting.arm.stop() == 0.0
+    with pytest.raises(ArmNotReleasedError):
+        resting.arm.move_to_start(resting.path)
+
+
+@pytest.mark.parametrize(
+    "phase", [pytest.param("tilt", marks=pytest.mark.slow), "hold", pytest.param("return", marks=pytest.mark.slow)]
+)
+def test_after_a_stop_in_any_phase_the_pourer_is_brought_upright_slowly(make_rig: Make, phase: str) -> None:
+    rig = make_rig(LONG_HOLD)
+    pouring = rig.pouring()
+    rig.await_phase(phase)
+    rig.await_that(lambda: phase == "hold" or 0.2 < rig.arm.state().tilt < 1.1, "a tilt in between")
+    rig.arm.stop()
+    error = stopped(pouring)
+    assert error.phase == phase
+    holds_until_released(rig)
+    comes_home(rig)
+
+
+def test_an_arm_stopped_on_its_way_to_the_pour_goes_back_the_way_it_came(rig: Rig) -> None:
+    rig.fault("protective_stop", joint=0, above=6.0 * DEG)
+    rig.arm.release()
+    error = stopped(Call(rig.arm.move_to_start, rig.path))
+    assert (error.kind, error.phase, error.tilt) == ("protective stop", "approach", 0.0)
+    holds_until_released(rig)
+    rig.arm.release()
+    rig.arm.recover()
+    rig.arm.release()
+    rig.arm.retreat(rig.path)
+    assert rig.joints == pytest.approx(HOME, abs=1e-3)
+
+
+# ---- by the safety system
+
+
+@pytest.mark.parametrize("phase", ["tilt", "hold", "return"])
+def test_a_protective_stop_holds_the_tilted_pourer_until_an_operator_has_looked(make_rig: Make, phase: str) -> None:
+    rig = make_rig(LONG_HOLD)
+    if phase == "tilt":
+        rig.fault("protective_stop", joint=5, above=START[5] + 0.6)
+    pouring = rig.pouring()
+    if phase != "tilt":
+        rig.await_phase("hold")
+        rig.fault("protective_stop", **({} if phase == "hold" else {"joint": 5, "below": START[5] + 0.6}))
+    error = stopped(pouring)
+    assert (error.kind, error.phase) == ("protective stop", phase)
+    assert f"during {phase}" in str(error)
+    rig.await_rest()
+    tilt = rig.joints[5] - START[5]
+    assert tilt > 0.4
+    assert error.tilt == pytest.approx(tilt, abs=0.02)
+    holds_until_released(rig)
+    rig.arm.release()
+    began = rig.now
+    assert "unlocked" in rig.arm.recover()
+    assert rig.moved(began) < 1e-6  # recovering moves nothing
+    assert rig.fault("state")["safety_mode"] == "NORMAL"
+    holds_until_released(rig)
+    comes_home(rig)
+
+
+def test_an_emergency_stop_is_recovered_from_once_its_button_is_released(make_rig: Make) -> None:
+    rig = make_rig(LONG_HOLD)
+    rig.fault("emergency_stop", joint=5, above=START[5] + 0.6)
+    error = stopped(rig.pouring())
+    assert (error.kind, error.phase) == ("emergency stop", "tilt")
+    holds_until_released(rig)
+    rig.arm.release()
+    with pytest.raises(ArmRefusedError, match="button"):
+        rig.arm.recover()
+    rig.fault("release_emergency_stop")
+    rig.arm.release()
+    assert "brakes" in rig.arm.recover()
+    holds_until_released(rig)
+    comes_home(rig)
+
+
+def test_a_safeguard_stop_does_not_go_on_by_itself_when_it_is_released(make_rig: Make) -> None:
+    rig = make_rig(LONG_HOLD)
+    rig.fault("safeguard", joint=5, above=START[5] + 0.6)
+    error = stopped(rig.pouring())
+    assert (error.kind, error.phase) == ("safeguard", "tilt")
+    rig.await_rest()
+    rig.fault("safeguard", active=False)
+    holds_until_released(rig)
+    comes_home(rig)
+
+
+def test_a_protective_stop_from_before_keeps_the_arm_still(rig: Rig) -> None:
+    rig.fault("protective_stop")
+    rig.arm.release()
+    began = rig.now
+    with pytest.raises(ArmRefusedError, match="protective stop is in force"):
+        rig.arm.move_to_start(rig.path)
+    assert rig.moved(began) == 0.0
+
+
+# ---- by people at the panel
+
+
+def test_switching_to_local_control_stops_the_pour(make_rig: Make) -> None:
+    rig = make_rig(LONG_HOLD)
+    rig.fault("remote", active=False, joint=5, above=START[5] + 0.6)
+    error = stopped(rig.pouring())
+    assert (error.kind, error.phase) == ("program ended", "tilt")
+    rig.await_rest()
+    rig.arm.release()
+    with pytest.raises(ArmRefusedError, match="local control"):
+        rig.arm.untilt()
+    rig.fault("remote", active=True)
+    holds_until_released(rig)
+    comes_home(rig)
+
+
+def test_a_slower_slider_is_refused_before_anything_moves(resting: Rig) -> None:
+    resting.fault("slider", fraction=0.5)
+    resting.arm.release()
+    with pytest.raises(ArmRefusedError, match="slider is at 50 %"):
+        resting.arm.move_to_start(resting.path)
+
+
+def test_a_slider_moved_during_a_pour_is_told_with_what_was_executed(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.fault("slider", fraction=0.5, joint=5, above=START[5] + 0.6)
+    executed = rig.pouring().result()
+    assert executed.completed
+    assert executed.tracking["slider"] == 0.5
+
+
+def test_an_arm_that_stands_elsewhere_is_asked_to_go_home_first(resting: Rig) -> None:
+    resting.arm.release()
+    with pytest.raises(ArmRefusedError, match="away from where it should be"):
+        resting.arm.execute(resting.path)
+
+
+def test_an_arm_that_was_moved_off_its_way_is_not_moved_blindly(rig: Rig) -> None:
+    rig.arm.release()
+    rig.arm.jog("joint 2", -9.0 * DEG, 10.0 * DEG)
+    rig.arm.release()
+    began = rig.now
+    with pytest.raises(ArmRefusedError, match="does not stand on the pour's path"):
+        rig.arm.untilt(rig.path)
+    rig.arm.release()
+    with pytest.raises(ArmRefusedError, match="does not stand on the way home"):
+        rig.arm.retreat(rig.path)
+    assert rig.moved(began) == 0.0
