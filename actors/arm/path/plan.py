@@ -25,7 +25,7 @@ ANGLE_ERROR, PLACE_ERROR = np.radians(0.1), 3e-4
 """How far linear joints between two waypoints may leave the pose that is wanted [rad], [m]."""
 
 FINEST = 8
-"""So many times the waypoints that a tilt about a wrist needs are tried, before saying that the motion can't be followed."""
+"""So many times the usual waypoints are tried before saying that joints can't follow the motion."""
 
 MOST_WAYPOINTS = 1_200
 """Of a pour: they travel to the controller as a program."""
