@@ -1,0 +1,134 @@
+"""Where proposals may lie: whole numbers, logarithms, linear constraints, and places that were refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from actors.optimizer.core.problem import Data, Linear, SuggestProblem
+from actors.optimizer.core.propose import propose
+from sim_engine.space import Axis, Space
+
+PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
+MIXED = Space((Axis("n", 1, 4, integer=True), Axis("k", 1e-3, 1.0, "log"), Axis("m", 10, 2000, "log", integer=True)))
+TRIANGLE = (Linear((("x", 1.0), ("y", 1.0)), 0.8),)
+
+
+def observed(function, points) -> Data:
+    return Data(tuple(points), tuple(function(*p) for p in points))
+
+
+def places(count, dimension=2, seed=0):
+    return [tuple(map(float, p)) for p in np.random.default_rng(seed).random((count, dimension))]
+
+
+@pytest.mark.parametrize("acquisition", ["lcb", "posterior_minimum", "random", "sobol"])
+def test_proposals_on_whole_numbers_are_whole_numbers(acquisition):
+    data = observed(lambda n, k, m: (n - 0.3) ** 2 + k + m, places(10, 3))
+    for point in propose(SuggestProblem(MIXED, data, count=6, acquisition=acquisition)).points:
+        again = MIXED.encode(MIXED.decode(point))
+        assert point == pytest.approx(again, abs=1e-9)
+
+
+def test_what_is_rounded_later_is_rounded_before_the_surrogate_sees_it():
+    # n = 2 is at 1/3; both places mean n = 2, so they are the same observation and the same prediction
+    data = Data(((0.28, 0.5, 0.5), (0.38, 0.5, 0.5), (1.0, 0.5, 0.5)), (0.2, 0.4, 0.9))
+    ask = ((0.2, 0.5, 0.5), (0.45, 0.5, 0.5))
+    first, second = propose(SuggestProblem(MIXED, data, count=0, predict_at=ask)).predictions
+    assert first == second
+
+
+def test_where_only_whole_numbers_are_searched_busy_ones_are_not_asked_for_again():
+    line = Space((Axis("n", 1, 6, integer=True),))
+    data = observed(lambda u: (u - 0.4) ** 2, [(0.0,), (0.8,), (1.0,)])
+    points = propose(SuggestProblem(line, data, count=3)).points
+    assert len({line.decode(p)["n"] for p in points}) == 3
+
+
+@pytest.mark.parametrize("acquisition", ["lcb", "posterior_minimum", "random", "sobol"])
+@pytest.mark.parametrize("count", [1, 5])
+def test_proposals_meet_linear_constraints(acquisition, count):
+    data = observed(lambda x, y: (x - 0.9) ** 2 + (y - 0.9) ** 2, places(10))  # tempts beyond the constraint
+    problem = SuggestProblem(PLANE, data, count=count, acquisition=acquisition, constraints=TRIANGLE)
+    assert all(x + y <= 0.8 + 1e-6 for x, y in propose(problem).points)
+
+
+def test_the_minimum_on_a_constraint_is_found():
+    data = observed(lambda x, y: (x - 0.9) ** 2 + (y - 0.5) ** 2, places(30))
+    (best,) = propose(SuggestProblem(PLANE, data, acquisition="posterior_minimum", constraints=TRIANGLE)).points
+    assert best == pytest.approx((0.6, 0.2), abs=0.05)
+
+
+def test_constraints_are_meant_in_values_not_in_places():
+    space = Space((Axis("tilt", 0.0, 2.0), Axis("speed", 0.1, 10.0, "log")))
+    problem = SuggestProblem(
+        space, Data(), count=32, acquisition="sobol", constraints=(Linear((("speed", 1.0),), 1.0),)
+    )
+    assert max(space.decode(p)["speed"] for p in propose(problem).points) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("constraint", "complaint"),
+    [
+        (Linear((("z", 1.0),), 1.0), "names 'z', but the axes are x, y"),
+        (Linear((("x", math.nan),), 1.0), "weight nan for x"),
+        (Linear((("x", 1.0),), math.inf), "upper bound inf"),
+        (Linear((("x", 1.0),), -1.0), "meet all constraints"),
+    ],
+)
+def test_a_constraint_that_cannot_be_met_or_read_is_refused(constraint, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        propose(SuggestProblem(PLANE, Data(), constraints=(constraint,)))
+
+
+def touching(x, y):
+    """A corner in which the vessels would touch: a sixth of the cube, and the cost is least in it."""
+    return x > 0.55 and y > 0.6
+
+
+def campaign(*, told: bool, seed: int, steps: int = 24):
+    """Refusals, and the best allowed cost, of a campaign whose cost is least inside the corner that is refused."""
+    data, refused, best = Data(), [], math.inf
+    for step in range(steps):
+        problem = SuggestProblem(PLANE, data, seed=100 * seed + step, infeasible=tuple(refused) if told else ())
+        (point,) = propose(problem).points
+        if touching(*point):
+            refused.append(point)
+            continue
+        cost = (point[0] - 0.8) ** 2 + (point[1] - 0.8) ** 2
+        best = min(best, cost)
+        data = data.added(point, cost)
+    return refused, best
+
+
+def test_a_forbidden_corner_is_avoided_after_a_few_refusals():
+    for seed in range(3):
+        refused, best = campaign(told=True, seed=seed)
+        assert len(refused) <= 10
+        assert best < 0.09  # the allowed minimum is 0.04, on the corner's edge
+
+
+def test_untold_the_same_campaign_would_ask_into_the_corner_for_ever():
+    assert len(campaign(told=False, seed=0)[0]) > 15
+
+
+def test_refusals_say_nothing_about_the_cost():
+    data = observed(lambda x, y: x + y, places(10))
+    ask = ((0.9, 0.9), (0.2, 0.3))
+    plain = propose(SuggestProblem(PLANE, data, count=0, predict_at=ask))
+    told = propose(SuggestProblem(PLANE, data, count=0, predict_at=ask, infeasible=((0.9, 0.9), (0.95, 0.8))))
+    assert told.predictions == plain.predictions
+    assert told.prediction_deviations == plain.prediction_deviations
+
+
+def test_before_anything_was_observed_refused_places_are_left():
+    refused = ((0.8, 0.8), (0.9, 0.7), (0.7, 0.9))
+    points = propose(SuggestProblem(PLANE, Data(), count=4, infeasible=refused)).points
+    assert min(math.dist(p, q) for p in points for q in refused) > 0.2
+
+
+def test_an_answer_says_how_likely_its_proposals_are_refused():
+    data = observed(lambda x, y: (x - 0.7) ** 2 + (y - 0.7) ** 2, [(0.1, 0.2), (0.3, 0.1), (0.2, 0.7)])
+    answer = propose(SuggestProblem(PLANE, data, count=2, infeasible=((0.7, 0.7),)))
+    assert all(0.3 < p < 1.0 for p in answer.feasibilities)
+    assert propose(SuggestProblem(PLANE, data)).feasibilities == ()
