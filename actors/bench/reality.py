@@ -80,7 +80,7 @@ class Reality:
         self._pour: PourAsk | None = None
         self._times: list[float] = []
         self._joints: list[tuple[float, ...]] = []
-        self._since = 0.0
+        self._since = self._earlier = 0.0
         self._settled = False
 
     async def prepare(self, pour: PourAsk) -> None:
@@ -93,12 +93,17 @@ class Reality:
     async def begin(self) -> None:
         """The arm is about to leave home."""
         self._times, self._joints, self._settled = [], [], False
-        self._since = (await self.site.history(math.inf)).now
+        self._earlier, self._since = 0.0, (await self.site.history(math.inf)).now
 
     async def note(self) -> None:
         """Take down what the arm did since; to be called within two minutes of the controller's time."""
         async with self._noting:
-            self._take(await self.site.history(self._since))
+            history = await self.site.history(self._since)
+            if history.now < self._since:  # the controller was switched off, and its clock begins anew
+                self._earlier += self._since
+                self._since = 0.0
+                history = await self.site.history(0.0)
+            self._take(history)
 
     async def follow(self) -> None:
         """Note again and again, for as long as the arm is away from home; ends by being cancelled."""
@@ -110,10 +115,10 @@ class Reality:
     def _take(self, history: History) -> None:
         last = self._times[-1] if self._times else -math.inf
         for t, q in zip(history.times, history.joints, strict=True):
-            if t > last:
-                self._times.append(t)
+            if t <= history.now and t + self._earlier > last:
+                self._times.append(t + self._earlier)
                 self._joints.append(q)
-        self._since = max(self._since, (self._times[-1] if self._times else 0.0))
+                self._since = t
 
     async def settle(self) -> None:
         """Let the liquid follow what the arm did, once, and have the balance carry what became of it.

@@ -1,0 +1,347 @@
+"""Every fault in every phase of a pour: what the arm does, what is recorded, what the operator is told.
+
+In all of them: nothing moves after a fault until somebody has consented, the pourer is never tilted again, and no
+weight is lost. Faults are real ones, of the controller's process, of the driver's worker, and of the balance's line.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import signal
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from actors.arm.path.frames import pourer_motion
+from actors.bench.planning import planner
+from actors.bench.virtual_operator import VirtualOperator
+from actors.operator import OperatorSpec
+from actors.protocols import LaboratoryError, NotPouredError, UnknownPourError
+from sim_engine.outcome import PourMeasurement
+
+from .conftest import ACTION, SCENE, Stage, wired_spec
+
+PACE = 6.0
+"""Bench seconds per second: phases must last long enough to be hit."""
+
+SPEC = wired_spec(pace=PACE, hurried=True)
+
+ACTION_WITH_HOLD = ACTION.with_values(hold_time=2.0)
+
+PHASES = ("approach", "tilt", "hold", "return", "weigh")
+POURING = PHASES[1:4]
+
+STANDING = 1.5
+"""After which an arm that was told to stop must stand [s of the clock]: half a second of missing heartbeats, a second
+for a busy machine."""
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@dataclass
+class Fault:
+    """Something that goes wrong, and how it is put right.
+
+    Attributes:
+        strike: does it.
+        mend: what the person does who is asked about it; None if nothing needs to be done.
+    """
+
+    strike: Callable[[Stage], Awaitable[Any]]
+    mend: Callable[[Stage], Awaitable[Any]] | None = None
+
+
+def controller(name: str, **arguments: Any) -> Callable[[Stage], Awaitable[Any]]:
+    return lambda stage: stage.site.fault(name, **arguments)
+
+
+def balance(what: str, **values: Any) -> Callable[[Stage], Awaitable[Any]]:
+    return lambda stage: stage.site.order(what, **values)
+
+
+async def kill_worker(stage: Stage) -> None:
+    driver = stage.bench.arm.device._object  # type: ignore[attr-defined]
+    os.kill(driver._worker.pid, signal.SIGKILL)
+
+
+ARM: dict[str, Fault] = {
+    "protective stop": Fault(controller("protective_stop")),
+    "emergency stop": Fault(controller("emergency_stop"), controller("release_emergency_stop")),
+    "safeguard": Fault(controller("safeguard"), controller("safeguard", active=False)),
+    "drop": Fault(controller("drop")),
+    "stall": Fault(controller("stall"), controller("clear")),
+    "refuse": Fault(controller("refuse"), controller("clear")),
+    "reboot": Fault(controller("reboot", seconds=1.0)),
+    "worker killed": Fault(kill_worker),
+}
+
+BALANCE: dict[str, Fault] = {
+    "unplugged": Fault(balance("unplug"), balance("plug")),
+    "silent": Fault(balance("faults", silent=True), balance("faults", silent=False)),
+    "garbage": Fault(balance("faults", garbage=1.0), balance("faults", garbage=0.0)),
+}
+
+QUICK = {
+    ("protective stop", "approach"),
+    ("protective stop", "tilt"),
+    ("protective stop", "hold"),
+    ("protective stop", "return"),
+    ("emergency stop", "tilt"),
+    ("safeguard", "return"),
+    ("drop", "tilt"),
+    ("stall", "hold"),
+    ("reboot", "approach"),
+    ("worker killed", "tilt"),
+    ("drop", "weigh"),
+    ("unplugged", "weigh"),
+    ("silent", "tilt"),
+    ("garbage", "weigh"),
+}
+"""Tried by default; the rest takes minutes."""
+
+
+def cases(faults: dict[str, Fault]) -> list[Any]:
+    return [
+        pytest.param(fault, phase, id=f"{fault}-{phase}", marks=() if (fault, phase) in QUICK else pytest.mark.slow)
+        for fault in faults
+        for phase in PHASES
+    ]
+
+
+@dataclass
+class Tale:
+    """What came of a pour with a fault in it.
+
+    Attributes:
+        outcome: the measurement, or the error.
+        struck, consented: controller times of the fault and of the first consent after it [s].
+        times, joints: of the controller from the fault on.
+    """
+
+    stage: Stage
+    outcome: PourMeasurement | LaboratoryError
+    struck: float
+    consented: float
+    times: np.ndarray
+    joints: np.ndarray
+
+    @property
+    def tilts(self) -> np.ndarray:
+        return pourer_motion(self.joints, self.times - self.times[0], SPEC.arm).tilt(self.times - self.times[0])
+
+
+class Recorder:
+    """Keeps what the controller's joints do; it forgets after two minutes of its time."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self.times: list[float] = []
+        self.joints: list[tuple[float, ...]] = []
+
+    async def run(self) -> None:
+        while True:
+            await self.take()
+            await asyncio.sleep(2.0)
+
+    async def take(self) -> None:
+        stage, last = self._stage, self.times[-1] if self.times else -1.0
+        await stage.now()
+        history = await stage.site.history(max(last - stage.earlier, 0.0))
+        for t, q in zip(history.times, history.joints, strict=True):
+            if t <= history.now and t + stage.earlier > last:
+                self.times.append(t + stage.earlier)
+                self.joints.append(q)
+
+
+async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any]) -> float:
+    """Have a fault happen in the middle of a phase; the controller's time then [s]."""
+    spans = {name: (begin, end) for name, begin, end in planner(SPEC.arm)(SCENE, ACTION_WITH_HOLD).phases}
+    end = time.monotonic() + 60.0
+    while True:
+        assert time.monotonic() < end, f"never came to {phase}"
+        state = await stage.bench.arm.state()
+        if phase == "weigh" and seen and seen[-1].checkpoint in ("settle", "weigh"):
+            break
+        if phase == "approach" and state.phase == phase and state.fraction > 0.2:
+            break
+        if phase in spans and state.phase == phase:
+            begin, until = spans[phase]
+            if state.time > begin + 0.2 * (until - begin):
+                break
+        await asyncio.sleep(0.005)
+    at = await stage.now()
+    await fault.strike(stage)
+    return at
+
+
+async def tell_tale(open_stage: Any, phase: str, fault: Fault, *, mend: set[str], **changes: Any) -> Tale:
+    seen: list[Any] = []
+    async with open_stage(wired_spec(pace=PACE, hurried=True, **changes.pop("spec", {})), **changes) as stage:
+        for about in mend:
+            if fault.mend is not None:
+                stage.before[about] = lambda: fault.mend(stage)
+        recorder = Recorder(stage)
+        recording = asyncio.create_task(recorder.run())
+        pour = asyncio.create_task(stage.pour(ACTION_WITH_HOLD, progress=seen.append))
+        struck = await strike_in(stage, phase, fault, seen)
+        outcome: PourMeasurement | LaboratoryError
+        try:
+            outcome = await asyncio.wait_for(pour, 90.0)
+        except LaboratoryError as error:
+            outcome = error
+        recording.cancel()
+        await fault_is_over(stage)
+        await recorder.take()
+        times, joints = np.array(recorder.times), np.array(recorder.joints)
+        consents = [stage.answered_at[about] for about in ("untilt", "home") if about in stage.answered_at]
+        consented = min(consents, default=times[-1])
+        after = times >= struck
+        return Tale(stage, outcome, struck, consented, times[after], joints[after])
+
+
+async def fault_is_over(stage: Stage) -> None:
+    await stage.site.fault("clear")
+
+
+def check_nothing_moved_without_consent(tale: Tale) -> None:
+    still = (tale.times > tale.struck + STANDING * PACE) & (tale.times < tale.consented)
+    shown = f"struck {tale.struck:.1f}, consented {tale.consented:.1f}, {tale.times[0]:.1f} … {tale.times[-1]:.1f}"
+    assert still.sum() > 5, f"too little time between fault and consent to see anything: {shown}"
+    assert np.max(np.ptp(tale.joints[still], axis=0)) < 1e-3
+
+
+def check_never_tilted_again(tale: Tale) -> None:
+    then = tale.tilts[tale.times <= tale.struck + STANDING * PACE].max()
+    assert tale.tilts[tale.times > tale.consented].max(initial=0.0) <= then + math.radians(2.0)
+
+
+LATE = 2.0
+"""The operator takes so long to come [s of the clock]: meanwhile the arm is looked at."""
+
+
+@pytest.mark.parametrize(("name", "phase"), cases(ARM))
+def test_a_fault_of_the_arm(open_stage, name, phase):
+    fault = ARM[name]
+    tale = asyncio.run(
+        tell_tale(open_stage, phase, fault, mend={"recover", "unsafe"}, late={"recover": LATE, "unsafe": LATE})
+    )
+    stage, outcome = tale.stage, tale.outcome
+    assert stage.unsafe == []
+    check_never_tilted_again(tale)
+    if phase == "weigh":
+        # The pour was over: what is asked next invites hands in only once it is seen that nothing can move.
+        assert isinstance(outcome, PourMeasurement), outcome
+        assert outcome.spilled == pytest.approx(stage.things.on_tray, abs=3e-4)
+        assert np.max(np.ptp(tale.joints, axis=0)) < 1e-3
+        return
+    check_nothing_moved_without_consent(tale)
+    recover = next(question for question in stage.operator.heard if question.about == "recover")
+    assert recover.problem, "the operator is told what happened"
+    assert recover.problem in stage.said("error")
+    np.testing.assert_allclose(tale.joints[-1], SPEC.arm.home, atol=0.02)
+    if phase == "approach":
+        assert isinstance(outcome, NotPouredError), outcome
+        assert stage.heard.index("recover") < stage.heard.index("home")
+        assert stage.things.on_tray == 0.0
+        assert "Nothing was poured" in str(outcome)
+        return
+    assert isinstance(outcome, UnknownPourError), outcome
+    assert stage.heard.index("recover") < stage.heard.index("untilt")
+    for key in ("pourer_full", "spilled", "pourer_after"):
+        assert f"weighed, {key}:" in stage.said("note")
+        assert key in str(outcome)
+    loaded = stage.things.in_receiver + stage.things.on_tray + stage.things.in_pourer
+    assert f"{1e3 * loaded:.1f}"[:4] in str(outcome)
+
+
+@pytest.mark.parametrize(("name", "phase"), cases(BALANCE))
+def test_a_fault_of_the_balance(open_stage, name, phase):
+    """Whenever the balance fails, the arm finishes; the weights are taken once it is mended."""
+    tale = asyncio.run(tell_tale(open_stage, phase, BALANCE[name], mend={"balance", "spilled", "pourer_after"}))
+    stage, outcome = tale.stage, tale.outcome
+    assert isinstance(outcome, PourMeasurement), outcome
+    assert "recover" not in stage.heard
+    asked = [q for q in stage.operator.heard if q.problem]
+    assert asked, "the operator is told what is wrong with the balance"
+    assert outcome.spilled == pytest.approx(stage.things.on_tray, abs=3e-4)
+    assert outcome.retained == pytest.approx(stage.things.in_pourer, abs=3e-4)
+
+
+@pytest.mark.parametrize(
+    "phase", ["approach", "tilt", *(pytest.param(p, marks=pytest.mark.slow) for p in ("hold", "return"))]
+)
+@pytest.mark.parametrize("how", ["no", "never"])
+def test_an_operator_who_does_not_want_the_stopped_arm_to_move(open_stage, how, phase):
+    """The arm stays where it was stopped, and what can be weighed without hands is weighed."""
+    tale = asyncio.run(
+        tell_tale(
+            open_stage,
+            phase,
+            ARM["protective stop"],
+            mend=set(),
+            spec={"operator": OperatorSpec(answers="virtual", time=2.0, reminder=6.0, deadline=18.0)},
+            **(
+                {"answers": {"recover": ["no"]}, "late": {"recover": 2.0}}
+                if how == "no"
+                else {"late": {"recover": math.inf}}
+            ),
+        )
+    )
+    still = tale.times > tale.struck + STANDING * PACE
+    assert np.max(np.ptp(tale.joints[still], axis=0)) < 1e-3
+    if phase == "approach":
+        assert isinstance(tale.outcome, NotPouredError)
+        return
+    assert isinstance(tale.outcome, UnknownPourError)
+    assert "pourer_full" in str(tale.outcome)
+    assert "spilled" in str(tale.outcome)
+    assert "What was poured is unknown" in str(tale.outcome)
+
+
+@pytest.mark.parametrize("how", ["no", "never"])
+def test_an_operator_who_leaves_the_balance_as_it_is(open_stage, how):
+    """No weight that was taken is lost, and the spill still lies where it can be weighed."""
+    fault = replace(BALANCE["unplugged"], mend=None)
+    scripted = {"answers": {"balance": ["no"]}} if how == "no" else {"late": {"balance": math.inf}}
+    spec = {"operator": OperatorSpec(answers="virtual", time=2.0, reminder=6.0, deadline=18.0)}
+    tale = asyncio.run(tell_tale(open_stage, "weigh", fault, mend=set(), spec=spec, **scripted))
+    assert isinstance(tale.outcome, UnknownPourError)
+    assert "pourer_full" in str(tale.outcome)
+    assert "weighed, pourer_full:" in tale.stage.said("note")
+
+
+def test_a_balance_that_was_switched_off_during_the_pour_is_not_believed(open_stage):
+    """Its new zero would count the spill as nothing; the operator says that it was off, and the spill is unknown."""
+
+    async def off_and_on(stage: Stage) -> None:
+        await stage.site.order("unplug")
+        await stage.site.order("power cycle")
+
+    async def plug(stage: Stage) -> None:
+        await stage.site.order("plug")
+
+    tale = asyncio.run(
+        tell_tale(open_stage, "weigh", Fault(off_and_on, plug), mend={"balance"}, answers={"reference": ["no"]})
+    )
+    assert "reference" in tale.stage.heard
+    assert isinstance(tale.outcome, UnknownPourError)
+
+
+def test_the_bench_pours_again_after_a_fault_was_mended(open_stage):
+    async def play():
+        seen: list[Any] = []
+        async with open_stage(SPEC) as stage:
+            pour = asyncio.create_task(stage.pour(ACTION_WITH_HOLD, progress=seen.append))
+            await strike_in(stage, "tilt", ARM["protective stop"], seen)
+            with pytest.raises(UnknownPourError):
+                await pour
+            assert isinstance(stage.operator, VirtualOperator)
+            return await stage.pour()
+
+    assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=5e-3)
