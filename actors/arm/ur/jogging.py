@@ -93,10 +93,20 @@ def _check(spec: UrArmSpec, points: FloatArray) -> None:
         if np.abs(positions).max() > most:
             raise ArmRefusedError(f"joint {number} would leave its range")
     rotation, position = forward(points[[0, -1]], model)
-    begin, end = position + rotation @ cell_frames(spec).tool.position
-    # Somebody who stands outside may come back in: only what the step makes worse is refused.
-    if (wrong := outside(end, spec)) and len(wrong) >= len(outside(begin, spec)) and wrong != outside(begin, spec):
-        raise ArmRefusedError(f"the tool would be {wrong[0]}")
+    frames = {"tool": cell_frames(spec).tool.position, "pourer": cell_frames(spec).pourer.position}
+    for thing, place in frames.items():
+        begin, end = position + rotation @ place
+        # Who stands outside may come back in: only what a step makes worse is refused.
+        if np.any(_beyond(end, spec) > np.maximum(_beyond(begin, spec), 0.0) + 1e-9):
+            raise ArmRefusedError(f"the {thing} would be {', '.join(outside(end, spec))}")
+
+
+def _beyond(point: FloatArray, spec: UrArmSpec) -> FloatArray:
+    """How far a point lies beyond each limit [m], negative inside."""
+    limits = spec.limits
+    planes = [plane.offset - float(np.dot(plane.normal, point)) for plane in limits.planes]
+    low, high = np.array(limits.box_low) - point, point - np.array(limits.box_high)
+    return np.concatenate([low, high, planes, [spec.cell.table - point[2]]])
 
 
 def _show(value: float, straight: bool) -> str:
