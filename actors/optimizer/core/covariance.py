@@ -59,7 +59,7 @@ SIGNAL_BOUNDS = (0.05, 6.0)
 NOISE_BOUNDS = (1e-3, 3.0)
 OFFSET_BOUNDS = (1e-3, 3.0)
 RHO_BOUNDS = (-1.0, 2.5)
-GROWTH_BOUNDS = (-4.0, 4.0)
+GROWTH_BOUNDS = (0.0, 4.0)
 
 
 class PriorCovariance(Protocol):

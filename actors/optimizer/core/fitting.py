@@ -54,7 +54,7 @@ def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Seque
 
     def loss(theta: Array) -> tuple[float, Array]:
         z = (theta - covariance.centre) / covariance.deviation
-        value, gradient = _negative_log_likelihood(covariance, residuals, theta)
+        value, gradient = negative_log_likelihood(covariance, residuals, theta)
         return value + 0.5 * float(z @ z), gradient + z / covariance.deviation
 
     best, lowest = np.clip(covariance.centre, bounds[:, 0], bounds[:, 1]), math.inf
@@ -77,7 +77,8 @@ def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Seque
     return Fitted(best, L, alpha, -_value(L, alpha, residuals))
 
 
-def _negative_log_likelihood(covariance: Covariance, residuals: Array, theta: Array) -> tuple[float, Array]:
+def negative_log_likelihood(covariance: Covariance, residuals: Array, theta: Array) -> tuple[float, Array]:
+    """−log p of residuals (n,) at hyperparameters θ (p,), and its gradient (p,)."""
     K, pullback = covariance.observed(theta)
     L, trouble = lapack.dpotrf(K, lower=1)
     if trouble:

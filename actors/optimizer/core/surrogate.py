@@ -127,9 +127,11 @@ class GaussianProcess:
 
 @dataclass(frozen=True)
 class NoiseGrowth:
-    """What the logarithm of the noise may grow with: the expected cost, linearly, and its distance from the middle.
+    """What the logarithm of the noise may grow with: the expected cost, linearly, and its nearness to the middle.
 
-    A cup that surely spills nothing, or all, scatters less than one on the brink.
+    A pour that surely spills nothing scatters least, and one that surely spills all less than one on the brink. The
+    coefficients can't be negative: noise that is larger in the valley was only ever seen to stand for a wall too steep
+    for the kernel.
 
     Attributes:
         process: of the cost, fitted with constant noise.
@@ -144,7 +146,7 @@ class NoiseGrowth:
         """(m, 2) at points (m, dimension), each about −½ … ½."""
         mean = self.process.predict(points)[0]
         z = np.clip((mean - self.low) / max(self.high - self.low, 1e-300), 0.0, 1.0) - 0.5
-        return np.stack([z, 4.0 * z * z - 0.5], axis=1)
+        return np.stack([z, 0.5 - 4.0 * z * z], axis=1)
 
 
 def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior, **terms: Any) -> GaussianProcess:

@@ -1,0 +1,191 @@
+"""What the surrogates make of simulations that are right, off, scaled or wrong, and of noise that varies."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+
+from actors.optimizer.core import fitting
+from actors.optimizer.core.covariance import Covariance, HyperPrior
+from actors.optimizer.core.problem import Data, Linear, SuggestProblem
+from actors.optimizer.core.propose import propose
+from orchestrator.codec import canonical, from_json, to_json
+from sim_engine.space import Axis, Space
+
+PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
+ASK = tuple((x, y) for x in (0.15, 0.4, 0.65, 0.9) for y in (0.1, 0.35, 0.6, 0.85))
+
+
+def points_of(count, seed=0, dimension=2):
+    return np.random.default_rng(seed).random((count, dimension))
+
+
+def data_of(points, costs) -> Data:
+    return Data(tuple(tuple(map(float, p)) for p in points), tuple(map(float, costs)))
+
+
+def cup(points):
+    """Nothing spilled in a valley, all far from it."""
+    radius = np.linalg.norm(np.asarray(points) - (0.35, 0.6), axis=1)
+    return 1.0 - np.exp(-((3.0 * np.maximum(radius - 0.15, 0.0)) ** 1.5))
+
+
+def asked(mean, simulated_costs, *, pours=6, **changes):
+    """A question after 40 simulations and a few pours; the pours are `cup`'s."""
+    simulated, real = points_of(40, 1), points_of(pours, 2)
+    return SuggestProblem(
+        PLANE,
+        data_of(real, cup(real)),
+        mean=mean,
+        simulated=data_of(simulated, simulated_costs(simulated)),
+        **{"count": 0, "predict_at": ASK, **changes},
+    )
+
+
+def error(answer):
+    return float(np.sqrt(np.mean((np.array(answer.predictions) - cup(ASK)) ** 2)))
+
+
+@pytest.mark.parametrize("kind", [{}, {"joint": 1}, {"joint": 1, "scaled": True}, {"growth": 1}])
+def test_the_likelihoods_gradient_is_that_of_the_likelihood(kind):
+    points, costs = points_of(20, 3, 3), np.random.default_rng(4).standard_normal(20)
+    terms = {"scaled": kind.get("scaled", False)}
+    if "joint" in kind:
+        terms["real"] = np.arange(20) >= 13
+    if "growth" in kind:
+        terms["growth"] = points_of(20, 5) - 0.5
+    covariance = Covariance(points, HyperPrior(), **terms)
+    theta = covariance.centre + 0.3 * np.random.default_rng(6).standard_normal(len(covariance.centre))
+    numeric = approx_fprime(theta, lambda t: fitting.negative_log_likelihood(covariance, costs, t)[0], 1e-6)
+    exact = fitting.negative_log_likelihood(covariance, costs, theta)[1]
+    assert exact == pytest.approx(numeric, rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("mean", ["simulated", "pooled", "scaled"])
+def test_a_right_simulation_makes_a_few_pours_worth_many(mean):
+    alone = error(propose(replace(asked(mean, cup), mean="constant")))
+    assert error(propose(asked(mean, cup))) < 0.6 * alone
+
+
+@pytest.mark.parametrize("mean", ["simulated", "pooled", "scaled"])
+def test_a_simulation_that_is_off_by_a_constant_is_corrected(mean):
+    answer = propose(asked(mean, lambda p: cup(p) + 0.4))
+    assert error(answer) < 0.15
+    if mean != "simulated":
+        assert answer.hyperparameters["offset"] > 0.15
+
+
+def test_a_simulation_that_spills_half_as_much_is_scaled():
+    answer = propose(asked("scaled", lambda p: 0.4 * cup(p), pours=10))
+    assert answer.hyperparameters["rho"] > 1.6
+    assert error(answer) < 0.12
+
+
+def test_a_simulation_that_is_the_wrong_way_round_gets_a_negative_scale():
+    answer = propose(asked("scaled", lambda p: 1.0 - cup(p), pours=14))
+    assert answer.hyperparameters["rho"] < 0.0
+    assert error(answer) < error(propose(asked("simulated", lambda p: 1.0 - cup(p), pours=14)))
+
+
+def test_pooled_simulations_that_contradict_the_pours_are_taken_for_noisy():
+    def unrelated(points):
+        return np.random.default_rng(7).random(len(points))
+
+    agreeing = propose(asked("pooled", cup, pours=12)).hyperparameters["simulated_noise"]
+    doubted = propose(asked("pooled", unrelated, pours=12)).hyperparameters["simulated_noise"]
+    assert doubted > 5 * agreeing
+
+
+@pytest.mark.parametrize("mean", ["pooled", "scaled"])
+def test_before_the_first_pour_simulations_alone_are_believed_with_more_doubt(mean):
+    question = replace(asked(mean, cup), data=Data())
+    joint, alone = propose(question), propose(replace(question, mean="simulated"))
+    assert joint.predictions == pytest.approx(alone.predictions, abs=0.15)
+    assert min(joint.prediction_deviations) > max(0.05, min(alone.prediction_deviations))
+    first = propose(replace(question, count=1, acquisition="posterior_minimum")).points[0]
+    assert math.dist(first, (0.35, 0.6)) < 0.2
+    assert propose(replace(question, simulated=Data())).predictions == ()
+
+
+@pytest.mark.parametrize("mean", ["pooled", "scaled"])
+@pytest.mark.parametrize(("simulated", "pours"), [(2, 0), (2, 1), (3, 5), (0, 2), (1, 3), (0, 0)])
+def test_any_few_simulations_and_pours_are_enough_for_an_answer(mean, simulated, pours):
+    cheap, dear = points_of(simulated, 1), points_of(pours, 2)
+    problem = SuggestProblem(PLANE, data_of(dear, cup(dear)), mean=mean, simulated=data_of(cheap, cup(cheap)), count=2)
+    answer = propose(problem)
+    assert len(answer.points) == 2
+    assert all(map(math.isfinite, (*answer.means, *answer.deviations, *answer.noises)))
+
+
+@pytest.mark.parametrize("mean", ["simulated", "pooled", "scaled"])
+def test_the_best_point_is_one_that_was_poured(mean):
+    problem = asked(mean, cup)
+    assert propose(problem).best_point in problem.data.points
+
+
+# -- noise ---------------------------------------------------------------------------------------------------------
+
+
+def scattered(count, deviation, seed):
+    """Pours that scatter by deviation(cost)."""
+    points = points_of(count, seed)
+    costs = cup(points)
+    return data_of(points, costs + deviation(costs) * np.random.default_rng(seed + 100).standard_normal(count))
+
+
+def test_where_the_pours_show_it_noise_grows_with_what_is_spilled():
+    data = scattered(90, lambda cost: 0.01 + 0.2 * cost, 2)
+    varying = propose(SuggestProblem(PLANE, data, noise="varying", acquisition="posterior_minimum"))
+    constant = propose(SuggestProblem(PLANE, data, acquisition="posterior_minimum"))
+    assert varying.noises[0] < 0.04  # 0.01 in truth, in the valley
+    assert constant.noises[0] > 0.08
+    assert varying.hyperparameters["noise"] < constant.hyperparameters["noise"] * 1.5
+
+
+@pytest.mark.parametrize("deviation", [0.08, 0.005])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_that_is_the_same_everywhere_stays_so(deviation, seed):
+    data = scattered(50, lambda cost: deviation, seed)
+    varying = propose(SuggestProblem(PLANE, data, noise="varying"))
+    constant = propose(SuggestProblem(PLANE, data))
+    assert (varying.points, varying.noises) == (constant.points, constant.noises)
+
+
+def test_a_few_pours_cannot_tell_and_noise_stays_constant():
+    data = scattered(12, lambda cost: 0.01 + 0.3 * cost, 4)
+    assert propose(SuggestProblem(PLANE, data, noise="varying")).points == propose(SuggestProblem(PLANE, data)).points
+
+
+def test_around_simulations_the_pours_noise_may_vary_too():
+    data = scattered(60, lambda cost: 0.01 + 0.3 * cost, 5)
+    simulated = data_of(points_of(30, 9), cup(points_of(30, 9)))
+    for mean in ("simulated", "pooled", "scaled"):
+        problem = SuggestProblem(PLANE, data, mean=mean, simulated=simulated, acquisition="posterior_minimum")
+        varying, constant = propose(replace(problem, noise="varying")), propose(problem)
+        assert varying.noises[0] < 0.6 * constant.noises[0], mean
+
+
+# -- travelling ----------------------------------------------------------------------------------------------------
+
+
+def test_a_question_of_an_earlier_journal_is_still_read():
+    problem = SuggestProblem(PLANE, data_of(points_of(3), (0.1, 0.2, 0.3)))
+    written = json.loads(canonical(to_json(problem, SuggestProblem)))
+    for newer in ("infeasible", "constraints", "noise"):
+        del written[newer]
+    assert from_json(written, SuggestProblem) == problem
+
+
+def test_a_question_with_everything_in_it_survives_the_journal():
+    problem = SuggestProblem(
+        PLANE,
+        data_of(points_of(3), (0.1, 0.2, 0.3)),
+        mean="scaled",
+        infeasible=((0.5, 0.6),),
+        constraints=(Linear((("x", 1.0), ("y", -2.0)), 0.5),),
+        noise="varying",
+    )
+    assert from_json(json.loads(canonical(to_json(problem, SuggestProblem))), SuggestProblem) == problem
