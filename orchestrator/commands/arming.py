@@ -67,6 +67,7 @@ class Envelope:
             low=(float(low[0]), float(low[1]), float(low[2])),
             high=(float(high[0]), float(high[1]), float(high[2])),
             duration=max(r.duration for r in self.reports),
+            deviation=max(r.deviation for r in self.reports),
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from actors.arm.spec import Pose, UrArmSpec
-from actors.arm.survey import PORTS, Exchange, RobotState
+from actors.arm.survey import PORTS, SCRIPTS, Exchange, RobotState
 from orchestrator.commands.doctor_look import Check, Findings, State
 from orchestrator.safety import SafetyRecord
 
@@ -76,7 +76,9 @@ def _ports(found: Findings) -> list[Check]:
             f"on PolyScope 5.10 or later enable the service '{name}' under Settings, Security, Services; else look for "
             "a firewall between"
         )
-        state: State = "ok" if reason is None else "fail"
+        state: State = "ok" if reason is None else "warn" if port == SCRIPTS else "fail"
+        if port == SCRIPTS:
+            advice = "programs go to the primary interface; other tools may want this one"
         checks.append(Check(f"port {port}", state, f"{name}: {reason or 'open'}", "" if reason is None else advice))
     return checks
 

@@ -257,7 +257,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     from orchestrator.strategies.one_pour import OnePour
 
     plan = dataclasses.replace(
-        chosen.plan,
+        _only(chosen),
         name=f"{chosen.plan.name}-pour",
         outputs=dataclasses.replace(chosen.plan.outputs, figures=False),
     )
@@ -281,6 +281,15 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         print_json({"run": str(directory), "mode": plan.laboratory.mode, "action": chosen.action.values(), **result})
     else:
         print(told(result))
+
+
+def _only(chosen: Chosen) -> CampaignPlan:
+    """The campaign without everything that this pour isn't of."""
+    plan = chosen.plan
+    if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
+        deployment = dataclasses.replace(plan.deployment, scenes=(chosen.scene,), pours=1)
+        return dataclasses.replace(plan, calibration=None, deployment=deployment)
+    return dataclasses.replace(plan, deployment=None)
 
 
 def told(result: dict[str, Any]) -> str:

@@ -138,7 +138,7 @@ def test_envelope_covers_the_actions_of_the_campaign_and_grows_with_them(campaig
     assert low.worst.tilt == pytest.approx(radians(110.0), abs=1e-3)
     assert not low.refused
     high = worst(hardware.CAMPAIGN.replace("height: 60 mm", "height: 200 mm"))
-    assert high.worst.high[2] == pytest.approx(low.worst.high[2] + 0.14, abs=5e-3)
+    assert low.worst.high[2] + 0.05 < high.worst.high[2] < low.worst.high[2] + 0.15
 
 
 def test_limits_of_the_laboratory_refuse_a_campaign_that_would_break_all_of_them(campaign: Path) -> None:
