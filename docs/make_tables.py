@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.config import campaign, cluster, laboratory, vessel
+from orchestrator.config import arm_sections, campaign, cluster, laboratory, operator, vessel
 from orchestrator.config.quantities import Quantity
 from orchestrator.config.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.scenes import DEFAULTS, NEEDED
@@ -47,6 +47,10 @@ SECTIONS: dict[str, type[Section]] = {
     "profile": vessel.ProfileSection,
     "laboratory": laboratory.LaboratoryFile,
     "ray": cluster.RaySection,
+    "arm": arm_sections.ArmSection,
+    "limits": arm_sections.LimitsSection,
+    "cell": arm_sections.CellSection,
+    "operator": operator.OperatorSection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
     "pose-error": laboratory.PoseErrorSection,
@@ -55,6 +59,17 @@ SECTIONS: dict[str, type[Section]] = {
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BalanceSection": "[balance](#bench)",
+    "ArmSection": "[arm](#arm-and-cell)",
+    "CellSection": "[cell](#arm-and-cell)",
+    "LimitsSection": "[limits](#arm-and-cell)",
+    "BoxSection": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
+    "PlaneSection": "`{normal: [x, y, z], offset: length}`",
+    "PointSection": "`{x, y, z}`, lengths",
+    "CentreSection": "`{x, y, z}`, lengths",
+    "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
+    "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
+    "BalanceDeviceSection": "[balance](balances.md#settings)",
+    "OperatorSection": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
     "PoseErrorSection": "[pose error](#bench)",
     "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
@@ -182,7 +197,7 @@ def _default(key: str, info: FieldInfo, model: type[Section]) -> str:
     if key in model.required:
         return "must be given"
     value = info.get_default()
-    if value is None or value is PydanticUndefined or isinstance(value, Section):
+    if value is None or value is PydanticUndefined or value == () or isinstance(value, Section):
         return ""
     quantity = next((m for m in info.metadata if isinstance(m, Quantity)), None)
     if quantity is not None and quantity.unit != "1":
@@ -197,7 +212,7 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         words = "".join(f" or `{word}`" for word in quantity.words)
         bounds = f"number, {quantity.bounds()}" if quantity.unit == "1" else quantity.bounds()
         if quantity.positive:
-            bounds = f"above 0, up to {bounds.removesuffix(' and less')}"
+            bounds = f"above 0, up to {bounds.removesuffix(' and less').removeprefix('0 … ')}"
         return bounds + words
     origin = typing.get_origin(annotation)
     if origin is typing.Annotated:
@@ -212,7 +227,10 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     if origin is list:
         return f"list of: {_value(typing.get_args(annotation)[0])}"
     if origin is tuple:
-        return "list of `[r, z]`"
+        inner = typing.get_args(annotation)
+        if isinstance(inner[0], type) and issubclass(inner[0], Section):
+            return f"list of: {_value(inner[0])}"
+        return "`[x, y, z]`" if len(inner) == 3 else "list of `[r, z]`"
     if origin is dict:
         return "mapping"
     if isinstance(annotation, type) and issubclass(annotation, Section):

@@ -34,8 +34,6 @@ def resolve_arm(
     before = len(report.problems)
     at = place.at("arm")
     _check_address(arm, at, report, mode)
-    if mode == "hardware" and "time_scale" in arm.model_fields_set:
-        report.add(at.at("time_scale"), "a robot's seconds are the clock's; remove the key")
     if arm.model is not None and arm.rate > MODELS[arm.model].frequency:
         fastest = MODELS[arm.model].frequency
         report.add(at.at("rate"), f"a {arm.model} answers at most {fastest} times a second; write '{fastest} Hz'")
@@ -68,7 +66,6 @@ def resolve_arm(
         untilt_speed=arm.untilt_speed,
         announcement=arm.announcement,
         rate=arm.rate,
-        time_scale=arm.time_scale,
     )
     if len(report.problems) > before:
         return None
@@ -170,8 +167,6 @@ def arm_as_file(spec: UrArmSpec) -> dict[str, Any]:
         "untilt_speed": format_quantity(spec.untilt_speed, "rad/s", "deg/s"),
         "announcement": format_quantity(spec.announcement, "s", "s"),
         "rate": format_quantity(spec.rate, "1/s", "Hz"),
-        # a robot's seconds are the clock's: its file has no such key
-        **({} if spec.time_scale == 1.0 else {"time_scale": spec.time_scale}),
     }
     cell = {
         "receiver": _point_as_file(spec.cell.receiver),

@@ -207,9 +207,6 @@ class ArmSection(Section):
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = _ARM.rate
     """At which the joints are read back."""
 
-    time_scale: Annotated[float, Quantity("1", "10", 1.0, 1000.0)] = _ARM.time_scale
-    """Seconds of a virtual arm per second of the clock."""
-
 
 class CellSection(Section):
     """What stands where around the arm."""

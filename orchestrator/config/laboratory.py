@@ -239,8 +239,6 @@ def _check_wires(section: LaboratoryFile, place: Place, report: Report) -> None:
             report.add(place, "a virtual arm pours a hidden liquid; add 'bench: {liquid: {…}}', or 'mode: hardware'")
         return
     at, bench = place.at("bench"), section.bench
-    if "time_scale" in section.arm.model_fields_set:
-        report.add(place.at("arm", "time_scale"), "one clock is enough: write 'time_scale' in the section 'bench'")
     for key, other in (("balance", "the section 'balance'"), ("operator_time", "'time' in the section 'operator'")):
         if key in bench.model_fields_set:
             report.add(at.at(key), f"is of a bench without wires; with an arm write it into {other}")
@@ -315,7 +313,7 @@ def _wires_as_file(arm: UrArmSpec | None, spec: LaboratorySpec) -> dict[str, obj
     if arm is None:
         return {}
     return {
-        **arm_as_file(replace(arm, time_scale=1.0)),
+        **arm_as_file(arm),
         **({} if spec.balance is None else {"balance": balance_as_file(spec.balance)}),
         "operator": operator_as_file(spec.operator, mode=spec.mode),
     }

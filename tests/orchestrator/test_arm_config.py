@@ -89,16 +89,10 @@ def test_every_key_reaches_the_arm():
     assert (cell.receiver, cell.direction, cell.table) == ((0.75, 0.0, 0.06), pytest.approx(deg(90)), -0.01)
 
 
-def test_a_virtual_arm_may_run_faster_than_the_clock():
-    assert load(VIRTUAL).time_scale == 1.0
-    assert load(VIRTUAL.replace("payload:", "time_scale: 20\n  payload:")).time_scale == 20.0
-
-
 @pytest.mark.parametrize(
     ("text", "mode"),
     [
         (VIRTUAL, "virtual"),
-        (VIRTUAL.replace("payload:", "time_scale: 20\n  payload:"), "virtual"),
         (FULL, "hardware"),
         (FULL.replace("[0, -2, 0]", "[0.1, -2, 0.3]"), "hardware"),
     ],
@@ -124,7 +118,7 @@ CASES = [
     (changed("192.168.0.10", "192.168.0.10:30004", HARDWARE), "hardware", r"neither an IPv4 address nor a host name"),
     (changed("192.168.0.10", "192.168.0.300", HARDWARE), "hardware", r"'192.168.0.300' is neither an IPv4 address"),
     (changed("192.168.0.10", "http://ur", HARDWARE), "hardware", r"'http://ur' is neither"),
-    (changed("payload:", "time_scale: 2\n  payload:", HARDWARE), "hardware", r"a robot's seconds are the clock's"),
+    (changed("payload:", "time_scale: 2\n  payload:", HARDWARE), "hardware", r"arm.time_scale: unknown key"),
     (changed("model: ur10e", "model: ur5"), "virtual", r"'ur5' is not known here"),
     (changed("  payload: 1.6 kg\n", ""), "virtual", r"key 'payload' is missing; add for example 'payload: 1.5 kg'"),
     (changed("1.6 kg", "1.6"), "virtual", r"1.6 has no unit; write '1.6 kg'"),
