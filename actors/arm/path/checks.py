@@ -48,11 +48,12 @@ def check_clearance(stretch: Stretch, until: float, pourer: Vessel, receiver: Ve
     if nearest.distance >= least:
         return nearest, []
     tilt = math.degrees(float(stretch.tilts[nearest.index]))
-    how = (
-        f"would come within {1e3 * nearest.distance:.1f} mm of the receiver"
-        if nearest.distance > 0.0
-        else f"would run {-1e3 * nearest.distance:.1f} mm into the receiver"
-    )
+    apart = 1e3 * nearest.distance
+    how = "would touch the receiver"
+    if apart >= 0.05:
+        how = f"would come within {apart:.1f} mm of the receiver"
+    elif apart <= -0.05:
+        how = f"would run {-apart:.1f} mm into the receiver"
     return nearest, [
         f"the pourer {how} at a tilt of {tilt:.0f} deg, {stretch.when(nearest.index)}; "
         f"{1e3 * least:.0f} mm have to stay free: a larger x_offset or height clears it"

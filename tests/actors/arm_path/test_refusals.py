@@ -142,6 +142,7 @@ def test_vessels_that_would_touch_or_come_too_near():
     assert "the pourer would come within 2.0 mm of the receiver at a tilt of 0 deg, at the approach's end" in near
     assert "a larger x_offset or height clears it" in near
     assert near.count("come within") == 1
+    assert "the pourer would touch the receiver at a tilt of 0 deg" in refusal(action=ACTION.with_values(x_offset=0.08))
     through = refusal(action=ACTION.with_values(height=0.01), pivot=Pivot("point", 0.0, 0.05))
     assert "mm into the receiver at a tilt of" in through
     assert "into the tilt" in through
@@ -181,7 +182,7 @@ def test_all_that_is_wrong_comes_at_once():
     spec = limited(tilt=100 * DEG, tilt_speed=80 * DEG, joint_speed=50 * DEG, tool_speed=0.1)
     text = refusal(spec, ACTION.with_values(x_offset=0.08))
     assert text.startswith("the arm can't make this pour:\n  - ")
-    for said in ("lean 110", "turn at 90 deg/s", "joint 6", "would move at", "of the receiver"):
+    for said in ("lean 110", "turn at 90 deg/s", "joint 6", "would move at", "the receiver at a tilt"):
         assert said in text
 
 
