@@ -11,6 +11,7 @@ import numpy as np
 
 from actors.bench.things import Things
 from actors.operator import Operator, Question
+from actors.protocols import LaboratoryError
 
 SCATTER = 1e-3
 """Standard deviation of a filling by hand [kg]."""
@@ -34,6 +35,9 @@ SHARES = {
 
 GLANCE = 0.02
 """Share of the time for one pour that an answer without work takes."""
+
+PERSISTENCE = 12
+"""After so many questions in a row about problems it says no: nobody would watch it say yes."""
 
 Put = Callable[[float], Awaitable[None]]
 """Puts a mass [kg] on the virtual balance, in place of what was there."""
@@ -69,7 +73,7 @@ class Hands:
 
 
 class VirtualOperator:
-    """See `actors.operator.Operator`.
+    """See `actors.operator.Operator`. Mends what it is told of, but not for ever: see `PERSISTENCE`.
 
     Args:
         hands: that it works with.
@@ -80,6 +84,7 @@ class VirtualOperator:
         self._hands, self._time = hands, time
         self._late: dict[str, float] = {}
         self._answers: dict[str, list[str]] = {}
+        self._again = 0
         self.heard: list[Question] = []
         self.told: list[str] = []
 
@@ -97,6 +102,7 @@ class VirtualOperator:
         """See `Operator.ask`."""
         self.heard.append(question)
         about = question.about
+        self._again = self._again + 1 if question.problem else 0
         late = self._late.pop(about, 0.0)
         if math.isinf(late):
             await asyncio.Event().wait()
@@ -105,6 +111,10 @@ class VirtualOperator:
         scripted = self._answers.get(about)
         if scripted:
             return scripted.pop(0)
+        if self._again > PERSISTENCE:
+            if question.wants == "yes or no":
+                return "no"
+            raise LaboratoryError(f"the virtual operator gives up: {question.problem}")
         await self._hands.do(question)
         match question.wants:
             case "weight":

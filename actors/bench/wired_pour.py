@@ -39,6 +39,7 @@ from actors.bench.wired_words import (
 from actors.device import DeviceLostError
 from actors.operator import Question
 from actors.protocols import (
+    BenchLostError,
     InvalidActionError,
     LaboratoryError,
     Notice,
@@ -226,6 +227,8 @@ class WiredPour:
                     await self._rooms.arm.ready()
                 await self._rooms.arm.hands_in()
                 return
+            except BenchLostError:
+                raise
             except _STUCK as error:
                 if not problem:
                     problem = str(error)  # the connection may be made anew without anybody's help
@@ -285,11 +288,15 @@ class WiredPour:
         Raises:
             RefusedError: they would rather leave it as it is.
         """
+        if isinstance(error, BenchLostError):
+            raise error  # nobody can mend it from here
         self._rooms.tell(Notice("error", str(error)))
         problem = str(error)
         while await self._agreed(stopped_question(error, problem, begun=self._begun)):
             try:
                 done = await self._rooms.arm.recover()
+            except BenchLostError:
+                raise
             except _STUCK as again:
                 problem = str(again)
                 continue
