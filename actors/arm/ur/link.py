@@ -32,6 +32,9 @@ PROBE_TIME = 2.0
 CONSTRUCTION_TIME = 5.0
 """After which a constructor that doesn't come back ends the process [s]: it holds the interpreter."""
 
+ATTEMPTS, BETWEEN_ATTEMPTS = 3, 0.4
+"""A controller may take a moment to notice that the connection before was cut [s]."""
+
 AT_REST = 8.0
 """Patience with silence while nothing moves: a controller may be taking in a program."""
 
@@ -69,12 +72,16 @@ class Link:
                 "refused",
                 f"the arm needs ur-rtde, which is missing here ({error}); it has no wheel for Python 3.13 yet",
             ) from None
-        try:
-            with _bounded(CONSTRUCTION_TIME):
-                self._receive: Any = RTDEReceiveInterface(address, rate, _VARIABLES)
-                self._io: Any = RTDEIOInterface(address)
-        except (RuntimeError, ValueError) as error:
-            raise TroubleError("lost", f"{address}: {error}") from None
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                with _bounded(CONSTRUCTION_TIME):
+                    self._receive: Any = RTDEReceiveInterface(address, rate, _VARIABLES)
+                    self._io: Any = RTDEIOInterface(address)
+                break
+            except (RuntimeError, ValueError) as error:
+                if attempt == ATTEMPTS:
+                    raise TroubleError("lost", f"{address}: {error}") from None
+                time.sleep(BETWEEN_ATTEMPTS)
         self._silence = silence
         self._writing = threading.Lock()
         self._last: Reading | None = None
