@@ -24,7 +24,10 @@ _MACHINE = ("simulators", "in_process", "object_store_mb", "ray", "operator", "a
 _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "handshake", "reconnect_time")}
 """Of its parts: a controller may get another address, a balance another socket."""
 
-_YOUNGER: dict[str, dict[str, Any]] = {"calibration": {"grid": {}, "thetas": 0}, "deployment": {"data": None}}
+_YOUNGER: dict[str, dict[str, Any]] = {
+    "calibration": {"grid": {}, "thetas": 0},
+    "deployment": {"data": None, "objectives": None},
+}
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from actors.spec import LaboratorySpec
+from orchestrator.strategies.objectives import Objectives
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, Loss
@@ -134,6 +135,7 @@ class DeploymentPlan:
         initial: actions drawn evenly before the surrogate takes over.
         on_failed_pour: how a failed pour enters the data.
         data: D2, D3: pours of before the campaign.
+        objectives: what is minimised in place of the loss.
     """
 
     strategy: DeploymentName
@@ -150,6 +152,12 @@ class DeploymentPlan:
     initial: int = 3
     on_failed_pour: Literal["penalise", "ignore"] = "penalise"
     data: ExistingPours | None = None
+    objectives: Objectives | None = None
+
+    @property
+    def loss_name(self) -> str:
+        """What results call that which is minimised."""
+        return self.loss.name if self.objectives is None else "objectives"
 
 
 @dataclass(frozen=True)

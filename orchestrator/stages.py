@@ -17,6 +17,7 @@ from orchestrator.strategies.calibration_c1 import UniformGrid
 from orchestrator.strategies.calibration_c2 import StratifiedSampling
 from orchestrator.strategies.calibration_c3 import BayesianCalibration
 from orchestrator.strategies.calibration_c4 import ContinuousBayesianCalibration
+from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.deployment import Deployment
 from orchestrator.strategies.deployment_d1 import OneShotPlanning
 from orchestrator.strategies.deployment_d2 import RealOnly
@@ -154,7 +155,8 @@ def prediction_stages(plan: CampaignPlan, deployment: DeploymentPlan, seeds: int
         def build(results: Results, seed: int) -> Strategy:
             values = results[DEPLOYMENT + name].get("action_si")
             action = None if values is None else scene.action(dict(values))
-            return RepeatedSimulation(scene, action, _theta(plan, results), deployment.loss, seeds, seed)
+            costing = Costing.of(deployment, scene, _theta(plan, results))
+            return RepeatedSimulation(costing, action, seeds, seed)
 
         return build
 

@@ -140,7 +140,7 @@ def plan_pour(
                 "predicted_spillage_deviation": spillage.get("deviation"),
                 "predicted_deviation": result["predicted_deviation"],
                 "prediction": repeated,
-                "loss": plan.deployment.loss.name,
+                "loss": plan.deployment.loss_name,
                 "not_covered": finished.summary["receivers"][result["scene"]]["not_covered"],
             }
         )

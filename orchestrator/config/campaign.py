@@ -13,6 +13,7 @@ from orchestrator.config.motion import Parameters as ParametersModel
 from orchestrator.config.quantities import Quantity
 from orchestrator.config.sections import Count, Name, PathOr, PositiveCount, Section, Switch, Text
 from orchestrator.config.vessel import LiquidFile, VesselFile
+from orchestrator.strategies.objectives import ObjectiveName
 from sim_engine.losses import LossName
 
 # Built at import from the declarations in sim_engine; a type checker sees them as Any.
@@ -144,6 +145,27 @@ class LossSection(Section):
     """w; 1 unless given."""
 
 
+class ObjectiveSection(Section):
+    """One of several things wanted of a pour."""
+
+    required: ClassVar[dict[str, str]] = {"name": "spillage"}
+
+    name: ObjectiveName | None = None
+    """spillage and retained: shares of the load; time: duration of the motion; target_volume: pour so much and stop."""
+
+    weight: Annotated[float, Quantity("1", "1.0", 1e-6, 1e6)] = 1.0
+    """In the weighted sum."""
+
+    scale: Annotated[float, Quantity("s", "10 s", 0.01, 3600.0)] | None = None
+    """Of time: a duration that is as bad as spilling everything; 10 s unless given."""
+
+    volume: Annotated[float, Quantity("m^3", "150 mL", 1e-7, 0.1)] | None = None
+    """Of target_volume: what should be poured."""
+
+    tolerance: Annotated[float, Quantity("m^3", "2 mL", 0.0, 0.1)] | None = None
+    """Of target_volume: by how much it may be missed; nothing unless given."""
+
+
 class DeploymentSection(Section):
     """How to pour into vessels that calibration never saw."""
 
@@ -169,6 +191,15 @@ class DeploymentSection(Section):
 
     loss: LossSection = LossSection()
     """What is minimised."""
+
+    objectives: list[ObjectiveSection] | None = None
+    """Several things wanted at once, in place of a loss."""
+
+    pareto: Switch | None = None
+    """Look for all compromises between the objectives that nothing beats; the weights then choose one of them."""
+
+    floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
+    """Share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless given."""
 
     pours: Count | None = None
     """Real pours per receiver; D1: 1 unless given, 0 only plans."""

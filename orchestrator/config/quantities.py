@@ -47,7 +47,7 @@ percent = 0.01 = %
 """What a pouring laboratory needs; a short list loads in milliseconds and has no surprising members."""
 
 FAMILIAR_UNITS = ("mm", "cm", "m", "in", "deg", "rad", "deg/s", "rad/s", "rpm", "deg/s^2", "rad/s^2", "s", "min", "ms",
-                  "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s", "cP", "1/s", "Hz",
+                  "mL", "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s", "cP", "1/s", "Hz",
                   "MB")  # fmt: skip
 
 KINDS = {

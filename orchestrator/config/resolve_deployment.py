@@ -5,6 +5,7 @@ from __future__ import annotations
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign import DeploymentSection
 from orchestrator.config.resolve_data import resolve_data
+from orchestrator.config.resolve_objectives import resolve_objectives
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place
 from orchestrator.plan import DeploymentPlan
@@ -64,6 +65,7 @@ def resolve_deployment(
     complete = tuple(scene for scene in scenes if scene is not None)
     if len(complete) < len(receivers) or actions is None or strategy is None or pours is None:
         return None
+    objectives = resolve_objectives(section, place, complete[0], actions, report)
     data = None
     if section.data is not None and strategy in BELONGS_TO["data"]:
         data = resolve_data(section.data, place.at("data"), complete, actions, laboratory, report)
@@ -83,4 +85,5 @@ def resolve_deployment(
         initial=section.initial,
         on_failed_pour=section.on_failed_pour,
         data=data,
+        objectives=objectives,
     )

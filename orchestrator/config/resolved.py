@@ -9,6 +9,7 @@ from orchestrator.config.motion import fixed_as_file, space_as_file, value_as_fi
 from orchestrator.config.vessel import liquid_as_file, vessel_as_file
 from orchestrator.journal import JOURNAL_NAME
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, ExistingPours
+from orchestrator.strategies.objectives import Objectives
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
@@ -127,6 +128,9 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
         "initial": plan.initial,
         "on_failed_pour": plan.on_failed_pour,
     }
+    if plan.objectives is not None:
+        del table["loss"]
+        table |= _objectives(plan.objectives)
     if plan.data is not None:
         table["data"] = _data(plan.data, plan)
     match plan.strategy:
@@ -148,3 +152,15 @@ def _data(data: ExistingPours, plan: DeploymentPlan) -> dict[str, object]:
     if data.lip_radius is not None:
         table["lip_radius"] = f"{data.lip_radius!r} m"
     return table | ({"columns": dict(data.columns)} if data.columns else {})
+
+
+def _objectives(objectives: Objectives) -> dict[str, object]:
+    parts = []
+    for part in objectives.parts:
+        row: dict[str, object] = {"name": part.name, "weight": part.weight}
+        if part.name == "time":
+            row["scale"] = f"{part.scale!r} s"
+        if part.name == "target_volume":
+            row |= {"volume": f"{part.volume!r} m^3", "tolerance": f"{part.tolerance!r} m^3"}
+        parts.append(row)
+    return {"objectives": parts, "pareto": objectives.pareto, "floor": objectives.floor}

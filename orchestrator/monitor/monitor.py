@@ -29,9 +29,9 @@ from orchestrator.report.style import safe_name
 from orchestrator.report.units import (
     DISCREPANCY,
     at_least_nothing,
+    deployment_unit,
     is_calibration,
     loss_of_pour,
-    loss_unit,
     unit_of_pour,
 )
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated, Suggest, Suggested
@@ -67,7 +67,7 @@ class RerunMonitor:
     def __init__(self, path: Path, plan: CampaignPlan, *, capacity: int = CAPACITY) -> None:
         self.path = free_path(path)
         scenes = plan.deployment.scenes if plan.deployment is not None else ()
-        unit = loss_unit(plan.deployment.loss) if plan.deployment is not None else DISCREPANCY
+        unit = deployment_unit(plan.deployment) if plan.deployment is not None else DISCREPANCY
         names = receiver_names(plan)
         receivers = {scene.name: names[scene.name] for scene in scenes}
         streams = Streams(self.path, name=plan.name, receivers=receivers, loss_label=unit.label)
@@ -290,7 +290,7 @@ class _Translator:
         acting = problem.space.names[0] in ACTION_DIMENSIONS
         scene = self._scene_of_stage.get(event.stage)
         place = f"/maps/{safe_name(scene)}" if acting and scene is not None else "/maps/calibration"
-        unit = loss_unit(self._plan.deployment.loss) if acting and self._plan.deployment else DISCREPANCY
+        unit = deployment_unit(self._plan.deployment) if acting and self._plan.deployment else DISCREPANCY
         said = self.streams.surrogate(place, problem.space, suggestion.surrogate, problem.data.points, unit.factor)
         self._about[f"map {self._name(scene) if acting and scene is not None else 'calibration'}"] = (
             f"{unit.label}: {said}"

@@ -21,7 +21,7 @@ from orchestrator.report.results import (
     pour_series,
 )
 from orchestrator.report.style import safe_name
-from orchestrator.report.units import loss_unit
+from orchestrator.report.units import deployment_unit
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def draw_figures(
             directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the scale: {plan.name}"
         )
     if plan.deployment is not None:
-        unit = loss_unit(plan.deployment.loss)
+        unit = deployment_unit(plan.deployment)
         if series := pour_series(plan, results, unit):
             jobs["spillage against pours"] = lambda: draw_spillage(
                 directory / "spillage.png", series, cost=unit.label, title=f"Spillage against pours: {plan.name}"

@@ -14,7 +14,7 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries
 from orchestrator.report.maps import SurrogatePicture
 from orchestrator.report.names import receiver_name
-from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, loss_unit
+from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]
@@ -124,7 +124,7 @@ def deployment_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture |
     """The loss over actions with the pours numbered; None before anything was learnt."""
     if plan.deployment is None:
         return None
-    unit = loss_unit(plan.deployment.loss)
+    unit = deployment_unit(plan.deployment)
     pours = weighed(result)
     mean, deviation = _grids(result, unit)
     if not pours and mean is None:

@@ -21,7 +21,7 @@ from orchestrator.report.results import (
     predictions_of,
     weighed,
 )
-from orchestrator.report.units import DISCREPANCY, LossUnit, loss_unit
+from orchestrator.report.units import DISCREPANCY, LossUnit, deployment_unit
 from sim_engine.spread import Spread
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def summarise(
         "predicted_discrepancy": None if calibration is None else calibration.get("predicted_discrepancy"),
         "predicted_deviation": None if calibration is None else calibration.get("predicted_deviation"),
         "discrepancy": _discrepancies(evaluation_of(results), baselines or {}),
-        "loss": None if plan.deployment is None else plan.deployment.loss.name,
+        "loss": None if plan.deployment is None else plan.deployment.loss_name,
         "receivers": {
             scene: {
                 "receiver": names.get(scene, scene),
@@ -135,6 +135,7 @@ def _receiver(result: Result) -> dict[str, Any]:
         "predicted_spillage_deviation": result.get("predicted_spillage_deviation"),
         "untrustworthy_simulation": bool(result.get("trust", {}).get("alarm", False)),
         "gave_up": result.get("gave_up"),
+        **({"front": result["front"]} if "front" in result else {}),
     }
 
 
@@ -166,7 +167,7 @@ def summary_table(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableT
     if plan.deployment is not None:
         known = [row for row in summary["receivers"].values() if _has_numbers(row[key] for key in _LOSSES)]
         if known:
-            parts.append(_receiver_table(known, loss_unit(plan.deployment.loss)))
+            parts.append(_receiver_table(known, deployment_unit(plan.deployment)))
         parts += _remarks(summary["receivers"].values())
     files = [*summary["figures"].items(), *([("recording", summary["recording"])] if summary["recording"] else [])]
     if files:

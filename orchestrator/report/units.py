@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from orchestrator.plan import CampaignPlan
+from orchestrator.plan import CampaignPlan, DeploymentPlan
 from orchestrator.requests import Pour, Prediction
+from orchestrator.strategies.costs import Costing
 from sim_engine.losses import Loss, normalised_spillage
 from sim_engine.outcome import PourMeasurement
 
@@ -67,6 +68,14 @@ def loss_unit(loss: Loss) -> LossUnit:
             return LossUnit("spilled [particles]", "particles", 1.0)
 
 
+def deployment_unit(plan: DeploymentPlan) -> LossUnit:
+    """How to show what a deployment minimises, a loss or a weighted sum of objectives."""
+    if plan.objectives is None:
+        return loss_unit(plan.loss)
+    weights = [(part.weight, part.name.replace("_", " ")) for part in plan.objectives.parts]
+    return LossUnit(f"{' + '.join(n if w == 1.0 else f'{w:g} × {n}' for w, n in weights)} [%]", "%", 100.0)
+
+
 DISCREPANCY = LossUnit("|measured − simulated| spillage [%]", "%", 100.0)
 """How a discrepancy Δ is shown."""
 
@@ -84,11 +93,15 @@ def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:
     """How the loss of a pour is shown."""
     if plan.deployment is None or is_calibration(plan, pour):
         return SPILLAGE
-    return loss_unit(plan.deployment.loss)
+    return deployment_unit(plan.deployment)
 
 
 def loss_of_pour(plan: CampaignPlan, pour: Pour, measured: PourMeasurement) -> float | None:
     """Measured loss of a pour in its own unit; None where it is undefined (too little poured)."""
     if plan.deployment is None or is_calibration(plan, pour):
         return normalised_spillage(measured.fractions)
+    if plan.deployment.objectives is not None:
+        scene = next(scene for scene in plan.deployment.scenes if scene.name == pour.scene)
+        costing = Costing.of(plan.deployment, scene, plan.parameters)
+        return costing.total(costing.poured(measured, pour.action))
     return plan.deployment.loss(measured.fractions, loaded_mass=measured.loaded, particles=plan.parameters.particles)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan
@@ -21,13 +23,15 @@ from orchestrator.requests import (
     Suggest,
 )
 from orchestrator.strategies.asking import Questions
+from orchestrator.strategies.compromise import Compromise
 from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.deployment_pours import PourTrial, trust
 from orchestrator.strategies.display import displayed_action, displayed_map
+from orchestrator.strategies.objectives import Vector
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.action import described
 from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
 from sim_engine.task import Scene
 
@@ -35,30 +39,6 @@ MAX_REFUSED = 20
 """Pours that may be refused (touching vessels) before a strategy gives up."""
 
 MAP_RESOLUTION = 25
-
-TRUST_POURS = 5
-TRUST_LIMIT = 3.0
-"""Mean |z| of the first pours above which the predictions are called untrustworthy."""
-
-
-@dataclass
-class PourTrial:
-    """A real pour: what was chosen and expected, and what came of it.
-
-    Attributes:
-        cost: what enters the data; None: nothing does.
-        status: 'pouring', 'weighed', 'refused' (an invalid action: nothing was poured) or 'failed'.
-    """
-
-    number: int
-    point: Point
-    values: dict[str, float]
-    predicted: Prediction | None
-    noise: float
-    cost: float | None = None
-    status: str = "pouring"
-    reason: str = ""
-    measurement: PourMeasurement | None = None
 
 
 class Deployment(ABC):
@@ -75,8 +55,9 @@ class Deployment(ABC):
         self._plan = plan
         self._scene = scene
         self._parameters = parameters
-        self._costing = Costing(plan.loss, scene, parameters)
+        self._costing = Costing.of(plan, scene, parameters)
         self._seeds = SeedStream(seed, f"{self.NAME} {scene.name}")
+        self._compromise = Compromise(self._costing, self._seeds.rng)
         self._questions = Questions(self._seeds)
         self._trials = Trials()
         self._width_known = False
@@ -119,7 +100,9 @@ class Deployment(ABC):
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            self._trials.settle(request, self._costing.simulated(outcome))
+            self._trials.settle(
+                request, self._compromise.note(request, self._costing.simulated(outcome, request.action))
+            )
         elif request == self._pouring:
             self._pouring = None
             self._weigh(self._pours[-1], outcome)
@@ -133,15 +116,19 @@ class Deployment(ABC):
     def _weigh(self, trial: PourTrial, outcome: Outcome) -> None:
         match outcome:
             case Poured(measurement):
-                trial.cost, trial.status, trial.measurement = self._costing.poured(measurement), "weighed", measurement
+                trial.vector = self._costing.poured(measurement, self._scene.action(trial.values))
+                trial.cost, trial.status = self._costing.total(trial.vector), "weighed"
+                trial.measurement = measurement
                 self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
+                return
             case Failed("invalid_action", reason):
-                trial.cost, trial.status, trial.reason = self._costing.worst, "refused", reason
+                trial.status, trial.reason = "refused", reason
             case Failed(kind, reason):
-                trial.cost = self._costing.worst if self._plan.on_failed_pour == "penalise" else None
                 trial.status, trial.reason = "failed", f"{kind}: {reason}"
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+        if trial.status == "refused" or self._plan.on_failed_pour == "penalise":
+            trial.cost, trial.vector = self._costing.worst, self._costing.worst_vector
 
     # -- pieces for subclasses -------------------------------------------------------------------------------------
 
@@ -180,7 +167,7 @@ class Deployment(ABC):
         """Queue a pour of the first suggested point, with the surrogate's prediction where there is one."""
         self._latest_map = suggestion if suggestion.surrogate is not None else self._latest_map
         known = None
-        if suggestion.means:
+        if suggestion.means and not self._compromise.exploring:
             known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion))
         self._pour(suggestion, suggestion.points[0], known)
 
@@ -189,7 +176,7 @@ class Deployment(ABC):
         simulation from seed to seed, as fitted; None without a surrogate."""
         return (suggestion.hyperparameters or {}).get("noise")
 
-    def _existing(self) -> list[tuple[Point, float]]:
+    def _existing(self) -> list[tuple[Point, Vector]]:
         """Place and cost of the pours of before the campaign in this scene."""
         pours = () if self._plan.data is None else self._plan.data.pours.get(self._scene.name, ())
         space, found = self._plan.actions, []
@@ -197,13 +184,24 @@ class Deployment(ABC):
             unit = space.encode({name: getattr(pour.action, name) for name in space.names})
             point = tuple(min(max(float(u), 0.0), 1.0) for u in unit)
             measured = PourMeasurement(pour.poured + pour.retained, pour.spilled, pour.retained)
-            found.append((point, self._costing.poured(measured)))
+            found.append((point, self._costing.poured(measured, pour.action)))
         return found
 
     def _real(self) -> Data:
         """Observations of the real cost, those of before the campaign first."""
-        observed = [*self._former, *((p.point, p.cost) for p in self._pours if p.cost is not None)]
-        return Data(tuple(point for point, _ in observed), tuple(cost for _, cost in observed))
+        poured = self._poured
+        return self._compromise.data(poured, [*poured, *self._compromise.of(self._trials.counting(everything=True))])
+
+    def _simulated(self, *, everything: bool = False) -> Data:
+        """Observations of the simulated cost."""
+        if not self._compromise.exploring:
+            return self._trials.data(everything=everything)
+        observed = self._compromise.of(self._trials.counting(everything=everything))
+        return self._compromise.data(observed, [*self._poured, *observed])
+
+    @property
+    def _poured(self) -> list[tuple[Point, Vector]]:
+        return [*self._former, *((p.point, p.vector) for p in self._pours if p.vector is not None)]
 
     @property
     def _counted(self) -> int:
@@ -221,7 +219,31 @@ class Deployment(ABC):
 
     def _conclude(self, suggestion: Suggestion) -> None:
         self._final = suggestion
-        self._finished = True
+        self._finish()
+
+    def _finish(self) -> None:
+        """The end, once the front is known where one is looked for: a regression of each objective."""
+        if not self._compromise.wanted or self._compromise.front is not None:
+            self._finished = True
+            return
+        simulated, poured = self._compromise.of(self._trials.counting(everything=True)), self._poured
+        candidates = self._compromise.candidates([*simulated, *poured])
+        answers: dict[int, Suggestion] = {}
+
+        def answered(j: int, suggestion: Suggestion) -> None:
+            answers[j] = suggestion
+            if len(answers) == len(self._compromise.names):
+                self._compromise.settle(candidates, [answers[k] for k in sorted(answers)], self._plan.actions)
+                self._finished = True
+
+        for j in range(len(self._compromise.names)):
+            problem = self._front_problem(_objective(simulated, j), _objective(poured, j))
+            problem = replace(problem, count=0, predict_at=tuple(candidates))
+            self._questions.put(problem, "front", partial(answered, j))
+
+    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
+        """How one objective is regressed: of the simulations, unless a strategy pours."""
+        return self._problem(simulated)
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         text = f"{what}  {described(values)}"
@@ -255,22 +277,26 @@ class Deployment(ABC):
         result: dict[str, object] = {
             "strategy": self.NAME,
             "scene": self._scene.name,
-            "loss": self._plan.loss.name,
+            "loss": self._plan.loss_name,
             "simulations": self._trials.answered,
             "simulations_lost": self._trials.lost,
-            "pours": [self._row(p) for p in self._pours if p.status != "pouring"],
+            "pours": [p.row(self._compromise.names) for p in self._pours if p.status != "pouring"],
             "former_pours": len(self._former),
             "refused_pours": self._refused,
             "failed_pours": sum(p.status == "failed" for p in self._pours),
-            "trust": self._trust(weighed),
+            "trust": trust(weighed),
         }
         if weighed:
             best = min(weighed, key=lambda p: p.cost if p.cost is not None else math.inf)
             for name, trial in (("first", weighed[0]), ("best", best), ("latest", weighed[-1])):
                 result[f"{name}_loss"] = trial.cost
-                result[f"{name}_spillage"] = self._row(trial)["spillage"]
+                result[f"{name}_spillage"] = trial.row(self._compromise.names)["spillage"]
         if self._refused >= MAX_REFUSED:
             result["gave_up"] = f"{self._refused} pours were refused as invalid; the action space hardly allows any"
+        if self._compromise.names:
+            result["objectives"] = list(self._compromise.names)
+        if self._compromise.front is not None:
+            result["front"] = self._compromise.front
         latest = self._final or self._latest_map
         if latest is not None and latest.surrogate is not None:
             result["map"] = displayed_map(latest.surrogate, self._plan.actions)
@@ -286,32 +312,7 @@ class Deployment(ABC):
             }
         return result
 
-    def _row(self, trial: PourTrial) -> dict[str, object]:
-        weighed = trial.measurement
-        return {
-            "number": trial.number,
-            "status": trial.status,
-            "reason": trial.reason,
-            "action": displayed_action(trial.values),
-            "action_si": trial.values,
-            "predicted": None if trial.predicted is None else trial.predicted.mean,
-            "predicted_deviation": None if trial.predicted is None else trial.predicted.deviation,
-            "predicted_scatter": None if trial.predicted is None else trial.predicted.scatter,
-            "loss": trial.cost,
-            "spillage": None if weighed is None else normalised_spillage(weighed.fractions),
-            "spilled_g": None if weighed is None else weighed.spilled * 1e3,
-            "retained_g": None if weighed is None else weighed.retained * 1e3,
-        }
 
-    def _trust(self, weighed: list[PourTrial]) -> dict[str, object]:
-        """How far the first pours were from what was predicted, in predicted deviations (noise included).
-
-        A prior from an untrustworthy simulation makes D3 worse than no prior at all, so people should be told.
-        """
-        scores = []
-        for trial in weighed[:TRUST_POURS]:
-            if trial.predicted is not None and trial.cost is not None:
-                spread = math.hypot(trial.predicted.deviation, trial.noise)
-                scores.append((trial.cost - trial.predicted.mean) / max(spread, 1e-9))
-        mean = sum(map(abs, scores)) / len(scores) if scores else None
-        return {"z_scores": scores, "alarm": bool(len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)}
+def _objective(observed: Sequence[tuple[Point, Vector]], index: int) -> Data:
+    """One objective alone."""
+    return Data(tuple(point for point, _ in observed), tuple(vector[index] for _, vector in observed))

@@ -49,7 +49,8 @@ class OneShotPlanning(Deployment):
             self._simulate(suggestion, "plan", repeats=repeats)
 
         if self._final is not None:
-            self._finished = self._pouring is None  # the one pour has been weighed
+            if self._pouring is None:  # the one pour has been weighed
+                self._finish()
         elif done == 0:
             count = min(max(self._plan.initial, 1), max(wanted - 1, 1))
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
@@ -64,15 +65,16 @@ class OneShotPlanning(Deployment):
             self._questions.put(problem, "conclude", self._recommend)
 
     def _model(self, *, everything: bool = False, **changes: object) -> SuggestProblem:
-        data = self._trials.data(everything=everything)
+        self._compromise.weigh(exploring=not everything)
+        data = self._simulated(everything=everything)
         return self._problem(data, pending=self._trials.pending(everything=everything), **changes)
 
     def _recommend(self, suggestion: Suggestion) -> None:
         self._final = suggestion
         if suggestion.best_point is None or suggestion.best_mean is None or suggestion.best_deviation is None:
-            self._finished = True  # too few simulations succeeded; the result says how many were lost
+            self._finish()  # too few simulations succeeded; the result says how many were lost
         elif self._plan.pours < 1:
-            self._finished = True
+            self._finish()
         else:
             prediction = Prediction(suggestion.best_mean, suggestion.best_deviation, self._scatter(suggestion))
             self._pour(suggestion, suggestion.best_point, prediction)

@@ -43,7 +43,8 @@ class Hybrid(Deployment):
             count = min(max(self._plan.initial, 1), self._plan.prior_simulations)
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif self._trials.ready:
-            problem = self._problem(self._trials.data(), pending=self._trials.pending())
+            self._compromise.weigh(exploring=True)
+            problem = self._problem(self._simulated(), pending=self._trials.pending())
             self._questions.put(problem, "prior", simulate)
 
     def _next_pour(self) -> None:
@@ -70,7 +71,11 @@ class Hybrid(Deployment):
         self._questions.put(problem, "refine", simulate)
 
     def _hybrid(self, **changes: object) -> SuggestProblem:
-        return self._problem(self._real(), mean="simulated", simulated=self._trials.data(everything=True), **changes)
+        self._compromise.weigh(exploring=changes.get("count") != 0)
+        return self._problem(self._real(), mean="simulated", simulated=self._simulated(everything=True), **changes)
+
+    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
+        return self._problem(poured, mean="simulated", simulated=simulated)
 
     def progress(self) -> tuple[int, int]:
         """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""

@@ -6,11 +6,8 @@ from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulate
 from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
 from sim_engine.outcome import PourOutcome
 from sim_engine.spread import Spread, spreads
-from sim_engine.task import Scene
 
 
 class RepeatedSimulation:
@@ -22,22 +19,21 @@ class RepeatedSimulation:
 
     def __init__(
         self,
-        scene: Scene,
+        costing: Costing,
         action: Action | None,
-        parameters: SimulationParameters,
-        loss: Loss,
         count: int,
         seed: int,
     ) -> None:
         """Plan.
 
         Args:
+            costing: scene, θ and loss.
             action: None: nothing was found that could be repeated, and nothing is asked for.
             count: of seeds.
         """
+        scene, parameters = costing.scene, costing.parameters
         seeds = SeedStream(seed, f"prediction {scene.name}")
-        self._scene = scene
-        self._costing = Costing(loss, scene, parameters)
+        self._costing = costing
         self._unissued: list[Simulate] = []
         self._open: set[Simulate] = set()
         self._outcomes: list[PourOutcome] = []
@@ -69,10 +65,10 @@ class RepeatedSimulation:
         if not isinstance(request, Simulate) or request not in self._open:
             raise ValueError(f"this simulation was not asked for, or has been answered already: {request}")
         self._open.discard(request)
-        cost = self._costing.simulated(outcome)
+        cost = self._costing.simulated(outcome, request.action)
         if isinstance(outcome, Simulated) and cost is not None:
             self._outcomes.append(outcome.outcome)
-            self._losses.append(cost)
+            self._losses.append(self._costing.total(cost))
         else:
             self._lost += 1
 
@@ -88,7 +84,7 @@ class RepeatedSimulation:
         if loss is not None:
             over_seeds["loss"] = loss
         return {
-            "prediction_of": self._scene.name,
+            "prediction_of": self._costing.scene.name,
             "simulations": self.progress()[0],
             "simulations_lost": self._lost,
             "over_seeds": {name: spread.as_json() for name, spread in over_seeds.items()},

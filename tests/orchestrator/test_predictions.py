@@ -19,6 +19,7 @@ from orchestrator.stages import deployment_stages, prediction_stages
 from orchestrator.strategies.deployment_d1 import OneShotPlanning
 from orchestrator.strategies.deployment_d3 import Hybrid
 from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.repeats import RepeatedSimulation
 from orchestrator.tally import Tally
 from sim_engine.losses import Loss
@@ -43,7 +44,7 @@ def learning_laboratory() -> ToyLaboratory:
 
 
 def repeated(count: int = 5, seed: int = 3, loss: Loss | None = None) -> RepeatedSimulation:
-    return RepeatedSimulation(SCENE, ACTION, THETA, loss or Loss(), count, seed)
+    return RepeatedSimulation(Costing(loss or Loss(), SCENE, THETA), ACTION, count, seed)
 
 
 def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> None:
@@ -77,7 +78,7 @@ def test_simulations_that_failed_are_counted_and_left_out_of_the_prediction() ->
 
 
 def test_without_a_planned_action_nothing_is_simulated() -> None:
-    strategy = RepeatedSimulation(SCENE, None, THETA, Loss(), 5, 1)
+    strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), None, 5, 1)
     assert strategy.finished
     assert strategy.result()["over_seeds"] == {}
 

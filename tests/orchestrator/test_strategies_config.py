@@ -102,3 +102,78 @@ def test_runs_from_before_the_other_strategies_can_be_gone_on_with(tmp_path: Pat
     assert not {"grid", "thetas"} & old["calibration"].keys()
     new = fingerprint(load(tmp_path, f"{CALIBRATED}  strategy: C2\n  samples: 18\n"))
     assert new["calibration"]["thetas"] == 18
+
+
+# -- objectives ----------------------------------------------------------------------------------------------------
+
+DEPLOYED = f"""\
+name: test
+laboratory: {CONFIGS}/laboratories/virtual.yaml
+liquid: {{name: water, mass: 200 g}}
+pourer: {CONFIGS}/vessels/beaker.yaml
+receiver: {CONFIGS}/vessels/narrow.yaml
+motion: {{x_offset: 110 mm, height: 50 mm}}
+deployment:
+  strategy: D1
+  actions: {{angular_velocity: [15 deg/s, 120 deg/s], max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]}}
+"""
+TARGET = "{name: target_volume, volume: 150 mL, tolerance: 2 mL}"
+
+
+def objectives(*parts: str, more: str = "") -> str:
+    return f"{DEPLOYED}  objectives: [{', '.join(parts)}]\n{more}"
+
+
+def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None:
+    text = objectives(TARGET, "{name: time, weight: 0.2, scale: 6 s}", more="  pareto: true\n  floor: 0.3\n")
+    plan = load(tmp_path, text)
+    assert plan.deployment is not None
+    found = plan.deployment.objectives
+    assert found is not None
+    target, time = found.parts
+    assert (target.name, target.weight, target.volume, target.tolerance) == ("target_volume", 1.0, 1.5e-4, 2e-6)
+    assert (time.name, time.weight, time.scale) == ("time", 0.2, 6.0)
+    assert (found.pareto, found.floor) == (True, 0.3)
+    assert plan.deployment.loss_name == "objectives"
+    (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
+    assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
+    assert "objectives" not in fingerprint(load(tmp_path, DEPLOYED))["deployment"]
+    assert fingerprint(plan)["deployment"]["objectives"]["floor"] == 0.3
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (objectives("{name: spilage}"), "objectives[0].name: 'spilage' is not known here; did you mean 'spillage'?"),
+        (objectives("{weight: 2}"), "deployment.objectives[0]: key 'name' is missing"),
+        (objectives(), "deployment.objectives: is empty; name at least one"),
+        (objectives("{name: spillage}", "{name: spillage}"), "objectives[1]: spillage stands twice in the list"),
+        (objectives("{name: spillage, volume: 1 mL}"), "volume: belongs to target_volume, not to spillage; remove it"),
+        (
+            objectives("{name: target_volume}"),
+            "objectives[0]: key 'volume' is missing; add for example",
+        ),
+        (objectives(TARGET.replace("150", "250")), "volume: is 250 mL, and only 200.4 mL are loaded (liquid.mass)"),
+        (objectives(TARGET.replace("150 mL", "150 g")), "volume: '150 g' is a mass; should be a volume"),
+        (objectives(TARGET.replace(" 2 mL", " 160 mL")), "tolerance: is as much as the volume: not pouring would do"),
+        (objectives(TARGET, "{name: retained}"), "objectives[1]: wants the pourer to be emptied, and target_volume"),
+        (
+            objectives("{name: spillage}", more="  pareto: true\n"),
+            "pareto: needs two objectives that can't both",
+        ),
+        (objectives("{name: spillage}", more="  loss: {name: grams}\n"), "loss: stands beside 'objectives'; keep one"),
+        (DEPLOYED + "  pareto: true\n", "deployment.pareto: belongs to 'objectives'; name some, or remove it"),
+        (
+            objectives(TARGET)
+            .replace(", max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]", "")
+            .replace("motion: {", "motion: {max_angle: 120 deg, "),
+            "objectives[0]: needs an action that stops the pour; search max_angle or hold_time",
+        ),
+        (
+            objectives("{name: time}").replace(", hold_time: [0 s, 3 s]", ""),
+            "objectives[0]: needs a hold that lasts a known time; search hold_time, or fix it under motion",
+        ),
+    ],
+)
+def test_objectives_that_make_no_sense_are_refused(text: str, expected: str, tmp_path: Path) -> None:
+    assert expected in refusal(tmp_path, text)
