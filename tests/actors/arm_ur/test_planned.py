@@ -1,0 +1,115 @@
+"""Pours as the planner makes them, executed: what comes back can be simulated in place of what was planned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from actors.arm.path.frames import pourer_motion
+from actors.arm.path.plan import plan_path
+from actors.arm.spec import ArmLimits, Cell, Pose, UrArmSpec
+from actors.arm.ur.driver import UrArm
+from actors.arm.ur.errors import ArmStoppedError
+from actors.arm.ur.ways import leans
+from actors.virtual_ur import VirtualController
+from sim_engine.action import DEG, Action
+from sim_engine.liquid import Liquid
+from sim_engine.motion import PourMotion, plan_motion
+from sim_engine.task import Scene
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.spec import cylinder
+from sim_engine.vessel.vessel import Vessel
+
+from .conftest import Call, Rig, next_address
+
+SPEC = UrArmSpec(
+    model="ur10e",
+    limits=ArmLimits((0.2, -0.7, 0.0), (1.1, 0.5, 1.0), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3),
+    cell=Cell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
+    home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
+    tool=Pose(z=0.17),
+    grip=Pose(y=-0.06, rx=-90 * DEG),
+    payload=0.9,
+    announcement=0.0,
+    time_scale=5.0,
+)
+ACTION = Action(
+    angular_velocity=60 * DEG,
+    x_offset=0.098,
+    height=0.1,
+    max_angle=100 * DEG,
+    angular_acceleration=600 * DEG,
+    hold_time=0.5,
+    return_velocity=90 * DEG,
+)
+
+
+@cache
+def vessels() -> tuple[Vessel, Vessel]:
+    cup = cylinder("cup", inner_radius=0.040, inner_height=0.100)
+    return build_vessel(cup), build_vessel(cylinder("receiver", inner_radius=0.045, inner_height=0.090))
+
+
+def motion(action: Action) -> PourMotion:
+    pourer, receiver = vessels()
+    return plan_motion(Scene("s", pourer.spec, receiver.spec, Liquid(mass=0.2)), action, pourer, receiver)
+
+
+@pytest.fixture
+def planned() -> Callable[..., Rig]:
+    made: list[Rig] = []
+
+    def make(action: Action) -> Rig:
+        path = plan_path(motion(action), SPEC, *vessels())
+        controller = VirtualController.start(next_address(), "ur10e", SPEC.time_scale, 125.0, joints=SPEC.home)
+        made.append(Rig(controller, UrArm(replace(SPEC, address=controller.address)), path))
+        made[-1].arm.connect()
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.arm.close()
+        rig.controller.close()
+
+
+def test_what_was_executed_is_the_planned_pour_seen_through_the_encoders(planned: Callable[..., Rig]) -> None:
+    rig = planned(ACTION)
+    rig.to_start()
+    executed = rig.arm.execute(rig.path)
+    rig.arm.retreat(rig.path)
+    assert rig.joints == pytest.approx(SPEC.home, abs=1e-3)
+    poured = pourer_motion(executed.joints, executed.times, SPEC)
+    asked = pourer_motion(rig.path.pour.joints, rig.path.pour.times, SPEC)
+    times = np.linspace(0.2, rig.path.pour.duration, 50)
+    lag = executed.tracking["lag"]
+    apart = np.linalg.norm(poured.sample(times)[:, :3] - asked.sample(times - lag)[:, :3], axis=1)
+    assert apart.max() < 2e-3
+    assert executed.tracking["max_angle"] < 0.5 * DEG
+
+
+def test_a_pour_without_a_return_is_brought_upright_on_the_way_home_even_after_a_stop(
+    planned: Callable[..., Rig],
+) -> None:
+    rig = planned(replace(ACTION, return_velocity=None))
+    rig.to_start()
+    rig.arm.execute(rig.path)
+    tilt = float(leans(rig.joints[None], SPEC)[0])
+    assert tilt > 90 * DEG
+    assert rig.arm.state().tilt == pytest.approx(tilt, abs=1 * DEG)
+    retreating = Call(rig.arm.retreat, rig.path)
+    rig.await_that(lambda: float(leans(rig.joints[None], SPEC)[0]) < tilt - 10 * DEG, "some un-tilting")
+    rig.arm.stop()
+    with pytest.raises(ArmStoppedError) as caught:
+        retreating.result()
+    assert caught.value.phase == "retreat"
+    assert caught.value.tilt == pytest.approx(float(leans(rig.joints[None], SPEC)[0]), abs=1 * DEG)
+    began = rig.now
+    rig.arm.release()
+    rig.arm.retreat(rig.path)
+    tilts = leans(rig.history(began)[1], SPEC)
+    assert tilts.max() < caught.value.tilt + 1 * DEG
+    assert rig.joints == pytest.approx(SPEC.home, abs=1e-3)
