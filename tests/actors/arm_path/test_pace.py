@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from actors.arm.path.pace import STEEPEST, followable, pour_times, trapezoid
 from sim_engine.action import DEG
+from sim_engine.motion import Phase, PourMotion, Segment
 
 from .cell import ACTION, motion
 
@@ -35,6 +38,16 @@ def test_a_step_becomes_a_ramp_and_what_follows_is_later_by_it(acceleration):
     assert after.end - before.end == pytest.approx(100 * DEG / STEEPEST - already, rel=1e-6)
     assert [p.name for p in made.phases] == [p.name for p in asked.phases]
     assert made.phases[1].end - made.phases[1].start == pytest.approx(ACTION.hold_time)
+    for first, second in pairwise(made.phases):
+        assert second.start == first.end
+    assert made.tilt(np.array([made.phases[1].start, made.phases[1].end])) == pytest.approx(ACTION.max_angle)
+
+
+def test_a_step_at_one_end_alone_is_one_too():
+    asked = PourMotion((Segment(0.0, 1.0, 0.0, 1.0, -1.0),), (Phase("tilt", 0.0, 1.0),), (0.0,) * 3, (0.0,) * 3)
+    made = followable(asked)
+    assert made.angular_velocity(np.zeros(1))[0] == 0.0
+    assert made.tilt(np.array([made.duration]))[0] == pytest.approx(0.5)
 
 
 def test_a_pour_that_ends_tilted_still_does():
