@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from actors.arm.path.frames import pourer_motion
@@ -66,8 +67,9 @@ def balance(what: str, **values: Any) -> Callable[[Stage], Awaitable[Any]]:
 
 
 async def kill_worker(stage: Stage) -> None:
-    driver = stage.bench.arm.device._object  # type: ignore[attr-defined]
-    os.kill(driver._worker.pid, signal.SIGKILL)
+    workers = [p for p in psutil.Process().children() if "actors.arm.ur.worker" in p.cmdline()]
+    assert len(workers) == 1
+    os.kill(workers[0].pid, signal.SIGKILL)
 
 
 ARM: dict[str, Fault] = {
@@ -183,7 +185,12 @@ async def tell_tale(open_stage: Any, phase: str, fault: Fault, *, mend: set[str]
         recorder = Recorder(stage)
         recording = asyncio.create_task(recorder.run())
         pour = asyncio.create_task(stage.pour(ACTION_WITH_HOLD, progress=seen.append))
-        struck = await strike_in(stage, phase, fault, seen)
+        try:
+            struck = await strike_in(stage, phase, fault, seen)
+        except BaseException:
+            pour.cancel()
+            await asyncio.gather(pour, return_exceptions=True)
+            raise
         outcome: PourMeasurement | LaboratoryError
         try:
             outcome = await asyncio.wait_for(pour, 90.0)
