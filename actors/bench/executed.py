@@ -46,5 +46,5 @@ def unpack(data: dict[str, Any]) -> ExecutedPath:
         whole = np.cumsum(steps, axis=0)
         times, joints = whole[:, 0].astype(float) * TIME_UNIT, whole[:, 1:].astype(float) * JOINT_UNIT
         return ExecutedPath(times, joints, bool(data["completed"]), dict(data["tracking"]))
-    except (KeyError, TypeError, zlib.error) as error:
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
         raise ValueError(f"no executed path: {error!r}") from error
