@@ -14,6 +14,7 @@ from orchestrator.fingerprint import scene_by_content
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import RecordedPour
 from orchestrator.requests import Pour, Poured
+from orchestrator.strategies.sound import is_sound
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
 from sim_engine.outcome import PourMeasurement
 from sim_engine.space import Space
@@ -58,7 +59,9 @@ def read_former_run(directory: Path) -> FormerRun:
                 request = decode_request(entry.body["request"])
                 if isinstance(request, Pour):
                     requests[entry.body["id"]] = (entry.stage, request)
-            elif isinstance(outcome := decode_outcome(entry.body["outcome"]), Poured):
+            elif isinstance(outcome := decode_outcome(entry.body["outcome"]), Poured) and is_sound(
+                outcome.measurement.fractions
+            ):
                 weighed.append((*requests[entry.body["id"]], outcome.measurement))
         splits = _splits(journal.stage_results())
         header = journal.header.fingerprint

@@ -13,6 +13,7 @@ from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.design import MeasuredPour
 from orchestrator.strategies.display import displayed_map
 from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, normalised_spillage
@@ -92,6 +93,8 @@ class Calibration(ABC):
 
     def _judged(self, request: Simulate, outcome: Outcome) -> float | None:
         if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
+            return None
+        if not is_sound(outcome.outcome.fractions):
             return None
         simulated = normalised_spillage(outcome.outcome.fractions)
         if simulated is None:

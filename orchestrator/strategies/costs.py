@@ -8,6 +8,7 @@ from functools import cached_property
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Failed, Outcome, Simulated
 from orchestrator.strategies.objectives import Objectives, Vector
+from orchestrator.strategies.sound import is_sound
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
@@ -64,7 +65,7 @@ class Costing:
     def simulated(self, outcome: Outcome, action: Action) -> Vector | None:
         """Of a simulation: worst for an invalid action, None for one that failed or is not to be used."""
         match outcome:
-            case Simulated(result) if result.invalid is None:
+            case Simulated(result) if result.invalid is None and is_sound(result.fractions):
                 return self._vector(result.fractions, action)
             case Failed("invalid_action"):
                 return self.worst_vector

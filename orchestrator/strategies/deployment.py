@@ -29,6 +29,7 @@ from orchestrator.strategies.deployment_pours import PourTrial, trust
 from orchestrator.strategies.display import displayed_action, displayed_map
 from orchestrator.strategies.objectives import Vector
 from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.action import described
 from sim_engine.liquid import SimulationParameters
@@ -115,6 +116,8 @@ class Deployment(ABC):
 
     def _weigh(self, trial: PourTrial, outcome: Outcome) -> None:
         match outcome:
+            case Poured(measurement) if not is_sound(measurement.fractions):
+                trial.status, trial.reason = "failed", "weighing: the balance gave no numbers"
             case Poured(measurement):
                 trial.vector = self._costing.poured(measurement, self._scene.action(trial.values))
                 trial.cost, trial.status = self._costing.total(trial.vector), "weighed"

@@ -8,6 +8,7 @@ from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Outcome, Prediction, Request, Simulate, Simulated
 from orchestrator.strategies.deployment import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.sound import is_sound
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
 from sim_engine.spread import Spread
@@ -35,7 +36,12 @@ class OneShotPlanning(Deployment):
     def tell(self, request: Request, outcome: Outcome) -> None:
         """As every deployment; and how much each simulation spilled, whatever the loss is."""
         super().tell(request, outcome)
-        if isinstance(request, Simulate) and isinstance(outcome, Simulated):
+        if (
+            isinstance(request, Simulate)
+            and isinstance(outcome, Simulated)
+            and outcome.outcome.invalid is None
+            and is_sound(outcome.outcome.fractions)
+        ):
             self._spillages[request] = normalised_spillage(outcome.outcome.fractions)
 
     def _next(self, free_simulations: int) -> None:

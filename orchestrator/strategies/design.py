@@ -12,6 +12,7 @@ from orchestrator.plan import RecordedPour
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
 from sim_engine.action import Action, described
 from sim_engine.losses import normalised_spillage
 from sim_engine.space import Space
@@ -154,6 +155,8 @@ class DesignedPours:
         self._pouring = None
         planned = self._planned[self._current]
         match outcome:
+            case Poured(measurement) if not is_sound(measurement.fractions):
+                planned.given_up = "weighing: the balance gave no numbers"
             case Poured(measurement):
                 fractions = measurement.fractions
                 assert planned.action is not None

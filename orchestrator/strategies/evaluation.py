@@ -12,6 +12,7 @@ import numpy as np
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.design import MeasuredPour
 from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
 from sim_engine.space import Space
@@ -90,7 +91,7 @@ class Evaluation:
         if not waiting:
             del self._open[request]
         case.answered = True
-        if isinstance(outcome, Simulated) and outcome.outcome.invalid is None:
+        if isinstance(outcome, Simulated) and outcome.outcome.invalid is None and is_sound(outcome.outcome.fractions):
             case.simulated = normalised_spillage(outcome.outcome.fractions)
             case.reason = "" if case.simulated is not None else "too little poured"
         else:
