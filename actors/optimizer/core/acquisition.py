@@ -97,12 +97,18 @@ def spread_out(
     candidates = region.draw(max(64, 4 * count), rng, even=True)
     weight = 1.0 if feasibility is None else np.exp(feasibility.log_probability(candidates))
     chosen: list[Array] = []
-    distance = np.linalg.norm(candidates[:, None, :] - taken[None, :, :], axis=2).min(axis=1)
+    distance = _round_the_cube(candidates, taken).min(axis=1)
     for _ in range(count):
         point = candidates[int(np.argmax(distance * weight))]
         chosen.append(point)
-        distance = np.minimum(distance, np.linalg.norm(candidates - point, axis=1))
+        distance = np.minimum(distance, _round_the_cube(candidates, point[None, :])[:, 0])
     return np.array(chosen).reshape(count, candidates.shape[1])
+
+
+def _round_the_cube(points: Array, others: Array) -> Array:
+    """(m, k) distances where opposite faces of the cube touch: else the farthest points would all be corners."""
+    gap = np.abs(points[:, None, :] - others[None, :, :])
+    return np.asarray(np.linalg.norm(np.minimum(gap, 1.0 - gap), axis=2))
 
 
 def search_candidates(region: Region, dimension: int, around: Sequence[Array], rng: np.random.Generator) -> Array:

@@ -27,6 +27,11 @@ from actors.optimizer.core.surrogate import (
 Array = NDArray[np.float64]
 
 
+FILL_EVERY = 3
+STRUCTURE = 2.0
+"""Gain of the log-likelihood from which the costs are more than noise."""
+
+
 def propose(problem: SuggestProblem) -> Suggestion:
     """Answer a `SuggestProblem`.
 
@@ -60,7 +65,7 @@ def _answer(problem: SuggestProblem) -> Suggestion:
         taken = np.concatenate([asked.known, asked.busy, asked.refused])
         points = acquisition.spread_out(problem.count, taken, asked.region, rng, feasibility)
     else:
-        points = _search(problem, asked, model.surrogate, feasibility, rng)
+        points = _search(problem, asked, model, feasibility, rng)
 
     answer: dict[str, object] = {}
     if model is not None:
@@ -167,12 +172,13 @@ def _fit(problem: SuggestProblem, asked: _Asked) -> _Model | None:
 def _search(
     problem: SuggestProblem,
     asked: _Asked,
-    surrogate: Surrogate,
+    model: _Model,
     feasibility: Feasibility | None,
     rng: np.random.Generator,
 ) -> Array:
     """`count` minimisers of the acquisition, each keeping away from the busy points and its forerunners."""
     chosen: list[Array] = []
+    surrogate = model.surrogate
     if problem.count:
         seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled") else asked.known
         means = surrogate.predict(seen)[0]
@@ -180,11 +186,27 @@ def _search(
         candidates = acquisition.search_candidates(asked.region, problem.space.dimension, around, rng)
     for index in range(problem.count):
         taken = np.concatenate([asked.busy, np.array(chosen).reshape(-1, problem.space.dimension)])
+        if _looks_round(problem, asked, model, index):
+            avoided = np.concatenate([asked.known, taken, asked.refused])
+            chosen.append(acquisition.spread_out(1, avoided, asked.region, rng, feasibility)[0])
+            continue
         conclude = problem.acquisition == "posterior_minimum" and index == 0
         score = acquisition.lower_confidence_bound(surrogate, 0.0 if conclude else problem.kappa)
         score = acquisition.penalised(score, surrogate, taken[:0] if conclude else taken, candidates, feasibility)
         chosen.append(acquisition.minimise(score, candidates, asked.region, rng))
     return np.array(chosen).reshape(problem.count, problem.space.dimension)
+
+
+def _looks_round(problem: SuggestProblem, asked: _Asked, model: _Model, index: int) -> bool:
+    """Whether the next point only fills space: every third one, while the costs could as well be noise.
+
+    On a plateau the luckiest pours look like a slope, and following them, mostly along the faces of the cube, would
+    take the whole budget. A prior mean that is not of the data, and a context, are left to what they were made for.
+    """
+    if problem.acquisition != "lcb" or problem.mean != "constant" or problem.context:
+        return False
+    number = len(asked.known) + len(asked.busy) + index
+    return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE
 
 
 def _describe(problem: SuggestProblem, asked: _Asked, model: _Model, points: Array) -> dict[str, object]:

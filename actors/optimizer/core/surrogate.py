@@ -53,6 +53,7 @@ class GaussianProcess:
         signal: fitted standard deviation of the signal, in the cost's unit.
         noise: fitted standard deviation of the real observations, in the cost's unit; where it varies, its
             geometric mean over them.
+        evidence: by how much the log-likelihood is above that of noise around the prior mean and nothing else.
         hyperparameters: what else was fitted, by name.
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, chapters 2 and 5.
@@ -93,6 +94,7 @@ class GaussianProcess:
         self.signal = covariance.value(theta, "signal") * scale
         self.noise = covariance.value(theta, "noise") * scale
         self.log_likelihood = fitted.log_likelihood
+        self.evidence = fitted.log_likelihood - _of_noise_alone(residuals)
         self.theta = theta
         self.hyperparameters: dict[str, float] = {
             name: covariance.value(theta, name) * (1.0 if name in ("rho", "delta_length") else scale)
@@ -269,6 +271,12 @@ def _fitted(
 ) -> GaussianProcess:
     process = GaussianProcess(costs, Covariance(points, prior, **terms), mean=mean, scale=scale)
     return with_varying_noise(process, costs, prior, **terms) if varying else process
+
+
+def _of_noise_alone(residuals: Array) -> float:
+    """Log-likelihood of residuals (n,) as independent normal noise of the deviation that suits them best."""
+    variance = max(float(np.mean(residuals**2)), 1e-12)
+    return -0.5 * len(residuals) * (math.log(2 * math.pi * variance) + 1.0)
 
 
 def _constant(value: float) -> Mean:
