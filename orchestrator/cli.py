@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from orchestrator.commands.common import INTERRUPTED, RefusalError, fail
+from orchestrator.commands import bench_verbs
+from orchestrator.commands.options import (
+    Answer,
+    Arm,
+    Assignments,
+    Campaign,
+    InProcess,
+    Json,
+    Parameters,
+    Receiver,
+    Resume,
+    RunId,
+    SceneName,
+    call,
+    examples,
+)
 
 app = typer.Typer(
     name="decant",
@@ -28,64 +42,12 @@ Exit codes: 0 done, 1 failed, 2 bad input (nothing was started), 3 a person has 
 """,
 )
 
-Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the newest unfinished run of this campaign.")]
-RunId = Annotated[str | None, typer.Option("--run", help="With --resume: the run, by its folder's name.")]
-Answer = Annotated[
-    str | None,
-    typer.Option(
-        help="With --resume: what came of the pour that was under way: 'lost', 'weighed 3.2 0.4' (g spilled, g "
-        "retained), or on the virtual bench 'repeat'.",
-        show_default=False,
-    ),
-]
-Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
-Assignments = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
-]
-SceneName = Annotated[
-    str | None,
-    typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),
-]
-Arm = Annotated[
-    bool,
-    typer.Option(
-        "--arm",
-        help="Arm hardware for this run only: shows what will move, and asks for the laboratory's name.",
-    ),
-]
-InProcess = Annotated[
-    bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
-]
-Parameters = Annotated[
-    Path | None, typer.Option(help="θ: a theta.json of a calibration, or your own YAML or JSON.", show_default=False)
-]
-Receiver = Annotated[
-    Path | None, typer.Option(help="Vessel file (YAML) in place of the campaign's receiver.", show_default=False)
-]
-
 
 class BackendChoice(StrEnum):
     """Where the solver runs."""
 
     CPU = "cpu"
     CUDA = "cuda"
-
-
-def examples(*commands: str) -> str:
-    """The end of a command's help: what one may type."""
-    return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
-
-
-def _call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
-    try:
-        verb(*args, **kwargs)
-    except RefusalError as refusal:
-        fail(refusal)
-    except KeyboardInterrupt:
-        fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
 
 
 @app.command(
@@ -109,7 +71,7 @@ def run(
     """
     from orchestrator.commands import campaigns
 
-    _call(
+    call(
         campaigns.run,
         campaign,
         resume=resume,
@@ -142,7 +104,7 @@ def calibrate(
     """
     from orchestrator.commands import campaigns
 
-    _call(
+    call(
         campaigns.calibrate,
         campaign,
         resume=resume,
@@ -178,7 +140,7 @@ def plan(
     """
     from orchestrator.commands import campaigns
 
-    _call(
+    call(
         campaigns.plan_pour,
         campaign,
         parameters=parameters,
@@ -220,7 +182,7 @@ def simulate(
     """
     from orchestrator.commands import single
 
-    _call(
+    call(
         single.simulate,
         campaign,
         assignments=assignments or [],
@@ -245,7 +207,7 @@ def validate(
     """Check files without starting anything: keys, units, bounds, vessels, and that some action can be poured."""
     from orchestrator.commands import single
 
-    _call(single.validate, files)
+    call(single.validate, files)
 
 
 @app.command(
@@ -257,106 +219,30 @@ def schema(
     """Print the JSON schema of campaign files (editors complete YAML with it)."""
     from orchestrator.commands import single
 
-    _call(single.schema, which)
+    call(single.schema, which)
 
 
-@app.command(
+app.command(
     epilog=examples(
         "decant doctor configs/laboratories/virtual.yaml",
         "decant doctor configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the teach pendant",
     )
-)
-def doctor(
-    laboratory: Laboratory,
-    accept_safety: Annotated[
-        bool,
-        typer.Option(
-            "--accept-safety",
-            help="Record the controller's safety settings, by their checksum, as those that people have read and "
-            "accepted: NAME.safety.json beside the file. Without such a record nothing is poured.",
-        ),
-    ] = False,
-    tare: Annotated[
-        bool,
-        typer.Option("--tare", help="Also tare the balance, to see that it obeys: what is on it counts as nothing."),
-    ] = False,
-    as_json: Json = False,
-) -> None:
-    """Look at everything that a pour needs, and say what to do: network, controller, safety settings, balance.
+)(bench_verbs.doctor)
 
-    Nothing moves and nothing is set. In a virtual laboratory its controller and balance are started for the purpose.
-    Exit code 1 if something fails.
-    """
-    from orchestrator.commands import doctor as verb
-
-    _call(verb.doctor, laboratory, accept_safety=accept_safety, tare=tare, as_json=as_json)
-
-
-@app.command(
+app.command(
     epilog=examples(
         "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
         "decant jog configs/laboratories/ur10-kern.yaml --arm",
     )
-)
-def jog(laboratory: Laboratory, arm: Arm = False) -> None:
-    """Move the arm by small, slow steps that are typed one by one, or bring it home.
+)(bench_verbs.jog)
 
-    'j5 +2' turns joint 5 by 2 deg, 'z -5' moves the tool by 5 mm, 'home' goes home. The first step along an axis is
-    confirmed by Enter; Ctrl-C stops the arm.
-    """
-    from orchestrator.commands import jog as verb
-
-    _call(verb.jog, laboratory, armed=arm)
-
-
-@app.command(
+app.command(
     epilog=examples(
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --arm",
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
     )
-)
-def pour(
-    campaign: Campaign,
-    assignments: Assignments = None,
-    scene: SceneName = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Plan and check the whole path of the arm, show it, and move nothing.")
-    ] = False,
-    connect: Annotated[
-        bool, typer.Option("--connect", help="With --dry-run: also read whether the arm stands at home.")
-    ] = False,
-    png: Annotated[
-        Path | None, typer.Option(help="Draw the arm's path, from the side and from above.", show_default=False)
-    ] = None,
-    empty: Annotated[
-        bool, typer.Option("--empty", help="The whole cycle with an empty pourer, and nothing weighed.")
-    ] = False,
-    slow: Annotated[float, typer.Option(min=0.05, max=1.0, help="With --empty: fraction of the planned speed.")] = 1.0,
-    in_process: InProcess = False,
-    arm: Arm = False,
-    as_json: Json = False,
-) -> None:
-    """Pour once, with an action of your own, on the campaign's bench; or only plan it, or try it with an empty pourer.
-
-    A pour with liquid is journalled and weighed as a small run of its own; `--empty` leaves a record, pour.json.
-    """
-    from orchestrator.commands import pour as verb
-
-    _call(
-        verb.pour,
-        campaign,
-        assignments=assignments or [],
-        scene_name=scene,
-        dry_run=dry_run,
-        connect=connect,
-        png=png,
-        empty=empty,
-        slow=slow,
-        armed=arm,
-        in_process=in_process,
-        as_json=as_json,
-    )
+)(bench_verbs.pour)
 
 
 @app.command(
@@ -387,7 +273,7 @@ def physics(
     """
     from orchestrator.commands import physics as verb
 
-    _call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
+    call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
 
 
 def main() -> None:

@@ -126,7 +126,8 @@ class TerminalOperator:
             except EOFError:
                 ends += 1
                 if ends >= _ENDS_OF_INPUT:
-                    raise LaboratoryError(f"the terminal was closed; nobody can answer: {question.text}") from None
+                    what = question.text.rstrip(".")
+                    raise LaboratoryError(f"the terminal was closed; nobody can answer: {what}") from None
                 self._write(f"\nThe question is still open: {self._expected(question)}\n> ")
                 continue
             ends = 0
@@ -140,7 +141,7 @@ class TerminalOperator:
         """The answer that a line is, else None, and it is said what would be one."""
         said = " ".join(line.lower().split())
         if said == GIVE_UP:
-            raise LaboratoryError(f"given up by the operator at: {question.text}")
+            raise LaboratoryError(f"given up by the operator at: {question.text.rstrip('.')}")
         if question.wants == "weight":
             try:
                 weight = typed_weight(line)
@@ -240,7 +241,7 @@ def _worded(question: Question) -> str:
     """The question as it stands on the screen: what was wrong, what to do, numbers that belong to it."""
     rows = []
     if question.problem:
-        rows.append(textwrap.fill(f"Once more: {question.problem}", _WIDTH))
+        rows.append(textwrap.fill(f"Problem: {question.problem}", _WIDTH))
     rows.append(textwrap.fill(question.text, _WIDTH))
     for name, value in question.details.items():
         rows.append(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")

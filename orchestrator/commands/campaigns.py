@@ -13,7 +13,6 @@ from orchestrator.commands.common import (
     RefusalError,
     check_campaign_can_run,
     check_laboratory_answers,
-    check_somebody_is_there,
     print_json,
     read_campaign,
     run_in_front_of_people,
@@ -207,6 +206,7 @@ def _run(
     armed: bool,
 ) -> Finished:
     from orchestrator.commands.arming import arm_campaign
+    from orchestrator.commands.people import check_somebody_is_there
     from orchestrator.stages import stages_of
 
     if answer is not None and not resume:

@@ -10,19 +10,15 @@ import os
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 if TYPE_CHECKING:
-    from actors.operator import Operator
     from actors.protocols import Laboratory
-    from actors.spec import LaboratorySpec
     from orchestrator.campaign import CampaignResult
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
-    from orchestrator.unknown import AskOperator
 
 W = TypeVar("W")
 
@@ -40,7 +36,8 @@ class RefusalError(Exception):
 
 def say(text: str) -> None:
     """A line for people: stderr, so that stdout stays for results."""
-    print(text, file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):  # a terminal that was closed is no reason to leave an arm where it is
+        print(text, file=sys.stderr, flush=True)
 
 
 def print_json(data: dict[str, Any]) -> None:
@@ -187,6 +184,7 @@ def run_in_front_of_people(
     from actors.laboratory import open_laboratory
     from actors.protocols import LaboratoryError
     from orchestrator.campaign import run_campaign
+    from orchestrator.commands.people import asked_about_unknown_pours, person_at_the_terminal
     from orchestrator.errors import RunError
     from orchestrator.events import Watcher
     from orchestrator.monitor.monitor import RerunMonitor
@@ -218,7 +216,7 @@ def run_in_front_of_people(
                     directory,
                     resume=resume,
                     watchers=watchers,
-                    ask_operator=_operator(answer),
+                    ask_operator=asked_about_unknown_pours(answer),
                     stages=chosen,
                 )
 
@@ -236,40 +234,6 @@ def run_in_front_of_people(
         if monitor is not None:
             monitor.close()
     return _report(plan, result, monitor)
-
-
-def person_at_the_terminal(
-    spec: LaboratorySpec, paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
-) -> Operator | None:
-    """Who answers the bench's questions; None where a virtual operator does.
-
-    Args:
-        spec: of the laboratory.
-        paused: entered while a question is open.
-    """
-    from actors.bench.open_wired import needs_person
-    from orchestrator.terminal_operator import TerminalOperator
-
-    if not needs_person(spec) or spec.arm is None:
-        return None
-    return TerminalOperator(spec.operator, paused=paused)
-
-
-def check_somebody_is_there(spec: LaboratorySpec) -> None:
-    """A bench that asks a person needs a terminal to ask at.
-
-    Raises:
-        RefusalError: there is none (exit code 2).
-    """
-    from actors.bench.open_wired import needs_person
-    from orchestrator.terminal_operator import somebody_at_the_terminal
-
-    if needs_person(spec) and not somebody_at_the_terminal():
-        raise RefusalError(
-            f"laboratory {spec.name} asks a person (operator: answers: person), and there is no terminal to ask at; "
-            "run this in a terminal, with nothing piped into it",
-            BAD_INPUT,
-        )
 
 
 def _way_on(directory: Path, again: str) -> str:
@@ -335,7 +299,7 @@ def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finishe
 
 
 async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], again: str) -> CampaignResult:
-    """Run; the first SIGINT or SIGTERM pauses at the next safe point, a second one gives up what is under way."""
+    """Run; a first SIGINT, SIGTERM or SIGHUP pauses at the next safe point, a second gives up what is under way."""
     task = asyncio.ensure_future(work())
     asked = 0
 
@@ -349,25 +313,14 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], again:
         task.cancel()
 
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: its terminal was closed
+    for number in numbers:
         loop.add_signal_handler(number, stop)
     try:
         return await task
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in numbers:
             loop.remove_signal_handler(number)
-
-
-def _operator(answer: str | None) -> AskOperator | None:
-    """Who is asked about a pour whose outcome is unknown: the command line, the terminal, or nobody."""
-    if answer is not None:
-        return lambda question, options: answer
-    return _ask_on_terminal if sys.stdin.isatty() else None
-
-
-async def _ask_on_terminal(question: str, options: Sequence[str]) -> str:
-    say(f"\n{question}\n  answer with one of: {' | '.join(options)}")
-    return (await asyncio.to_thread(input, "> ")).strip()
 
 
 def fail(refusal: RefusalError) -> NoReturn:

@@ -56,11 +56,9 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
     with reached(spec) as ready:
         assert ready.arm is not None
         found = look_at(ready.arm.address)
-        if virtual:
-            record = _virtual_record(found)
-        elif accept_safety:
+        if accept_safety and not virtual:
             record = _accept(path, found)
-        checks = judge(ready.arm, found, record, accept=f"decant doctor {path} --accept-safety")
+        checks = judge(ready.arm, found, record, accept=f"decant doctor {path} --accept-safety", virtual=virtual)
         checks += look_at_balance(ready.balance, tare=tare)
     failed = [check for check in checks if check.state == "fail"]
     if as_json:
@@ -103,13 +101,6 @@ def print_table(checks: list[Check]) -> None:
         table.add_row(Text(mark, style=style), Text(check.name), said)
     console = Console(highlight=False)
     (console if console.is_terminal else Console(highlight=False, width=1000)).print(table)
-
-
-def _virtual_record(found: Findings) -> SafetyRecord | None:
-    checksum = None if found.state is None else found.state.checksum
-    if checksum is None:
-        return None
-    return SafetyRecord(checksum, found.serial, found.model, "", "this run", "nobody: it is virtual")
 
 
 def _accept(path: Path, found: Findings) -> SafetyRecord:

@@ -15,7 +15,6 @@ from orchestrator.commands.common import (
     FAILED,
     RefusalError,
     check_output,
-    check_somebody_is_there,
     print_json,
     read_campaign,
     say,
@@ -253,6 +252,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     """As a small run of its own: journalled, with the operator's questions, weighed."""
     from orchestrator.commands.campaigns import run_directory
     from orchestrator.commands.common import check_laboratory_answers, run_in_front_of_people
+    from orchestrator.commands.people import check_somebody_is_there
     from orchestrator.stages import StageDefinition
     from orchestrator.strategies.one_pour import OnePour
 

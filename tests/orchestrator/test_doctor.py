@@ -84,7 +84,7 @@ def test_virtual_laboratory_is_started_looked_at_and_called_virtual() -> None:
     result = doctor(Path("configs/laboratories/virtual.yaml"))
     assert result.exit_code == 0, result.output
     assert "virtual: no robot, no balance" in result.stderr
-    assert "nobody: it is virtual" in result.stdout
+    assert "of a virtual controller, nobody has to accept it" in result.stdout
 
 
 def test_a_bench_of_numbers_and_a_bad_file_are_refused_with_exit_code_2(tmp_path: Path) -> None:

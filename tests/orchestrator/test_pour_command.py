@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import degrees, radians
 from pathlib import Path
 
@@ -123,3 +123,68 @@ def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, control
         assert terminal.end() == 1
     assert "nothing has moved" in terminal.screen
     assert controller.fault("state")["joints"] == before
+
+
+WEIGHTS = ("312.0 g", "412.1 g", "428.0 g", "431.2 g", "313.5 g")
+"""Pourer empty and full, tray before and after, pourer after."""
+
+
+def answered(terminal: Terminal, before_start: Callable[[], object] = lambda: None) -> list[str]:
+    """Answer all questions of a pour, as a person beside the bench would; returns what was asked to be allowed."""
+    weights, consents = list(WEIGHTS), []
+    while weights:
+        begin = len(terminal.screen)
+        terminal.expect("> ", 60.0)
+        asked = terminal.screen[begin:].rpartition("\a")[2]
+        if "weight with its unit" in asked:
+            terminal.type(weights.pop(0))
+        elif "'yes' or 'no'" in asked:
+            consents.append(" ".join(asked.split()))
+            before_start()
+            before_start = lambda: None  # noqa: E731
+            terminal.type("yes")
+        else:
+            terminal.type("done")
+    return consents
+
+
+@pytest.mark.slow
+def test_whole_pour_on_hardware_is_asked_for_confirmed_made_and_weighed(
+    tmp_path: Path, controller: VirtualController
+) -> None:
+    campaign = hardware.write_rig(tmp_path, controller.address)
+    checksum = controller.fault("state")["checksum"]
+    write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
+    action = ("--set", "angular_velocity=60", "--set", "x_offset=80")
+    with Terminal("pour", str(campaign), *action, "--in-process", "--arm", cwd=str(tmp_path)) as terminal:
+        terminal.expect("> ")
+        terminal.type("rig")
+        terminal.expect("mode hardware")
+        consents = answered(terminal)
+        assert terminal.end(60.0) == 0
+    assert len(consents) == 1
+    assert "Hands out of the cell" in consents[0]
+    assert "spilled 3.2 g, retained 1.5 g" in terminal.screen
+    run = next((tmp_path / "runs").glob("rigged-pour-hardware-*"))
+    assert json.loads((run / "summary.json").read_text())["mode"] == "hardware"
+    tilted = np.ptp(np.array(controller.fault("history", since=0.0)["joints"]), axis=0).max()
+    assert degrees(tilted) == pytest.approx(110.0, abs=2.0)
+
+
+@pytest.mark.slow
+def test_protective_stop_in_a_pour_is_mended_by_consent_weighed_and_left_for_a_person_to_judge(
+    tmp_path: Path, controller: VirtualController
+) -> None:
+    campaign = hardware.write_rig(tmp_path, controller.address)
+    checksum = controller.fault("state")["checksum"]
+    write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
+    action = ("--set", "angular_velocity=30", "--set", "x_offset=80")
+    with Terminal("pour", str(campaign), *action, "--in-process", "--arm", cwd=str(tmp_path)) as terminal:
+        terminal.expect("> ")
+        terminal.type("rig")
+        consents = answered(terminal, lambda: controller.fault("protective_stop", after=6.5))
+        assert terminal.end(60.0) == 3
+    assert [("made ready" in c, "upright" in c) for c in consents[1:]] == [(True, False), (False, True)]
+    assert "protective stop during tilt" in terminal.screen
+    joints = controller.fault("state")["joints"]
+    assert joints == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)

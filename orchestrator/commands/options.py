@@ -1,0 +1,64 @@
+"""Arguments and options that several verbs share, and how a verb is called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orchestrator.commands.common import INTERRUPTED, RefusalError, fail
+
+Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the newest unfinished run of this campaign.")]
+RunId = Annotated[str | None, typer.Option("--run", help="With --resume: the run, by its folder's name.")]
+Answer = Annotated[
+    str | None,
+    typer.Option(
+        help="With --resume: what came of the pour that was under way: 'lost', 'weighed 3.2 0.4' (g spilled, g "
+        "retained), or on the virtual bench 'repeat'.",
+        show_default=False,
+    ),
+]
+Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
+]
+SceneName = Annotated[
+    str | None,
+    typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),
+]
+Arm = Annotated[
+    bool,
+    typer.Option(
+        "--arm",
+        help="Arm hardware for this run only: shows what will move, and asks for the laboratory's name.",
+    ),
+]
+InProcess = Annotated[
+    bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
+]
+Parameters = Annotated[
+    Path | None, typer.Option(help="θ: a theta.json of a calibration, or your own YAML or JSON.", show_default=False)
+]
+Receiver = Annotated[
+    Path | None, typer.Option(help="Vessel file (YAML) in place of the campaign's receiver.", show_default=False)
+]
+
+
+def examples(*commands: str) -> str:
+    """The end of a command's help: what one may type."""
+    return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
+
+
+def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
+    """Run a verb; a refusal is told, with its exit code."""
+    try:
+        verb(*args, **kwargs)
+    except RefusalError as refusal:
+        fail(refusal)
+    except KeyboardInterrupt:
+        fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
