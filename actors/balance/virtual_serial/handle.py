@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import select
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.scale import ScaleSettings
 from actors.balance.virtual_serial.voice import VOICES
 from actors.protocols import LaboratoryError
+from actors.ray_warden import MARK
 
 PATIENCE = 10.0
 """How long its process may take to start, or to answer [s]."""
@@ -34,7 +36,8 @@ class FarProcess:
     """
 
     def __init__(self, settings: dict[str, Any], baud: int) -> None:
-        folder = Path(tempfile.mkdtemp(prefix="decant-balance-"))
+        # In a Ray of our own: in its folder, which is removed even behind a program that was killed.
+        folder = Path(tempfile.mkdtemp(prefix="decant-balance-", dir=os.environ.get(MARK)))
         self.port = str(folder / "balance")
         """Path of the line, which keeps its name when the plug is pulled and put in again."""
         self._lock = threading.Lock()

@@ -1,0 +1,112 @@
+"""A whole campaign over wires: `decant run` with a controller on TCP and a balance on a pty, killed and resumed."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from actors.bench.executed import unpack
+from orchestrator.journal import Entry, Kind
+from tests.end_to_end import small
+from tests.end_to_end.command import Workplace, finished_in, pour_under_way, started_after_they_were_finished
+
+pytestmark = [pytest.mark.ray, pytest.mark.timeout(600)]
+
+LABORATORIES = Path(__file__).parents[2] / "configs" / "laboratories"
+
+RUN = ("run", "small.yaml")
+
+
+def write_wired(folder: Path) -> None:
+    """The small campaign on the shipped virtual laboratory, with few particles."""
+    laboratory = (LABORATORIES / "virtual.yaml").read_text(encoding="utf-8")
+    (folder / "lab.yaml").write_text(
+        replaced(
+            laboratory,
+            ("particles: 4000", "particles: 400"),
+            ("x: -9 mm, y: 1 mm", "x: 1 mm"),
+            ("simulators: 0 ", "simulators: 2 "),
+        ),
+        encoding="utf-8",
+    )
+    before, rest = small.CAMPAIGN.split("laboratory:\n")
+    after = rest[rest.index("liquid: {name: water") :]
+    campaign = replaced(
+        f"{before}laboratory: lab.yaml\n{after}",
+        ("return_velocity: 180 deg/s", "return_velocity: 100 deg/s"),
+        ("[60 deg/s, 180 deg/s]", "[60 deg/s, 100 deg/s]"),
+        ("height: 60 mm", "height: 80 mm"),
+        ("x_offset: 66 mm", "x_offset: 75 mm"),
+        ("x_offset: [60 mm, 100 mm]", "x_offset: [70 mm, 100 mm]"),
+    )
+    small.write_campaign(folder, campaign)
+
+
+def replaced(text: str, *pairs: tuple[str, str]) -> str:
+    for old, new in pairs:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.fixture
+def workplace(tmp_path: Path) -> Iterator[Workplace]:
+    place = Workplace(tmp_path)
+    write_wired(tmp_path)
+    yield place
+    place.close()
+
+
+def far_ends(place: Workplace) -> list[psutil.Process]:
+    """Processes in the place of hardware that a workplace's run has started."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            ours = process.environ().get("TMPDIR") == str(place.temporary)
+            if ours and any(name in process.cmdline() for name in ("actors.virtual_ur", "actors.arm.ur.worker")):
+                found.append(process)
+        except (psutil.Error, OSError):
+            continue
+    return found
+
+
+def test_a_campaign_over_wires_is_killed_in_a_pour_resumed_and_comes_to_its_end(workplace: Workplace) -> None:
+    def tilting(entries: list[Entry]) -> bool:
+        announced = [e for e in entries if e.kind == Kind.NOTE and "The arm moves in" in e.body["text"]]
+        return finished_in("pours", entries) == 1 and pour_under_way(entries) and len(announced) == 2
+
+    killed, _ = workplace.interrupt(tilting, signal.SIGKILL, *RUN)
+    assert killed.returncode == -signal.SIGKILL
+    workplace.assert_nothing_is_left()
+    assert far_ends(workplace) == []
+
+    workplace.finish(*RUN, "--resume")
+    entries = workplace.entries()
+    pours = [e.body["outcome"]["measurement"] for e in entries if e.kind == Kind.POUR_FINISHED]
+    assert len(pours) == 3 + 2
+    assert started_after_they_were_finished(entries) == []
+    for measured in pours:
+        assert measured["loaded"] == pytest.approx(0.1, abs=5e-3)
+        notes = measured["notes"]
+        assert notes["mode"] == "virtual"
+        executed = unpack(notes["executed"])
+        assert executed.completed
+        assert executed.times[-1] > 1.0
+        assert [one["about"] for one in notes["operator"]][-2:] == ["start", "pourer_after"]
+    said = [e.body["text"] for e in entries if e.kind == Kind.NOTE]
+    assert sum(text.startswith("weighed, spilled:") for text in said) >= len(pours)
+    workplace.assert_nothing_is_left()
+
+
+def test_ctrl_c_during_a_pour_over_wires_finishes_and_weighs_it(workplace: Workplace) -> None:
+    process, errors = workplace.interrupt(pour_under_way, signal.SIGINT, *RUN)
+    assert process.returncode == 130, errors
+    entries = workplace.entries()
+    assert not pour_under_way(entries)
+    assert [e.body["after"] for e in entries if e.kind == Kind.CAMPAIGN_STATE][-1] == "paused"
+    workplace.assert_nothing_is_left()
+    assert far_ends(workplace) == []
