@@ -248,3 +248,16 @@ def test_a_plan_takes_well_under_a_second():
 def test_limits_are_looked_at_before_anything_is_planned():
     with pytest.raises(InvalidActionError, match=r"limits\.box: x of 'low'"):
         planned(spec=limited(box_low=(2.0, -0.6, 0.0)))
+
+
+@pytest.mark.parametrize("x_offset", [0.108, 0.112])
+def test_a_rim_that_swings_past_the_receiver_is_seen_where_it_is_nearest(x_offset):
+    # about its middle: the lip comes down beside the receiver's rim and goes away again
+    action, pivot = ACTION.with_values(x_offset=x_offset, height=0.01), Pivot("point", 0.0, 0.05)
+    asked = motion(action, pivot=pivot)
+    poses = asked.sample(np.linspace(0.0, asked.phases[0].end, 400))
+    nearest = clearance(vessel("beaker"), vessel("tumbler"), poses).min()
+    assert 1e-3 < nearest < 0.012
+    with pytest.raises(InvalidActionError, match="of the receiver"):
+        planned(action, limited(clearance=nearest + 1e-5), pivot=pivot)
+    assert planned(action, limited(clearance=nearest - 2e-4), pivot=pivot).report.clearance < nearest + 2e-5
