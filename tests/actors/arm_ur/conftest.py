@@ -122,7 +122,7 @@ class Makers:
     def __call__(self, path: PourPath | None = None, connect: bool = True, **changes: Any) -> Rig:
         """A controller at home, and an arm that is connected to it."""
         scale = changes.pop("time_scale", SCALE)
-        options: dict[str, Any] = {"model": "ur10e", "time_scale": scale, "joints": HOME}
+        options: dict[str, Any] = {"model": changes.pop("there", "ur10e"), "time_scale": scale, "joints": HOME}
         options["frequency"] = changes.pop("frequency", 125.0)
         controller = VirtualController.start(address=next_address(), **options)
         arm = UrArm(settings(controller.address, time_scale=scale, **changes))

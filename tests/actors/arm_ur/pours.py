@@ -45,7 +45,7 @@ def settings(address: str = "", **changes: Any) -> UrArmSpec:
     return replace(spec, **changes)
 
 
-def smooth(begin: Any, end: Any, duration: float, step: float = 0.01) -> JointPath:
+def smooth(begin: Any, end: Any, duration: float, step: float = 0.03) -> JointPath:
     """From rest to rest."""
     times = np.linspace(0.0, duration, max(2, round(duration / step)) + 1)
     u = times / duration

@@ -52,6 +52,16 @@ def test_what_was_executed_at_scaled_time_is_the_same_pour(rig: Rig) -> None:
     assert executed.tracking["longest_gap"] > 0.05  # ten times as far apart as at time scale 1
 
 
+def test_the_older_generation_pours_too(make_rig: Make) -> None:
+    rig = make_rig(there="ur10", model="ur10")
+    assert rig.arm.facts().remote is None  # it knows no such thing
+    rig.to_start()
+    executed = rig.arm.execute(rig.path)
+    rig.arm.retreat(rig.path)
+    assert executed.completed
+    assert rig.joints == pytest.approx(HOME, abs=1e-4)
+
+
 def test_tool_and_payload_are_set_whatever_was_there_before(rig: Rig) -> None:
     rig.to_start()
     state = rig.fault("state")

@@ -190,7 +190,7 @@ def test_switching_to_local_control_stops_the_pour(make_rig: Make) -> None:
     assert (error.kind, error.phase) == ("program ended", "tilt")
     rig.await_rest()
     rig.arm.release()
-    with pytest.raises(ArmRefusedError, match="local control"):
+    with pytest.raises(ArmRefusedError, match="switch it to remote control"):
         rig.arm.untilt()
     rig.fault("remote", active=True)
     holds_until_released(rig)
