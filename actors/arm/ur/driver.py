@@ -328,6 +328,13 @@ class UrArm:
             self._announced = False
             outcome = self._run(motion, leg)
             return self._judge(outcome, leg)
+        except LaboratoryError:
+            raise
+        except BaseException:  # an interrupt at the keyboard, say: whoever waited for the motion doesn't any more
+            self._session.stop(self._stops.ask())
+            self.lock()
+            self._stopped = True
+            raise
         finally:
             self._announced, self._leg = False, None
             self._stops.end()

@@ -48,7 +48,8 @@ def stood_soon(rig: Rig, since: float, limit: float) -> None:
     """The arm came to rest by itself, tilted, within so many seconds of the clock, and stays so."""
     rig.await_rest()
     times, joints = rig.history(since)
-    at_rest = times[np.abs(joints - joints[-1]).max(axis=1) > 1e-5][-1] - since
+    moving = times[np.abs(joints - joints[-1]).max(axis=1) > 1e-5]
+    at_rest = moving[-1] - since if len(moving) else 0.0
     assert at_rest < limit * rig.arm._spec.time_scale
     assert 0.05 < joints[-1][5] - START[5] < 1.3
     later = rig.now
@@ -222,6 +223,24 @@ def test_a_driver_that_hangs_in_mid_pour_stops_the_arm(make_rig: Make, tmp_path:
     finally:
         process.kill()
         process.wait()
+
+
+def test_an_interrupt_at_the_keyboard_stops_the_arm(make_rig: Make) -> None:
+    rig = make_rig(LONG_TILT, time_scale=FASTER)
+    rig.to_start()
+    tilted = Call(rig.await_tilt, 0.15)
+
+    def interrupt() -> None:
+        tilted.result()
+        os.kill(os.getpid(), signal.SIGINT)
+
+    interrupting = Call(interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        rig.arm.execute(rig.path)
+    interrupting.result()
+    stood_soon(rig, rig.now, 1.0)
+    with pytest.raises(ArmNotReleasedError):
+        rig.arm.untilt()
 
 
 # ---- others at the same robot
