@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.arm.joint_path import ExecutedPath, PourPath
+from actors.arm.path.frames import pourer_motion
 from actors.arm.protocol import ArmState
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.errors import ArmError, ArmLostError, ArmRefusedError, ArmStoppedError
@@ -248,9 +249,9 @@ class WiredPour:
         """
         if not await self._agreed(question):
             raise RefusedError("the operator did not let the arm move")
+        await self._rooms.questions.say(f"The arm moves in {self._rooms.spec.announcement:g} s. Keep out of its way.")
         # The driver waits for as long from the release to the first movement.
         await self._rooms.arm.release()
-        await self._rooms.questions.say(f"The arm moves in {self._rooms.spec.announcement:g} s. Keep out of its way.")
 
     # ---- the way back from a stop
 
@@ -367,10 +368,16 @@ class WiredPour:
             **measured.notes,
             "arm": _who(self._facts),
             "executed_s": float(executed.times[-1]),
-            "largest_tilt_deg": math.degrees(float(self._path.tilts.max())),
+            "largest_tilt_deg": math.degrees(self._largest_tilt(executed)),
             "executed": pack(executed),
             "operator": self._rooms.questions.take_log(),
         }
+
+    def _largest_tilt(self, executed: ExecutedPath) -> float:
+        """As read back [rad]."""
+        if len(executed.times) < 2:
+            return 0.0
+        return float(pourer_motion(executed.joints, executed.times, self._rooms.spec).tilt(executed.times).max())
 
     # ---- time and screens
 

@@ -13,6 +13,7 @@ from actors.bench.executed import pack, unpack
 from actors.bench.questions import NobodyAnsweredError, Questions
 from actors.bench.reality import LONGEST_REST, executed_pour
 from actors.bench.things import POURER, RECEIVER, TRAY, Things
+from actors.bench.virtual_operator import Hands, PlayedOperator
 from actors.operator import OperatorSpec, Question
 from actors.protocols import Notice
 
@@ -127,6 +128,32 @@ def test_a_question_that_nobody_answers_is_repeated_and_then_given_up():
     assert sum("still waiting" in notice.text for notice in notices) == 2
     assert "no answer" in notices[-1].text
     assert questions.take_log()[0]["about"] == "tray_wiped"
+
+
+def test_a_person_can_play_on_a_virtual_bench_and_reads_weights_off_the_question():
+    put: list[float] = []
+
+    async def onto(mass: float) -> None:
+        put.append(mass)
+
+    class Reader(Person):
+        async def ask(self, question: Question) -> str:
+            await super().ask(question)
+            return question.text.split("shows ")[1].rstrip(".)") if question.wants == "weight" else "done"
+
+    async def play() -> tuple[Things, str]:
+        things = Things(Placement.TRAY)
+        hands = Hands(things, onto)
+        hands.prepare(0.2, (1,))
+        played = PlayedOperator(Reader(0.0), hands)
+        await played.ask(Question("Wipe the tray.", "done", about="tray_wiped"))
+        await played.ask(Question("Fill the pourer.", "done", about="pourer_full"))
+        return things, await played.ask(Question("Weigh the tray.", "weight", about="tray_before"))
+
+    things, typed = asyncio.run(play())
+    assert put == [pytest.approx(TRAY), pytest.approx(TRAY + POURER + 0.2, abs=5e-3)]
+    assert typed == f"{1e3 * TRAY:.1f} g"
+    assert things.in_pourer == pytest.approx(0.2, abs=5e-3)
 
 
 @pytest.mark.parametrize("placement", Placement)
