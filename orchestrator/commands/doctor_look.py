@@ -23,6 +23,9 @@ from actors.arm.survey import (
     read_state,
 )
 
+PATIENT_GAP = 0.1
+"""Between two packages over RTDE [s]; beyond it they are looked at once more."""
+
 State = Literal["ok", "warn", "fail"]
 
 
@@ -105,6 +108,8 @@ def look_at(host: str) -> Findings:
     if ports[RTDE] is None:
         with _noting(problems):
             exchange = read_exchange(address)
+            if exchange.gap > PATIENT_GAP:  # a hiccup of this computer, or the rule? The better of two tells
+                exchange = min(exchange, read_exchange(address), key=lambda e: e.gap)
     return Findings(address, ports, dashboard, state, exchange, tuple(problems))
 
 

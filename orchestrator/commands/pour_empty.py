@@ -117,7 +117,7 @@ class _Cycle:
             return
         with contextlib.suppress(LaboratoryError):
             self._arm.release()
-            say(f"ready again: {self._arm.recover()}")
+            say(f"ready again: {self._arm.recover() or 'nothing had to be done'}")
         self._released()
         self._moving("upright", self._arm.untilt)
         self._released()

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import TracebackType
 
 
@@ -30,7 +31,7 @@ class Terminal:
             stdout=theirs,
             stderr=theirs,
             cwd=cwd,
-            env={**os.environ, "TERM": "dumb", "COLUMNS": "200", "PYTHONPATH": os.getcwd()},
+            env={**os.environ, "TERM": "dumb", "COLUMNS": "200", "PYTHONPATH": str(Path.cwd())},
             start_new_session=True,
         )
         os.close(theirs)
@@ -50,6 +51,12 @@ class Terminal:
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
+        with contextlib.suppress(OSError):
+            os.close(self._keys)
+
+    def close(self) -> None:
+        """Close the terminal's window, as its program is told."""
+        os.kill(self.process.pid, signal.SIGHUP)
         os.close(self._keys)
 
     def expect(self, text: str, patience: float = 40.0) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from math import degrees, radians
 from pathlib import Path
@@ -13,7 +14,9 @@ from typer.testing import CliRunner, Result
 
 from actors.virtual_ur.launcher import VirtualController
 from orchestrator.cli import app
+from orchestrator.journal import JournalReader
 from orchestrator.safety import SafetyRecord, write_record
+from orchestrator.states import State
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal
 
@@ -188,3 +191,36 @@ def test_protective_stop_in_a_pour_is_mended_by_consent_weighed_and_left_for_a_p
     assert "protective stop during tilt" in terminal.screen
     joints = controller.fault("state")["joints"]
     assert joints == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)
+
+
+@pytest.mark.slow
+def test_terminal_that_is_closed_in_a_pour_leaves_the_arm_at_home_and_the_pour_unknown(
+    tmp_path: Path, controller: VirtualController
+) -> None:
+    campaign = hardware.write_rig(tmp_path, controller.address)
+    checksum = controller.fault("state")["checksum"]
+    write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
+    terminal = Terminal("pour", str(campaign), *ACTION, "--in-process", "--arm", cwd=str(tmp_path))
+    try:
+        for typed in ("rig", *WEIGHTS[:3]):
+            terminal.expect("> ")
+            terminal.type(typed)
+        terminal.expect("May it?")
+        terminal.expect("> ")
+        terminal.type("yes")
+        terminal.expect("now")
+        wait_until(lambda: bool(controller.fault("state")["program"]))
+        terminal.close()
+        assert terminal.process.wait(90) != 0
+    finally:
+        terminal.__exit__(None, None, None)
+    assert controller.fault("state")["joints"] == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)
+    with JournalReader(next((tmp_path / "runs").glob("*/journal.sqlite"))) as journal:
+        assert journal.state() is State.UNKNOWN
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
