@@ -207,8 +207,20 @@ def wanted_sets(options: argparse.Namespace) -> list[tuple[tuple[str, ...], dict
         SystemExit: `--known` names no parameter, or gives no number that it may have.
     """
     sets: list[tuple[tuple[str, ...], dict[str, float]]] = [(names, {}) for names in growing_sets()]
+    known = known_values(options.known)
+    if known:
+        sets.append((tuple(name for name in sets[-1][0] if name not in known), known))
+    return sets
+
+
+def known_values(texts: Sequence[str]) -> dict[str, float]:
+    """What `--known` says: values of parameters by name.
+
+    Raises:
+        SystemExit: it names no parameter, or gives no number that it may have.
+    """
     known: dict[str, float] = {}
-    for text in options.known:
+    for text in texts:
         name, _, value = text.partition("=")
         try:
             known[name] = float(value)
@@ -218,9 +230,7 @@ def wanted_sets(options: argparse.Namespace) -> list[tuple[tuple[str, ...], dict
             raise SystemExit(f"--known {text}: no such parameter; there are {there_are}") from None
         except ValueError as error:
             raise SystemExit(f"--known {text}: {error}") from None
-    if known:
-        sets.append((tuple(name for name in sets[-1][0] if name not in known), known))
-    return sets
+    return known
 
 
 def set_name(names: Sequence[str], known: Mapping[str, float]) -> str:
@@ -261,8 +271,8 @@ def _rounded(theta: Mapping[str, float]) -> dict[str, float]:
 class Kept:
     """Calibrations that have been made, by everything that decides them; one file for each."""
 
-    def __init__(self, *, fresh: bool) -> None:
-        self._folder = cache_directory() / "calibration-power"
+    def __init__(self, folder: str = "calibration-power", *, fresh: bool) -> None:
+        self._folder = cache_directory() / folder
         self._folder.mkdir(exist_ok=True)
         if fresh:
             for path in self._folder.glob("*.json"):

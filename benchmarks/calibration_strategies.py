@@ -1,0 +1,240 @@
+"""C1, C2, C3, C4 and no calibration at all: discrepancy of θ* on recorded pours that it never saw, and the price.
+
+    python benchmarks/calibration_strategies.py [CAMPAIGN] [--search particles wall_distance]
+                                                [--rows C1=2800 C2=504 C3=1652 C4=108] [--seeds 11 12 13]
+                                                [--known cohesion=0 viscosity=0 lip_drop=0]
+                                                [--random 8] [--workers 1] [--fresh] [--json]
+
+Each row is a strategy with a budget of single simulated pours, the paper's unless given; `--rows C1=504 C2=504 C3=504
+C4=504` compares them at one price. All search the same parameters, two as in the paper; what is not searched has the
+value given with `--known`, the campaign's fixed one, or Decant's default. θ* is then simulated on each recorded pour:
+mean |measured − simulated| of the normalised spillage on training, test and transfer pours, and the quartiles over all
+pours that were not trained on (test and transfer, all seeds). Seeds change the random choices and the initial
+positions; C1 has no random choices.
+
+'uncalibrated' are Decant's defaults; 'random' the median over θ drawn from the searched box.
+
+Every calibration is a process of its own, `--workers` of them at a time, and kept in the cache directory: what was
+interrupted goes on where it stopped. `--fresh` forgets what was kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from calibration_power import CAMPAIGN, SPLITS, Answers, Kept, known_values, play, recorded, searching
+from machine import describe, run_self, say, show
+
+from orchestrator.config.errors import ConfigError
+from orchestrator.config.load import load_campaign
+from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import CalibrationName, CalibrationPlan, CampaignPlan
+from orchestrator.stages import CALIBRATION, calibration_stages, stage_seed
+from orchestrator.strategies.evaluation import Evaluation, random_parameters
+from sim_engine.liquid import SimulationParameters
+
+PAPER = ("C1=2800", "C2=504", "C3=1652", "C4=108")
+UNCALIBRATED, RANDOM = "uncalibrated", "random"
+TRAINED_ON = "train"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A strategy and what it may spend.
+
+    Attributes:
+        name: 'C1' to 'C4', `UNCALIBRATED` or `RANDOM`.
+        budget: single simulated pours; of random θ their number.
+    """
+
+    name: str
+    budget: int = 0
+
+
+def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
+    """The calibration by another strategy: as many θ as the budget allows.
+
+    Raises:
+        SystemExit: it allows none.
+    """
+    pours = sum(scored.pour.split == TRAINED_ON and scored.pour.spillage is not None for scored in recorded(plan))
+    names, thetas = plan.parameters.names, row.budget // pours
+    changed = replace(plan, strategy=cast("CalibrationName", row.name), simulations=row.budget)
+    if row.name == "C4":
+        return replace(changed, initial=min(plan.initial, row.budget))
+    per_axis = 1
+    while (per_axis + 1) ** len(names) <= thetas:
+        per_axis += 1
+    if thetas < 1 or (row.name == "C1" and per_axis < 2):
+        raise SystemExit(f"--rows {row.name}={row.budget}: too few for {len(names)} parameters and {pours} pours")
+    if row.name == "C1":
+        return replace(changed, grid=dict.fromkeys(names, per_axis), simulations=pours * per_axis ** len(names))
+    return replace(changed, thetas=thetas, initial=min(plan.initial, thetas), simulations=pours * thetas)
+
+
+def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
+    """Calibrate as a campaign would, and simulate what was found on all recorded pours.
+
+    Args:
+        plan: its calibration is `at_price`.
+        seed: takes the place of the campaign's.
+    """
+    calibration = plan.calibration
+    assert calibration is not None
+    answers, begun, label = Answers(plan), time.process_time(), f"{row.name}, seed {seed}"
+    found: Mapping[str, Any] = {}
+    if row.name == UNCALIBRATED:
+        # fixed values are what anybody would take; those that are searched have their defaults
+        thetas = {"theta": SimulationParameters.from_values(calibration.fixed_parameters)}
+    elif row.name == RANDOM:
+        thetas = random_parameters(calibration.parameters, calibration.fixed_parameters, row.budget, seed)
+    else:
+        (stage,) = (stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION)
+        strategy = stage.build({}, stage_seed(seed, stage.name))
+        play(strategy, answers, plan.parallel_simulations, label)
+        found = strategy.result()
+        thetas = {"theta": SimulationParameters.model_validate(found["theta"])}
+    judge = Evaluation(thetas, recorded(calibration), stage_seed(seed, "evaluation"))
+    play(judge, answers, plan.parallel_simulations, f"{label}, judged")
+    answers.close()
+    unseen = [
+        abs(pair["measured"] - pair["simulated"])
+        for pair in cast("Sequence[Mapping[str, Any]]", judge.result()["pairs"])
+        if pair["simulated"] is not None and pair["split"] != TRAINED_ON
+    ]
+    return {
+        "theta": None if row.name == RANDOM else thetas["theta"].model_dump(),
+        "discrepancy": {
+            split: judge.random_median(split) if row.name == RANDOM else judge.discrepancy("theta", split)
+            for split in SPLITS
+        },
+        "unseen": unseen,
+        "simulations": found.get("simulations", 0),
+        "lost": found.get("lost", 0),
+        "expected": found.get("predicted_discrepancy"),
+        "cpu_s": round(time.process_time() - begun, 1),
+    }
+
+
+def table_row(row: Row, calibration: CalibrationPlan | None, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over the seeds, each seed's beside them, and quartiles over the unseen pours."""
+    shown: dict[str, Any] = {"strategy": row.name, "simulations": max(one["simulations"] for one in found)}
+    if calibration is not None and row.name in ("C1", "C2", "C3"):
+        shown["thetas"] = calibration.thetas or next(iter(calibration.grid.values())) ** len(calibration.grid)
+    for split in SPLITS:
+        values = [one["discrepancy"][split] for one in found if one["discrepancy"][split] is not None]
+        shown[split] = round(statistics.mean(values), 4) if values else None
+        shown[f"{split}_seeds"] = [round(value, 4) for value in values]
+    unseen = sorted(error for one in found for error in one["unseen"])
+    if len(unseen) > 1:
+        shown["unseen_quartiles"] = [round(value, 4) for value in statistics.quantiles(unseen, n=4)]
+    shown["expected"] = [round(one["expected"], 4) for one in found if one["expected"] is not None]
+    shown["thetas_found"] = [
+        {name: float(f"{value:.4g}") for name, value in one["theta"].items()} for one in found if one["theta"]
+    ]
+    shown["lost"] = sum(one["lost"] for one in found)
+    shown["cpu_s"] = round(sum(one["cpu_s"] for one in found), 1)
+    return shown
+
+
+def rows_of(options: argparse.Namespace) -> list[Row]:
+    """The rows of the table, the uncalibrated first.
+
+    Raises:
+        SystemExit: `--rows` names no strategy, or no budget.
+    """
+    rows = [Row(UNCALIBRATED), *([Row(RANDOM, options.random)] if options.random > 0 else [])]
+    for text in options.rows:
+        name, _, budget = text.partition("=")
+        if name not in ("C1", "C2", "C3", "C4") or not budget.isdigit() or int(budget) < 1:
+            raise SystemExit(f"--rows {text}: should be a strategy and its simulations, for example C3=1652")
+        rows.append(Row(name, int(budget)))
+    return rows
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="with recorded pours")
+    parser.add_argument("--search", nargs="+", default=("particles", "wall_distance"), metavar="PARAMETER")
+    parser.add_argument("--known", nargs="*", default=[], metavar="NAME=VALUE", help="of what is not searched")
+    parser.add_argument("--rows", nargs="+", default=PAPER, metavar="STRATEGY=SIMULATIONS")
+    parser.add_argument("--seeds", type=int, nargs="+", default=(11, 12, 13))
+    parser.add_argument("--random", type=int, default=8, help="random θ to compare with, each seed; 0 for none")
+    parser.add_argument("--workers", type=int, default=1, help="calibrations at a time")
+    parser.add_argument("--fresh", action="store_true", help="forget what was kept")
+    parser.add_argument("--json", action="store_true", help="one line of JSON")
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # this is a process that makes one calibration
+    return parser.parse_args()
+
+
+def searched(plan: CampaignPlan, names: Sequence[str], known: Mapping[str, float]) -> CampaignPlan:
+    """The campaign with only these parameters searched, and nothing but its calibration.
+
+    Raises:
+        SystemExit: it has no recorded pours, or doesn't search these.
+    """
+    calibration = plan.calibration
+    if calibration is None or calibration.records is None:
+        raise SystemExit(f"{plan.source}: a campaign with recorded pours is needed (calibration.pours.from)")
+    unknown = sorted(set(names) - set(calibration.parameters.names))
+    if unknown:
+        there_are = ", ".join(calibration.parameters.names)
+        raise SystemExit(f"--search {' '.join(unknown)}: not searched by {plan.source.name}; it searches {there_are}")
+    default = SimulationParameters().particles
+    both = sorted(set(known) & set(names))
+    if both:
+        raise SystemExit(f"--known {' '.join(both)}: searched as well; say one of them")
+    return replace(plan, calibration=searching(calibration, names, default, known), deployment=None)
+
+
+def main() -> None:
+    """Measure and print."""
+    options = _options()
+    try:
+        plan = searched(load_campaign(options.campaign), options.search, known_values(options.known))
+    except ConfigError as error:
+        raise SystemExit(str(error)) from None
+    calibration = plan.calibration
+    assert calibration is not None
+    rows = rows_of(options)
+    plans = [
+        plan if row.name in (UNCALIBRATED, RANDOM) else replace(plan, calibration=at_price(calibration, row))
+        for row in rows
+    ]
+    if options.one is not None:
+        number, seed = map(int, options.one.split())
+        print(json.dumps(measure(plans[number], rows[number], seed)))
+        return
+    same = [str(options.campaign.resolve()), "--search", *options.search, "--rows", *options.rows]
+    same += ["--known", *options.known] if options.known else []
+    same += [f"--random={options.random}"]
+    machine, kept, begun = describe(), Kept("calibration-strategies", fresh=options.fresh), time.monotonic()
+
+    def make(job: tuple[int, int]) -> dict[str, Any]:
+        number, seed = job
+        row = rows[number]
+        key = ["strategies", machine["fingerprint"], fingerprint(plans[number]), row.name, row.budget, seed]
+        return kept.get(key, lambda: run_self(__file__, *same, f"--one={number} {seed}"))
+
+    jobs = [(number, seed) for number in range(len(rows)) for seed in options.seeds]
+    with ThreadPoolExecutor(max(options.workers, 1)) as pool:
+        found = dict(zip(jobs, pool.map(make, jobs), strict=True))
+    say(f"all made, {time.monotonic() - begun:.0f} s")
+    table = [
+        table_row(row, plans[number].calibration, [found[number, seed] for seed in options.seeds])
+        for number, row in enumerate(rows)
+    ]
+    result = {"campaign": options.campaign.stem, "searched": list(options.search), "seeds": list(options.seeds)}
+    show({**result, "rows": table, "machine": machine}, options.json)
+
+
+if __name__ == "__main__":
+    main()

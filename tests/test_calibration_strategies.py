@@ -1,0 +1,115 @@
+"""The benchmark that compares C1 to C4: the same pours judge all of them, and nobody spends more than it may."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from actors.optimizer.core.propose import propose
+from orchestrator.config.load import load_campaign
+from orchestrator.plan import CampaignPlan
+from orchestrator.requests import Outcome, Request, Simulate, Simulated, Suggest, Suggested
+from sim_engine.action import Action
+from tests.orchestrator.play import outcome_of
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import calibration_strategies
+
+    return calibration_strategies
+
+
+@pytest.fixture
+def plan(bench: ModuleType) -> CampaignPlan:
+    found: CampaignPlan = bench.searched(load_campaign(bench.CAMPAIGN), ["particles", "wall_distance"], {})
+    return found
+
+
+class Toy:
+    """A simulator that knows the recorded pours, and is right where its liquid keeps 1.2 spacings from walls."""
+
+    def __init__(self, plan: CampaignPlan) -> None:
+        assert plan.calibration is not None
+        assert plan.calibration.records is not None
+        self._pours = plan.calibration.records.pours
+
+    def __call__(self, request: Request) -> Outcome:
+        if isinstance(request, Suggest):
+            return Suggested(propose(request.problem))
+        assert isinstance(request, Simulate)
+        near = min(self._pours, key=lambda pour: _apart(pour.action, request.action))
+        off = 0.5 * (request.parameters.wall_distance - 1.2)
+        return Simulated(outcome_of(min(max((near.normalised_spillage or 0.0) - off, 0.0), 1.0)))
+
+    def close(self) -> None:
+        pass
+
+
+def _apart(one: Action, other: Action) -> float:
+    return abs(one.angular_velocity - other.angular_velocity) + abs(one.max_angle - other.max_angle)
+
+
+def test_budgets_are_the_papers_and_none_is_exceeded(bench: ModuleType, plan: CampaignPlan) -> None:
+    calibration = plan.calibration
+    assert calibration is not None
+    c1, c2, c3, c4 = (
+        bench.at_price(calibration, bench.Row(name, budget))
+        for name, budget in (("C1", 2800), ("C2", 504), ("C3", 1652), ("C4", 108))
+    )
+    assert c1.grid == {"particles": 10, "wall_distance": 10}
+    assert (c2.thetas, c3.thetas, c4.simulations) == (18, 59, 108)
+    assert [one.simulations for one in (c1, c2, c3)] == [2800, 504, 1652]
+    for name in ("C1", "C2", "C3", "C4"):
+        assert bench.at_price(calibration, bench.Row(name, 300)).simulations <= 300
+    with pytest.raises(SystemExit, match="too few for 2 parameters and 28 pours"):
+        bench.at_price(calibration, bench.Row("C1", 111))
+
+
+@pytest.mark.parametrize(("name", "budget"), [("C1", 140), ("C2", 140), ("C3", 280), ("C4", 20)])
+def test_a_calibrated_simulator_beats_an_uncalibrated_one_on_pours_that_it_never_saw(
+    bench: ModuleType, plan: CampaignPlan, name: str, budget: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "Answers", Toy)
+    assert plan.calibration is not None
+    row = bench.Row(name, budget)
+    priced = replace(plan, calibration=bench.at_price(plan.calibration, row))
+    found: dict[str, Any] = bench.measure(priced, row, 11)
+    without = bench.measure(plan, bench.Row(bench.UNCALIBRATED), 11)
+    assert found["simulations"] <= budget
+    assert set(found["discrepancy"]) == {"train", "test", "transfer"}
+    assert found["discrepancy"]["test"] < 0.6 * without["discrepancy"]["test"]
+    assert len(found["unseen"]) == 4 + 16
+    shown = bench.table_row(row, priced.calibration, [found, found])
+    assert shown["test_seeds"] == [shown["test"]] * 2
+    assert len(shown["unseen_quartiles"]) == 3
+
+
+def test_random_parameters_are_told_by_their_median(
+    bench: ModuleType, plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "Answers", Toy)
+    found = bench.measure(plan, bench.Row(bench.RANDOM, 5), 1)
+    assert found["discrepancy"]["test"] > 0.0
+    assert found["theta"] is None
+
+
+def test_what_can_t_be_compared_is_refused(bench: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusal(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["calibration_strategies.py", *arguments])
+        with pytest.raises(SystemExit) as refused:
+            bench.main()
+        return str(refused.value)
+
+    assert "--rows C7=3: should be a strategy and its simulations" in refusal("--rows", "C7=3")
+    assert "not searched by recorded.yaml; it searches particles" in refusal("--search", "friction")
+    assert "--known particles: searched as well" in refusal("--known", "particles=700")
+    quickstart = BENCHMARKS.parent / "configs" / "campaigns" / "quickstart.yaml"
+    assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
