@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from actors.arm.spec import UrArmSpec
+from actors.protocols import InvalidActionError
 from orchestrator.plan import CampaignPlan
 from sim_engine.action import Action
 from sim_engine.contact import describe_contact, first_contact
@@ -27,6 +29,7 @@ RANDOM_ACTIONS = 16
 
 @dataclass
 class _Checker:
+    arm: UrArmSpec | None = None
     problems: list[str] = field(default_factory=list)
     vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
 
@@ -57,23 +60,42 @@ class _Checker:
         return (pourer, receiver) if ok else None
 
     def reachable(self, scene: Scene, actions: Space, role: str) -> None:
-        """Some action of the space must not touch."""
+        """Some action of the space must not touch, and be one that the arm can make."""
         vessels = self.scene(scene, role)
         if vessels is None:
             return
-        first: str | None = None
+        first = beyond = ""
         for chosen in _trials(actions):
             try:
                 contact = touch(scene, scene.action(chosen), *vessels)
             except ValueError as error:  # an action out of bounds, or a motion that can't be made
                 contact = str(error)
             if contact is None:
-                return
-            first = first or contact
+                problem = self._for_the_arm(scene, scene.action(chosen), *vessels)
+                if not problem:
+                    return
+                beyond = beyond or problem
+            else:
+                first = first or contact
+        if beyond:
+            self.problems.append(f"{role}: the arm can make no action that was tried; for example {beyond}")
+            return
         self.problems.append(
             f"{role}: the vessels touch at every action that was tried; for example {first}. "
             f"A larger x_offset or height would clear them"
         )
+
+    def _for_the_arm(self, scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str:
+        """Why the laboratory's arm, if it has one, can't make it; '' if it can."""
+        if self.arm is None:
+            return ""
+        from actors.arm.path.plan import plan_path
+
+        try:
+            plan_path(plan_motion(scene, action, pourer, receiver), self.arm, pourer, receiver)
+        except InvalidActionError as error:
+            return f"{action.display(*action.values())}: {error}"
+        return ""
 
     def recorded(self, scene: Scene, recorded: list[Action], role: str) -> None:
         """Weighed pours have been poured: if their vessels touch, the scene is described wrongly."""
@@ -101,12 +123,13 @@ def check_campaign(plan: CampaignPlan) -> list[str]:
     """Build the vessels of a campaign and try its actions.
 
     Checked for every scene: both vessels can be built and hold the liquid; some action of the space lets them stay
-    clear of each other (middle, corners and a few drawn at random are tried); recorded pours do.
+    clear of each other, and can be made by the laboratory's arm (middle, corners and a few drawn at random are tried);
+    recorded pours stay clear.
 
     Returns:
         What is wrong, one text each; empty when the campaign can start.
     """
-    checker = _Checker()
+    checker = _Checker(plan.laboratory.arm)
     if plan.calibration is not None:
         calibration = plan.calibration
         if calibration.records is None:

@@ -11,6 +11,7 @@ import pytest
 from actors.balance.placement import Placement
 from actors.spec import LaboratorySpec
 from orchestrator.codec import from_json, to_json
+from orchestrator.config.check import check_campaign
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.laboratory import laboratory_as_file
 from orchestrator.config.load import load_campaign, load_laboratory
@@ -110,7 +111,10 @@ CASES = {
         r"bench.balance: is of a bench without wires",
     ),
     "a bench of numbers with an operator": (TWIN + "operator: {time: 85 s}\n", r"operator: belongs to an arm"),
-    "a cell without an arm": (TWIN + "cell: {receiver: {x: 1 m, y: 0 m, z: 0 m}, direction: 90 deg}\n", r"cell: belongs to an arm"),
+    "a cell without an arm": (
+        TWIN + "cell: {receiver: {x: 1 m, y: 0 m, z: 0 m}, direction: 90 deg}\n",
+        r"cell: belongs to an arm",
+    ),
     "a port on a virtual bench": (
         changed(VIRTUAL, ("  repeatability", "  port: /dev/ttyUSB0\n  repeatability")),
         r"balance.virtual: a balance has a 'port' or is 'virtual'",
@@ -157,3 +161,16 @@ def test_a_controller_may_get_another_address_between_two_parts_of_a_run_and_the
 
 
 QUICKSTART = CONFIGS / "campaigns" / "quickstart.yaml"
+
+
+def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
+    plan = load_campaign(QUICKSTART)
+    assert check_campaign(plan) == []
+    assert plan.laboratory.arm is not None
+    arm = plan.laboratory.arm
+    lower = replace(arm.limits, box_high=(arm.limits.box_high[0], arm.limits.box_high[1], 0.25))
+    low = replace(plan, laboratory=replace(plan.laboratory, arm=replace(arm, limits=lower)))
+    problems = check_campaign(low)
+    assert len(problems) == 2
+    assert problems[0].startswith("calibration: the arm can make no action that was tried; for example")
+    assert "deployment into 'narrow'" in problems[1]
