@@ -155,7 +155,7 @@ def test_noise_that_is_the_same_everywhere_stays_so(deviation, seed):
 
 
 def test_a_few_pours_cannot_tell_and_noise_stays_constant():
-    data = scattered(12, lambda cost: 0.01 + 0.3 * cost, 4)
+    data = scattered(12, lambda cost: 0.01 + 0.3 * cost, 2)
     assert propose(SuggestProblem(PLANE, data, noise="varying")).points == propose(SuggestProblem(PLANE, data)).points
 
 

@@ -130,5 +130,6 @@ def test_before_anything_was_observed_refused_places_are_left():
 def test_an_answer_says_how_likely_its_proposals_are_refused():
     data = observed(lambda x, y: (x - 0.7) ** 2 + (y - 0.7) ** 2, [(0.1, 0.2), (0.3, 0.1), (0.2, 0.7)])
     answer = propose(SuggestProblem(PLANE, data, count=2, infeasible=((0.7, 0.7),)))
+    assert len(answer.feasibilities) == 2
     assert all(0.3 < p < 1.0 for p in answer.feasibilities)
     assert propose(SuggestProblem(PLANE, data)).feasibilities == ()

@@ -1,0 +1,253 @@
+"""Decant's optimiser beside others on the same problems: regret of what each reports at the end.
+
+    python benchmarks/optimisers.py [--problems spill2 narrow2 ...] [--optimisers Decant "BoTorch UCB" ...] [--seeds 30]
+                                    [--budget SECONDS] [--fresh NAME ...] [--speed] [--json]
+
+All start at the same points, see the same noise and may evaluate as often (`optimiser_problems.py`). Reported: what an
+optimiser would hand to its user, judged without noise: by posterior mean for ours and BoTorch, else the lowest
+observation. Visited: the best of what it tried, whatever it reports. Means with 95 % bootstrap intervals over seeds.
+
+The others live in an environment of their own in the cache directory, made when it is first needed (about 1 GB); they
+are no dependency of Decant. Every run of (problem, optimiser, seed) is kept there too: what was interrupted goes on.
+`--budget` ends each optimiser after so many CPU seconds; `--fresh` forgets what was kept of some. `--speed` measures
+what a fit and a suggestion cost instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+import venv
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import describe, pin, say, show, single_threaded
+from optimiser_problems import BY_NAME, PROBLEMS, World
+from optimiser_rivals import RIVALS, luckiest, play
+
+from actors.optimizer.core.problem import Data, SuggestProblem
+from actors.optimizer.core.propose import propose
+from sim_engine.cache import cache_directory
+from sim_engine.space import Axis, Space
+
+REQUIREMENTS = ("scikit-optimize==0.10.2", "bayesian-optimization==3.4.0", "torch==2.13.0", "botorch==0.18.0")
+RIVALS_FILE = Path(__file__).with_name("optimiser_rivals.py")
+OURS = ("Decant", "random search", "Sobol")
+RESAMPLES = 4000
+
+
+def environment() -> Path:
+    """The Python of the others' environment, made if there is none.
+
+    Raises:
+        SystemExit: it can't be made, with what pip said.
+    """
+    folder = cache_directory() / f"rivals-1-py{sys.version_info[0]}.{sys.version_info[1]}"
+    python = folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    ready = folder / "ready"
+    if ready.exists():
+        return python
+    say(f"making an environment for {', '.join(REQUIREMENTS)} in {folder} (once)")
+    shutil.rmtree(folder, ignore_errors=True)
+    venv.create(folder, with_pip=True)
+    command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *REQUIREMENTS]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise SystemExit(f"the others can't be installed; pip says:\n{done.stderr.strip()}")
+    ready.touch()
+    return python
+
+
+class Kept:
+    """Results in the cache, one line of JSON each, appended as they come."""
+
+    def __init__(self) -> None:
+        self._path = cache_directory() / "optimisers.jsonl"
+        lines = self._path.read_text(encoding="utf-8").splitlines() if self._path.exists() else []
+        self.rows: dict[tuple[str, str, int], dict[str, Any]] = {}
+        for line in lines:
+            row = json.loads(line)
+            self.rows[row["optimiser"], row["problem"], row["seed"]] = row
+
+    def add(self, optimiser: str, row: dict[str, Any]) -> None:
+        """Keep one more."""
+        row = {"optimiser": optimiser, **row}
+        self.rows[optimiser, row["problem"], row["seed"]] = row
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def forget(self, optimisers: Sequence[str]) -> None:
+        """Drop what was kept of some optimisers."""
+        self.rows = {key: row for key, row in self.rows.items() if key[0] not in optimisers}
+        lines = [json.dumps(row) + "\n" for row in self.rows.values()]
+        beside = self._path.with_suffix(".new")
+        beside.write_text("".join(lines), encoding="utf-8")
+        beside.replace(self._path)
+
+
+def ours(name: str, world: World) -> dict[str, Any]:
+    """One run of Decant's optimiser as a campaign uses it, or of blind search."""
+    axes = [
+        Axis(f"x{i}", c.lower, c.upper, "log" if c.log else "linear", c.integer)
+        for i, c in enumerate(world.problem.coordinates)
+    ]
+    space = Space(tuple(axes))
+    blind = {"random search": "random", "Sobol": "sobol"}.get(name)
+
+    def problem(points: list[Any], costs: list[float], **changes: Any) -> SuggestProblem:
+        data = Data(tuple(tuple(map(float, point)) for point in points), tuple(costs))
+        return SuggestProblem(space, data, seed=1000 * world.seed + len(points), **changes)
+
+    def ask(points: list[Any], costs: list[float]) -> Any:
+        return np.array(propose(problem(points, costs, acquisition=blind or "lcb")).points[0])
+
+    def report(points: list[Any], costs: list[float]) -> Any:
+        if blind:
+            return luckiest(points, costs)
+        return np.array(propose(problem(points, costs, count=0)).best_point)
+
+    return play(world, ask, report)
+
+
+def rival(name: str, jobs: Sequence[tuple[str, int]], seconds: float) -> Iterator[dict[str, Any]]:
+    """Results of one of the others, as they come, from a child that ends when no more jobs can come.
+
+    Raises:
+        SystemExit: it failed, with the end of what it said.
+    """
+    command = [str(environment()), str(RIVALS_FILE), name]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    child = subprocess.Popen(command, **pipes, text=True, env=single_threaded())  # type: ignore[call-overload]
+    try:
+        spent = 0.0
+        for problem, seed in jobs:
+            child.stdin.write(json.dumps({"problem": problem, "seed": seed}) + "\n")
+            child.stdin.flush()
+            line = child.stdout.readline()
+            if not line:
+                raise SystemExit(f"{name} ended with {child.wait()}:\n{child.stderr.read()[-2000:]}")
+            row = json.loads(line)
+            yield row
+            spent += row["total_s"]
+            if spent > seconds:
+                break
+    finally:
+        child.kill()
+        child.wait()
+
+
+def run(optimisers: Sequence[str], problems: Sequence[str], seeds: int, seconds: float, kept: Kept) -> None:
+    """Run what is missing; seeds outermost, so that what time allows is spread over all problems."""
+    for name in optimisers:
+        jobs = [(p, seed) for seed in range(seeds) for p in problems if (name, p, seed) not in kept.rows]
+        if not jobs:
+            continue
+        say(f"{name}: {len(jobs)} runs")
+        if name in RIVALS:
+            for row in rival(name, jobs, seconds):
+                kept.add(name, row)
+            continue
+        started = time.process_time()
+        for problem, seed in jobs:
+            kept.add(name, ours(name, World(BY_NAME[problem], seed)))
+            if time.process_time() - started > seconds:
+                break
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Mean and its 95 % bootstrap interval (percentiles)."""
+    array = np.array(values)
+    means = array[np.random.default_rng(0).integers(0, len(array), (RESAMPLES, len(array)))].mean(axis=1)
+    low, high = np.percentile(means, (2.5, 97.5))
+    return float(array.mean()), float(low), float(high)
+
+
+def table(optimisers: Sequence[str], problems: Sequence[str], seeds: int, kept: Kept) -> list[dict[str, Any]]:
+    """A row for each problem and optimiser."""
+    rows = []
+    for problem in problems:
+        for name in optimisers:
+            runs = [kept.rows[name, problem, seed] for seed in range(seeds) if (name, problem, seed) in kept.rows]
+            if not runs:
+                continue
+            mean, low, high = interval([run["reported"] for run in runs])
+            rows.append(
+                {
+                    "problem": problem,
+                    "optimiser": name,
+                    "reported": round(mean, 4),
+                    "interval": [round(low, 4), round(high, 4)],
+                    "median": round(statistics.median(run["reported"] for run in runs), 4),
+                    "visited": round(statistics.fmean(run["visited"] for run in runs), 4),
+                    "per_evaluation": round(statistics.fmean(run["poured"] for run in runs), 3),
+                    "seeds": len(runs),
+                    "ms": round(1e3 * statistics.median(run["cpu_s"] for run in runs), 1),
+                }
+            )
+    return rows
+
+
+def speed() -> list[dict[str, Any]]:
+    """CPU time of a fit, and of a fit with a proposal, at 100 observations: the quickest of five."""
+    rows = []
+    for dimension in (2, 4, 6):
+        space = Space(tuple(Axis(f"x{i}", 0.0, 1.0) for i in range(dimension)))
+        rng = np.random.default_rng(dimension)
+        points = rng.random((100, dimension))
+        costs = 1.0 - np.exp(-((4.0 * np.maximum(np.linalg.norm(points - 0.4, axis=1) - 0.2, 0.0)) ** 1.5))
+        costs += (0.01 + 0.1 * costs) * rng.standard_normal(100)
+
+        def data(part: slice, points: Any = points, costs: Any = costs) -> Data:
+            return Data(tuple(map(tuple, points[part].tolist())), tuple(costs[part].tolist()))
+
+        everything, pours, simulations = data(slice(None)), data(slice(15)), data(slice(15, None))
+        for mean, noise in (
+            ("constant", "constant"),
+            ("constant", "varying"),
+            ("simulated", "constant"),
+            ("pooled", "constant"),
+            ("scaled", "constant"),
+        ):
+            question = SuggestProblem(space, everything, noise=noise)  # type: ignore[arg-type]
+            if mean != "constant":
+                question = replace(question, data=pours, simulated=simulations, mean=mean)
+            fit = min(propose(replace(question, count=0)).seconds for _ in range(5))
+            both = min(propose(question).seconds for _ in range(5))
+            row = {"dimension": dimension, "mean": mean, "noise": noise}
+            rows.append({**row, "fit_ms": round(1e3 * fit, 1), "suggestion_ms": round(1e3 * both, 1)})
+    return rows
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = [*OURS, *RIVALS]
+    parser.add_argument("--problems", nargs="+", choices=list(BY_NAME), default=[p.name for p in PROBLEMS])
+    parser.add_argument("--optimisers", nargs="+", choices=names, default=names)
+    parser.add_argument("--seeds", type=int, default=30)
+    parser.add_argument("--budget", type=float, default=600.0)
+    parser.add_argument("--fresh", nargs="+", choices=names, default=[])
+    parser.add_argument("--speed", action="store_true")
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    core = pin(None)
+    if asked.speed:
+        show({"core": core, "rows": speed(), "machine": describe()}, asked.json)
+        return
+    kept = Kept()
+    kept.forget(asked.fresh)
+    run(asked.optimisers, asked.problems, asked.seeds, asked.budget, kept)
+    rows = table(asked.optimisers, asked.problems, asked.seeds, kept)
+    show({"core": core, "seeds": asked.seeds, "rows": rows, "machine": describe()}, asked.json)
+
+
+if __name__ == "__main__":
+    main()
