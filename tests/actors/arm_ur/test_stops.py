@@ -87,9 +87,8 @@ def test_a_stop_of_an_arm_that_stands_locks_it(resting: Rig) -> None:
         resting.arm.move_to_start(resting.path)
 
 
-@pytest.mark.parametrize(
-    "phase", [pytest.param("tilt", marks=pytest.mark.slow), "hold", pytest.param("return", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow  # what follows protective stops is the same, and is tried in every phase below
+@pytest.mark.parametrize("phase", ["tilt", "hold", "return"])
 def test_after_a_stop_in_any_phase_the_pourer_is_brought_upright_slowly(make_rig: Make, phase: str) -> None:
     rig = make_rig(LONG_HOLD)
     pouring = rig.pouring()
