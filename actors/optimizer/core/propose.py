@@ -201,12 +201,19 @@ def _looks_round(problem: SuggestProblem, asked: _Asked, model: _Model, index: i
     """Whether the next point only fills space: every third one, while the costs could as well be noise.
 
     On a plateau the luckiest pours look like a slope, and following them, mostly along the faces of the cube, would
-    take the whole budget. A prior mean that is not of the data, and a context, are left to what they were made for.
+    take the whole budget. The same holds where every pour came to more than half of all simulations did, and pours
+    alone show no structure: what simulation promised isn't there. The paper's models, and contexts, are left alone.
     """
-    if problem.acquisition != "lcb" or problem.mean != "constant" or problem.context:
-        return False
     number = len(asked.known) + len(asked.busy) + index
-    return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE
+    if problem.acquisition != "lcb" or problem.context or number % FILL_EVERY != FILL_EVERY - 1:
+        return False
+    if problem.mean == "constant":
+        return model.process.evidence < STRUCTURE
+    if problem.mean not in ("pooled", "scaled") or len(asked.known) < 2 or len(asked.simulated) < 2:
+        return False
+    if asked.costs.min() <= np.median(asked.simulated_costs):
+        return False
+    return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
 
 
 def _describe(problem: SuggestProblem, asked: _Asked, model: _Model, points: Array) -> dict[str, object]:

@@ -38,7 +38,8 @@ CONSTANT_PRIOR = HyperPrior()
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 """Of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
 
-JOINT_PRIOR = HyperPrior()
+JOINT_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
+"""Wide, so that a simulation that is the wrong way round can be found out."""
 
 VARYING_FROM = 20
 """Observations below which the noise is taken for constant: fewer can't tell."""
