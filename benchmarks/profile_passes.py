@@ -41,7 +41,8 @@ PASSES = {
     "sim_engine.fluid.step.displace": "displacements",
     "sim_engine.fluid.step.Stepper.apply": "moving and wall contact",
     "sim_engine.fluid.step.Stepper.finish": "finish: sweep, friction, velocities",
-    "sim_engine.fluid.step.interact": "cohesion and viscosity",
+    "sim_engine.fluid.step.relax": "viscosity",
+    "sim_engine.fluid.step.pull": "cohesion",
     "sim_engine.fluid.step.Stepper.classify": "classify",
 }
 """Functions of the solver by the name under which a step finds them, and what people read."""

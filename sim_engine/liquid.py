@@ -59,7 +59,7 @@ class SimulationParameters(BaseModel):
     """Number of particles at fixed liquid volume; sets the spacing d = (V/N)^(1/3)."""
 
     cohesion: float = Field(default=0.02, ge=0.0, le=0.2, json_schema_extra={"unit": "N/m"})
-    """Surface tension [N/m] that the pairwise attraction is scaled to, so that it means the same at any spacing.
+    """Surface tension [N/m], the same at any spacing: drops oscillate at Rayleigh's frequency.
     Below about one capillary length per spacing (2.7 mm for water) it only acts on drips."""
 
     viscosity: float = Field(default=3.0, ge=0.0, le=60.0, json_schema_extra={"unit": "1/s"})

@@ -146,7 +146,7 @@ def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:
 
 
 def test_numbers_of_the_solver_are_the_code_s() -> None:
-    sources = "".join(text_of(ROOT / "sim_engine" / "fluid" / f"{name}.py") for name in ("step", "forces"))
+    sources = "".join(text_of(ROOT / "sim_engine" / "fluid" / f"{name}.py") for name in ("step", "tension"))
     names = ("CFL", "PACE", "SHORTEST_STEP", "LONGEST_STEP", "SKIN", "WARM", "LARGEST_PULL", "TOLERANCE")
     cfl, pace, shortest, longest, skin, warm, pull, tolerance = (
         float(re.findall(rf"^{name} = (\S+)$", sources, re.MULTILINE)[0]) for name in names
@@ -157,7 +157,7 @@ def test_numbers_of_the_solver_are_the_code_s() -> None:
     assert f"which is thin, {skin:g} spacings" in page
     assert (warm, "Three tenths of the multipliers are kept" in page) == (0.3, True)
     assert f"while the mean compression inside is above {100 * tolerance:g} %" in page
-    assert (pull, "more than a tenth of a spacing in a step" in page) == (0.1, True)
+    assert (pull, "more than a tenth of a spacing at a time" in page) == (0.1, True)
 
 
 def test_limits_of_what_is_simulated_are_the_code_s() -> None:

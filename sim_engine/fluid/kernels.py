@@ -47,28 +47,42 @@ def wall_slope(q: ti.f32) -> ti.f32:
 
 @ti.func
 def attraction(u: ti.f32) -> ti.f32:
-    """Shape of the cohesive pair force over u = max(1 − q, 0): 1 at its peak q = ½, 0 at q = 0 and from 1 on."""
+    """Shape of the cohesive force over u = max(1 − q, 0): 1 at its peak q = ½, 0 at q = 0 and from 1 on."""
     w = u * (1.0 - u)
     return 64.0 * w * w * w
 
 
-ATTRACTION_MOMENT = 64.0 * math.factorial(7) * math.factorial(3) / math.factorial(11)
-"""∫₀¹ attraction(q) q⁴ dq, for the scaling of cohesion to a tension."""
+@ti.func
+def attraction_slope(u: ti.f32) -> ti.f32:
+    """d(attraction)/dq."""
+    w = u * (1.0 - u)
+    return 192.0 * w * w * (2.0 * u - 1.0)
 
 
-def cohesion_acceleration(tension: float, density: float, spacing: float, support: float) -> float:
-    """Peak acceleration of one pair [m/s²] that gives a liquid of that spacing a surface tension.
+@ti.func
+def bond(u: ti.f32) -> ti.f32:
+    """∫ attraction from q to 1: flat towards q = 0, so that nothing is gained by pairs that close up."""
+    u2 = u * u
+    return u2 * u2 * (16.0 - u * (38.4 - u * (32.0 - u * (64.0 / 7.0))))
 
-    Fowler's sharp-interface integral σ = (π/8) n² ∫ f(r) r⁴ dr with number density n = d⁻³, solved for the amplitude
-    of the pair force f.
 
-    Args:
-        tension: σ [N/m].
-        density: of the liquid [kg/m³].
-        spacing: d [m].
-        support: h [m].
+@ti.func
+def wall_bond(u: ti.f32) -> ti.f32:
+    """∫ bond over the half-space beyond a plane at distance (1 − u) h, in units of h³."""
+    u2 = u * u
+    series = 1.0 / 60.0 - u * (17.0 / 420.0 - u * (11.0 / 280.0 - u * (1.0 / 56.0 - u / 315.0)))
+    return 64.0 * math.pi * u2 * u2 * u2 * series
 
-    Source: Fowler 1937; for particle methods Tartakovsky & Panchenko 2016.
-    """
-    force = tension * spacing**6 / (math.pi / 8.0 * ATTRACTION_MOMENT * support**5)
-    return force / (density * spacing**3)
+
+@ti.func
+def wall_attraction(u: ti.f32) -> ti.f32:
+    """d(wall_bond)/du: what the half-space attracts with."""
+    u2 = u * u
+    series = 1.0 / 10.0 - u * (17.0 / 60.0 - u * (11.0 / 35.0 - u * (9.0 / 56.0 - u * (2.0 / 63.0))))
+    return 64.0 * math.pi * u2 * u2 * u * series
+
+
+HALF_ATTRACTION = 64.0 * math.pi / 504.0
+"""∫ attraction · cos over a half-space, in units of h³."""
+BULK_BOND = 64.0 * 4.0 * math.pi / 3.0 / 840.0
+"""∫ bond over all space, in units of h³."""

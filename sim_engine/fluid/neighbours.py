@@ -12,16 +12,11 @@ SPILLED = int(ParticleState.SPILLED)
 
 
 @ti.func
-def rebuild(f: ti.template(), s, skin):
-    """Sort the moving particles by cell, put the others last, and list all pairs within h + skin·d, each once."""
-    d = f.spacing[s]
-    reach = (SUPPORT + skin) * d
+def cover(f: ti.template(), s, reach):
+    """Cells of at least that edge over all that moves and is in play: their lowest corner, edge and numbers."""
     low = ti.Vector([1e9, 1e9, 1e9])
     high = ti.Vector([-1e9, -1e9, -1e9])
-    begin = f.begin[s]
-    end = begin + f.moving[s]
-    table = f.cells_begin[s]
-    for i in range(begin, end):
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         if f.home[i] < SPILLED:
             low = ti.min(low, f.x[i])
             high = ti.max(high, f.x[i])
@@ -32,6 +27,18 @@ def rebuild(f: ti.template(), s, skin):
     while ti.cast(size[0], ti.f32) * size[1] * size[2] > f.cells[s]:
         edge *= 1.25
         size = ti.cast((high - low) / edge, ti.i32) + 1
+    return low, edge, size
+
+
+@ti.func
+def rebuild(f: ti.template(), s, skin):
+    """Sort the moving particles by cell, put the others last, and list all pairs within h + skin·d, each once."""
+    d = f.spacing[s]
+    reach = (SUPPORT + skin) * d
+    begin = f.begin[s]
+    end = begin + f.moving[s]
+    table = f.cells_begin[s]
+    low, edge, size = cover(f, s, reach)
     cells = size[0] * size[1] * size[2]
     for c in range(table, table + cells + 2):
         f.cell_start[c] = 0
@@ -96,3 +103,61 @@ def rebuild(f: ti.template(), s, skin):
             entries = f.list_begin[s]
     f.rebuilds[s] += 1
     f.stale[s] = 0
+
+
+@ti.func
+def list_widely(f: ti.template(), s, reach):
+    """List all pairs within `reach`, each once, without sorting particles.
+
+    The next step makes the usual lists again.
+    """
+    begin = f.begin[s]
+    end = begin + f.moving[s]
+    table = f.cells_begin[s]
+    low, edge, size = cover(f, s, reach)
+    cells = size[0] * size[1] * size[2]
+    for c in range(table, table + cells + 1):
+        f.cell_start[c] = 0
+    f.cell_start[table] = begin
+    for i in range(begin, end):
+        q = ti.cast((f.x[i] - low) / edge, ti.i32)
+        c = table + (q[0] * size[1] + q[1]) * size[2] + q[2]
+        f.cell[i] = c
+        f.cell_start[c + 1] = f.cell_start[c + 1] + 1
+    for c in range(table, table + cells):
+        f.cell_start[c + 1] = f.cell_start[c + 1] + f.cell_start[c]
+    for i in range(begin, end):
+        c = f.cell[i]
+        k = f.cell_start[c]
+        f.cell_start[c] = k + 1
+        f.ranked[k] = i
+        f.x_copy[k] = f.x[i]
+    entries = f.list_begin[s]
+    last = f.list_begin[s] + f.particles[s] * NEIGHBOURS
+    reach2 = reach * reach
+    for rank in range(begin, end):
+        i = f.ranked[rank]
+        xi = f.x[i]
+        q = ti.cast((xi - low) / edge, ti.i32)
+        f.first[i] = entries
+        for a in range(q[0], ti.min(q[0] + 2, size[0])):
+            b0 = q[1]
+            if a > q[0]:
+                b0 = ti.max(q[1] - 1, 0)
+            for b in range(b0, ti.min(q[1] + 2, size[1])):
+                column = table + (a * size[1] + b) * size[2]
+                k0 = rank + 1
+                if a != q[0] or b != q[1]:
+                    c0 = column + ti.max(q[2] - 1, 0)
+                    k0 = begin
+                    if c0 > table:
+                        k0 = f.cell_start[c0 - 1]
+                for k in range(k0, f.cell_start[column + ti.min(q[2] + 1, size[2] - 1)]):
+                    r = xi - f.x_copy[k]
+                    f.neighbour[entries] = f.ranked[k]
+                    entries += ti.cast(r.dot(r) < reach2, ti.i32)
+        f.count[i] = entries - f.first[i]
+        if entries > last:
+            f.fault[s] = 1
+            entries = f.list_begin[s]
+    f.stale[s] = 1

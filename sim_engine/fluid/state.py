@@ -8,8 +8,8 @@ SUPPORT = 2.2
 VESSELS = 2
 """Pourer (0) and receiver (1)."""
 
-NEIGHBOURS = 32
-"""Entries in the half lists per particle of a scene; about 18 are used."""
+NEIGHBOURS = 72
+"""Entries in the half lists per particle of a scene; about 18 are used, and 45 by cohesion, which reaches farther."""
 
 LIST_RESERVE = 2_000
 """Entries that one particle may add before the overflow check sees them; far above any packing."""
@@ -33,6 +33,7 @@ class FluidState:
             between; its gradient. Between steps phi is the signed distance.
         push: normal displacement given by each wall in this step [m].
         home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
+        cell, ranked: in which cell a particle is; particles in the order of cells, where they are not sorted.
         gradient, squares: Σ∇W and what the constraint's gradients amount to, Σ|∇C|².
         first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
     """
@@ -52,7 +53,8 @@ class FluidState:
         self.phi = ti.Vector.field(VESSELS, ti.f32, shape=pool)
         self.push = ti.Vector.field(VESSELS, ti.f32, shape=pool)
         self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=pool)
-        self.home, self.home_copy, self.name, self.name_copy, self.cell = (scalars(ti.i32) for _ in range(5))
+        self.home, self.home_copy, self.name, self.name_copy = (scalars(ti.i32) for _ in range(4))
+        self.cell, self.ranked = (scalars(ti.i32) for _ in range(2))
         self.gradient, self.squares = vectors(), scalars()
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
         self.neighbour = ti.field(ti.i32, shape=pool * NEIGHBOURS + scenes * LIST_RESERVE)
@@ -66,14 +68,15 @@ class FluidState:
         # … constants of the liquid …
         self.particles = ti.field(ti.i32, shape=scenes)
         self.spacing = ti.field(ti.f32, shape=scenes)
-        self.attraction = ti.field(ti.f32, shape=scenes)  # peak cohesive acceleration of one pair [m/s²]
+        self.cohesion = ti.field(ti.f32, shape=scenes)  # scale of its accelerations [m/s²]
         self.viscosity = ti.field(ti.f32, shape=scenes)
         self.friction = ti.field(ti.f32, shape=scenes)
         self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
         self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles by so many spacings
         self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if that much nearer, in supports h
-        self.wait = ti.field(ti.f32, shape=scenes)  # viscosity and cohesion act at such intervals [s]
+        self.wait = ti.field(ti.f32, shape=scenes)  # viscosity acts at such intervals [s]
+        self.pull_wait = ti.field(ti.f32, shape=scenes)  # and cohesion at these at most [s]
         self.poses_begin = ti.field(ti.i32, shape=scenes)  # first row in the table of poses
         self.table_step = ti.field(ti.f32, shape=scenes)  # of the pose table [s]
         self.table_length = ti.field(ti.i32, shape=scenes)
@@ -86,7 +89,8 @@ class FluidState:
         # … and what changes with time.
         self.time = ti.field(ti.f64, shape=scenes)
         self.dt = ti.field(ti.f32, shape=scenes)
-        self.waited = ti.field(ti.f32, shape=scenes)  # since viscosity and cohesion acted [s]
+        self.waited = ti.field(ti.f32, shape=scenes)  # since viscosity acted [s]
+        self.pull_waited = ti.field(ti.f32, shape=scenes)  # … and cohesion [s]
         self.steps = ti.field(ti.i32, shape=scenes)
         self.iterations = ti.field(ti.i32, shape=scenes)
         self.rebuilds = ti.field(ti.i32, shape=scenes)

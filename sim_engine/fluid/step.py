@@ -9,9 +9,10 @@ Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 import taichi as ti
 
 from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
-from sim_engine.fluid.forces import interact
 from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.state import VESSELS, FluidState
+from sim_engine.fluid.tension import pull
+from sim_engine.fluid.viscosity import relax
 from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
 from sim_engine.outcome import ParticleState
 
@@ -298,9 +299,14 @@ class Stepper:
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
         f.waited[s] += dt
-        if (f.viscosity[s] > 0.0 or f.attraction[s] > 0.0) and f.waited[s] >= f.wait[s]:
-            interact(f, s, f.waited[s])
+        if f.viscosity[s] > 0.0 and f.waited[s] >= f.wait[s]:
+            relax(f, s, f.waited[s])
             f.waited[s] = 0.0
+        # Too late is unstable: before it could be, not after.
+        f.pull_waited[s] += dt
+        if f.cohesion[s] > 0.0 and f.pull_waited[s] + dt > f.pull_wait[s]:
+            pull(f, s, f.pull_waited[s])
+            f.pull_waited[s] = 0.0
         if f.time[s] < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] * TREACLE

@@ -1,8 +1,7 @@
 """Cohesion as a surface tension: a cube of liquid becomes a sphere, and a stretched drop oscillates, without gravity.
 
 The oscillation's frequency is Rayleigh's for the second mode of a free drop, ω² = 8σ / (ρR³), from which the tension
-follows. The time step is a tenth of the capillary limit √(ρ d³ / (2π σ)) (Brackbill et al. 1992): at half of it these
-drops heat up and fall apart. Pours at their spacings of millimetres stay below a fifth of it by gravity's limit.
+follows. The time step is a tenth of the capillary limit √(ρ d³ / (2π σ)) (Brackbill et al. 1992).
 
 Source: Rayleigh 1879; cube to sphere: Akinci et al. 2013.
 """

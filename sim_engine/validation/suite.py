@@ -184,10 +184,10 @@ def _dam_break(simulator: PourSimulator, effort: Effort) -> tuple[list[Measureme
 
 def _cohesion(simulator: PourSimulator, effort: Effort) -> tuple[list[Measurement], Figure]:
     free = PLAIN.model_copy(update={"viscosity": 0.0})
-    found = droplet.cube_to_sphere(1_000, free)
+    found = droplet.cube_to_sphere(2_000, free)
     curves: list[Series] = []
     tensions: dict[int, float] = {}
-    for n in (1_000, 4_000) if effort.full else (1_000,):
+    for n in (2_000, 10_000) if effort.full else (2_000,):
         measurements, series, tensions[n] = droplet.oscillation(n, free)
         found += measurements
         curves += series
