@@ -227,20 +227,29 @@ def test_the_front_is_reported_with_actions_that_pour_and_none_beats_another(str
     assert all(row["predicted"] is None for row in result["pours"] if strategy != "D1")
 
 
-def test_a_front_is_wider_than_what_a_weighted_sum_tries() -> None:
-    def spread(pareto: bool) -> float:
-        widths = []
-        for seed in range(3):
-            played = play(make("D2", (SPILLAGE, TIME), seed, pareto=pareto, pours=16))
-            vectors = [cost_vector(pour.action) for pour in played.pours[6:]]
-            widths.append(np.ptp([v[1] for v in vectors if v[0] <= 1.0] or [0.0]))
-        return float(np.mean(widths))
-
-    def cost_vector(action: Action) -> tuple[float, ...]:
+def covered(actions: list[Action]) -> float:
+    """Area of (spillage, time) that some of the actions beat, below 0.5 and 1."""
+    vectors = []
+    for action in actions:
         truth = world(action)
-        return costing((SPILLAGE, TIME)).poured(PourMeasurement(1.0, truth.spilled, truth.retained), action)
+        measured = PourMeasurement(1.0, truth.spilled, truth.retained)
+        vectors.append(costing((SPILLAGE, TIME)).poured(measured, action))
+    area, best = 0.0, 1.0
+    for spillage, time in sorted(vectors):
+        if spillage < 0.5 and time < best:
+            area, best = area + (0.5 - spillage) * (best - time), time
+    return area
 
-    assert spread(True) > 1.2 * spread(False)
+
+def test_a_search_for_the_front_covers_more_of_it_than_as_many_drawn_actions() -> None:
+    searched, drawn = [], []
+    for seed in range(3):
+        search = make("D1", (SPILLAGE, TIME), seed, pareto=True, pours=0, iterations=48, simulations_per_iteration=1)
+        searched.append(covered([request.action for request in play(search).simulations]))
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        drawn.append(covered([SCENE.action(ACTIONS.draw(rng)) for _ in range(48)]))
+    assert np.mean(searched) > np.mean(drawn) + 0.5 * np.std(drawn)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
