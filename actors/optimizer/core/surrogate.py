@@ -38,7 +38,10 @@ CONSTANT_PRIOR = HyperPrior()
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 """Of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
 
-JOINT_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
+POOLED_PRIOR = HyperPrior(noise=(0.05, 0.4), simulated_noise=(0.3, 1.0))
+"""Of pours little noise, of simulations much: where they contradict each other the simulations must give way."""
+
+SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
 """Wide, so that a simulation that is the wrong way round can be found out."""
 
 VARYING_FROM = 20
@@ -258,7 +261,8 @@ def joint_process(
     centre = float(simulated_costs.mean())
     terms = {"real": np.arange(len(both)) >= len(simulated), "scaled": scaled}
     scale = _scale(values - centre, values)
-    return _fitted(both, values, _constant(centre), scale, varying, JOINT_PRIOR, **terms)
+    prior = SCALED_PRIOR if scaled else POOLED_PRIOR
+    return _fitted(both, values, _constant(centre), scale, varying, prior, **terms)
 
 
 def _fitted(
