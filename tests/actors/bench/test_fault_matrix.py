@@ -24,16 +24,18 @@ from actors.bench.planning import planner
 from actors.bench.virtual_operator import VirtualOperator
 from actors.operator import OperatorSpec
 from actors.protocols import LaboratoryError, NotPouredError, UnknownPourError
+from sim_engine.action import DEG
 from sim_engine.outcome import PourMeasurement
 
 from .conftest import ACTION, SCENE, Stage, wired_spec
 
-PACE = 6.0
-"""Bench seconds per second: phases must last long enough to be hit."""
+PACE = 15.0
+"""Bench seconds per second."""
 
 SPEC = wired_spec(pace=PACE, hurried=True)
 
-ACTION_WITH_HOLD = ACTION.with_values(hold_time=2.0)
+SLOWLY = ACTION.with_values(angular_velocity=18 * DEG, return_velocity=18 * DEG, hold_time=5.0)
+"""Phases must last long enough to be hit."""
 
 PHASES = ("approach", "tilt", "hold", "return", "weigh")
 POURING = PHASES[1:4]
@@ -157,7 +159,7 @@ class Recorder:
 
 async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any]) -> float:
     """Have a fault happen in the middle of a phase; the controller's time then [s]."""
-    spans = {name: (begin, end) for name, begin, end in planner(SPEC.arm)(SCENE, ACTION_WITH_HOLD).phases}
+    spans = {name: (begin, end) for name, begin, end in planner(SPEC.arm)(SCENE, SLOWLY).phases}
     end = time.monotonic() + 60.0
     while True:
         assert time.monotonic() < end, f"never came to {phase}"
@@ -184,7 +186,7 @@ async def tell_tale(open_stage: Any, phase: str, fault: Fault, *, mend: set[str]
                 stage.before[about] = lambda: fault.mend(stage)
         recorder = Recorder(stage)
         recording = asyncio.create_task(recorder.run())
-        pour = asyncio.create_task(stage.pour(ACTION_WITH_HOLD, progress=seen.append))
+        pour = asyncio.create_task(stage.pour(SLOWLY, progress=seen.append))
         try:
             struck = await strike_in(stage, phase, fault, seen)
         except BaseException:
@@ -222,7 +224,7 @@ def check_never_tilted_again(tale: Tale) -> None:
     assert tale.tilts[tale.times > tale.consented].max(initial=0.0) <= then + math.radians(2.0)
 
 
-LATE = 2.0
+LATE = 2.2
 """The operator takes so long to come [s of the clock]: meanwhile the arm is looked at."""
 
 
@@ -286,7 +288,7 @@ def test_an_operator_who_does_not_want_the_stopped_arm_to_move(open_stage, how, 
             phase,
             ARM["protective stop"],
             mend=set(),
-            spec={"operator": OperatorSpec(answers="virtual", time=2.0, reminder=6.0, deadline=18.0)},
+            spec={"operator": OperatorSpec(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)},
             **(
                 {"answers": {"recover": ["no"]}, "late": {"recover": 2.0}}
                 if how == "no"
@@ -310,7 +312,7 @@ def test_an_operator_who_leaves_the_balance_as_it_is(open_stage, how):
     """No weight that was taken is lost, and the spill still lies where it can be weighed."""
     fault = replace(BALANCE["unplugged"], mend=None)
     scripted = {"answers": {"balance": ["no"]}} if how == "no" else {"late": {"balance": math.inf}}
-    spec = {"operator": OperatorSpec(answers="virtual", time=2.0, reminder=6.0, deadline=18.0)}
+    spec = {"operator": OperatorSpec(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)}
     tale = asyncio.run(tell_tale(open_stage, "weigh", fault, mend=set(), spec=spec, **scripted))
     assert isinstance(tale.outcome, UnknownPourError)
     assert "pourer_full" in str(tale.outcome)
@@ -339,7 +341,7 @@ def test_the_bench_pours_again_after_a_fault_was_mended(open_stage):
     async def play():
         seen: list[Any] = []
         async with open_stage(SPEC) as stage:
-            pour = asyncio.create_task(stage.pour(ACTION_WITH_HOLD, progress=seen.append))
+            pour = asyncio.create_task(stage.pour(SLOWLY, progress=seen.append))
             await strike_in(stage, "tilt", ARM["protective stop"], seen)
             with pytest.raises(UnknownPourError):
                 await pour
