@@ -250,7 +250,9 @@ class Deployment(ABC):
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         text = f"{what}  {described(values)}"
-        if suggestion.means:
+        if suggestion.means and self._compromise.exploring:
+            self.decisions.append(Decision(f"{text}  (a compromise under random weights)"))
+        elif suggestion.means:
             mean, deviation = suggestion.means[index], suggestion.deviations[index]
             self.decisions.append(
                 Decision(f"{text}  predicted {max(mean, 0.0):.4g} ± {deviation:.2g}", {"mean": mean, "sd": deviation})

@@ -6,11 +6,14 @@ import itertools
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from orchestrator.report.summary import summarise, summary_table
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
 from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.deployment_d1 import OneShotPlanning
@@ -24,6 +27,7 @@ from sim_engine.motion import plan_motion
 from sim_engine.outcome import Fractions, PourMeasurement
 from sim_engine.space import Axis, Space
 from sim_engine.vessel.build import build_vessel
+from tests.orchestrator.toy import toy_plan
 
 from .play import SCENE, THETA, Play, deployment_plan, outcome_of, replay
 
@@ -225,6 +229,29 @@ def test_the_front_is_reported_with_actions_that_pour_and_none_beats_another(str
     assert {SCENE.action(row["action_si"]) for row in front} <= made
     assert result["action_si"] is not None
     assert all(row["predicted"] is None for row in result["pours"] if strategy != "D1")
+
+
+def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poured(tmp_path: Path) -> None:
+    found = make("D1", (SPILLAGE, TIME), 1, pareto=True, pours=0, iterations=10)
+    played = play(found)
+    deployment = deployment_plan(
+        strategy="D1", actions=ACTIONS, pours=0, objectives=Objectives((SPILLAGE, TIME), pareto=True)
+    )
+    plan = toy_plan(tmp_path, deployment=deployment)
+    summary = summarise(plan, {"deployment:cup": found.result()})
+    assert summary["loss"] == "objectives"
+    console = Console(width=200)
+    with console.capture() as capture:
+        console.print(summary_table(plan, summary))
+    text = capture.get()
+    assert "spillage + time [%]" in text
+    front = found.result()["front"]
+    first = front[0]["objectives"]
+    assert f"cup, nothing beats: spillage {100 * first['spillage']:.1f} ± " in text
+    assert text.count("nothing beats") == len(front)
+    assert "deg/s, max angle" in text
+    assert any("under random weights" in decision.text for decision in found.decisions)
+    assert played.pours == []
 
 
 def covered(actions: list[Action]) -> float:
