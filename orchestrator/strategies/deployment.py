@@ -51,9 +51,12 @@ class Deployment(ABC):
     """
 
     NAME = ""
+    LEARNS_ON_POURS = True
+    """Whether real pours, also those of before, enter its surrogate."""
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         self._plan = plan
+        self._data = plan.data if self.LEARNS_ON_POURS else None
         self._scene = scene
         self._parameters = parameters
         self._costing = Costing.of(plan, scene, parameters)
@@ -70,11 +73,10 @@ class Deployment(ABC):
         self._latest_map: Suggestion | None = None
         self._finished = False
         self.decisions: list[Decision] = []
-        if plan.data is not None:
-            text = (
-                f"{len(self._former)} former pours enter the data ({plan.data.path.parent.name}/{plan.data.path.name})"
-            )
-            self.decisions.append(Decision("; left out: ".join([text, *plan.data.left_out])))
+        if self._data is not None:
+            path = self._data.path
+            text = f"{len(self._former)} former pours enter the data ({path.parent.name}/{path.name})"
+            self.decisions.append(Decision("; left out: ".join([text, *self._data.left_out])))
 
     # -- asking and listening --------------------------------------------------------------------------------------
 
@@ -181,7 +183,7 @@ class Deployment(ABC):
 
     def _existing(self) -> list[tuple[Point, Vector]]:
         """Place and cost of the pours of before the campaign in this scene."""
-        pours = () if self._plan.data is None else self._plan.data.pours.get(self._scene.name, ())
+        pours = () if self._data is None else self._data.pours.get(self._scene.name, ())
         space, found = self._plan.actions, []
         for pour in pours:
             unit = space.encode({name: getattr(pour.action, name) for name in space.names})
@@ -209,7 +211,7 @@ class Deployment(ABC):
     @property
     def _counted(self) -> int:
         """Pours that count against the budget."""
-        former = len(self._former) if self._plan.data is not None and self._plan.data.counts else 0
+        former = len(self._former) if self._data is not None and self._data.counts else 0
         return former + sum(p.status in ("weighed", "failed") for p in self._pours)
 
     @property

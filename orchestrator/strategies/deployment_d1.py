@@ -28,6 +28,7 @@ class OneShotPlanning(Deployment):
     """
 
     NAME = "D1"
+    LEARNS_ON_POURS = False
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)

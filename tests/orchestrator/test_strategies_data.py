@@ -19,6 +19,7 @@ from orchestrator.config.load import load_campaign
 from orchestrator.fingerprint import fingerprint
 from orchestrator.plan import CampaignPlan, DeploymentPlan
 from orchestrator.requests import Suggest
+from orchestrator.strategies.deployment_d1 import OneShotPlanning
 from orchestrator.strategies.deployment_d2 import RealOnly
 from orchestrator.strategies.deployment_d3 import Hybrid
 from sim_engine.action import DEG
@@ -131,6 +132,16 @@ def test_a_hybrid_pours_first_where_the_former_pours_and_the_simulations_say(tmp
     first = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
     assert (len(first.data), len(first.simulated), first.acquisition) == (3, 6, "lcb")
     assert hybrid.result()["former_pours"] == 3
+
+
+def test_planning_with_the_same_campaign_learns_from_no_pour(tmp_path: Path) -> None:
+    (tmp_path / "pours.csv").write_text(CSV)
+    plan = deployment(tmp_path, CAMPAIGN + "  data: {from: pours.csv, counts: true}\n")
+    planner = OneShotPlanning(dataclasses.replace(plan, strategy="D1", pours=1), plan.scenes[0], THETA, 1)
+    played = Play(narrow_cup)(planner)
+    assert len(played.pours) == 1
+    assert planner.result()["former_pours"] == 0
+    assert not any("former" in decision.text for decision in planner.decisions)
 
 
 def test_a_csv_needs_no_split_and_its_pours_outside_the_bounds_are_told(tmp_path: Path) -> None:
