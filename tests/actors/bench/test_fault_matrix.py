@@ -40,8 +40,8 @@ SLOWLY = ACTION.with_values(angular_velocity=18 * DEG, return_velocity=18 * DEG,
 PHASES = ("approach", "tilt", "hold", "return", "weigh")
 POURING = PHASES[1:4]
 
-STANDING = 1.5
-"""After which an arm that was told to stop must stand [s of the clock]: half a second of missing heartbeats, a second
+STANDING = 2.0
+"""After which an arm that was told to stop must stand [s of the clock]: half a second of missing heartbeats, the rest
 for a busy machine."""
 
 pytestmark = pytest.mark.timeout(120)
@@ -224,7 +224,7 @@ def check_never_tilted_again(tale: Tale) -> None:
     assert tale.tilts[tale.times > tale.consented].max(initial=0.0) <= then + math.radians(2.0)
 
 
-LATE = 2.2
+LATE = 3.2
 """The operator takes so long to come [s of the clock]: meanwhile the arm is looked at."""
 
 
