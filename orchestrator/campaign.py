@@ -7,7 +7,7 @@ import contextlib
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +92,17 @@ async def run_campaign(
         Watchers(watchers),
         ask_operator,
         tuple(stages_of(plan) if stages is None else stages),
-        deadlines or Deadlines(),
+        deadlines or _patience(plan),
     )
     return await run.run(resume)
+
+
+def _patience(plan: CampaignPlan) -> Deadlines:
+    """A person who has to weigh what was poured takes the time that questions may take."""
+    usual, laboratory = Deadlines(), plan.laboratory
+    if laboratory.arm is None or laboratory.operator.answers == "virtual":
+        return usual
+    return replace(usual, pour_grace=max(usual.pour_grace, laboratory.operator.deadline))
 
 
 class _Run:
