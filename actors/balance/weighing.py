@@ -104,9 +104,7 @@ class Weighings:
         Raises:
             WeighingError: they are incomplete, or can't all be right.
         """
-        return measurement(
-            self._spec.placement, self.weighed, nominal=nominal, tolerance=self._spec.load_tolerance
-        )
+        return measurement(self._spec.placement, self.weighed, nominal=nominal, tolerance=self._spec.load_tolerance)
 
     @property
     def _pour(self) -> int:
