@@ -98,7 +98,7 @@ def calibrate(
     arm: Arm = False,
     as_json: Json = False,
 ) -> None:
-    """Only calibrate: find the θ whose simulated spills match the weighed ones (C4), and score it on unseen pours.
+    """Only calibrate: find the θ whose simulated spills match the weighed ones (C1 to C4), and score it on unseen pours.
 
     θ* goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
     """
