@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
+from sklearn.gaussian_process.kernels import Matern
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,11 +78,14 @@ class PriorCovariance(Protocol):
 def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
     """Matérn 5/2 correlation (m, k) between points (m, d) and (k, d), and −∂/∂(r²/2) of it, r in lengthscales.
 
+    The correlation is scikit-learn's. Its gradients there are arrays (m, k, d), one slice for each lengthscale; the
+    factor that all of them share makes a fit three times as fast.
+
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, equation 4.17.
     """
+    correlation: Array = Matern(length_scale=lengths, nu=2.5)(first, second)
     s = np.sqrt(5.0) * cdist(first / lengths, second / lengths)
-    decay = np.exp(-s)
-    return (1.0 + s + s * s / 3.0) * decay, (5.0 / 3.0) * (1.0 + s) * decay
+    return correlation, (5.0 / 3.0) * (1.0 + s) * np.exp(-s)
 
 
 class Covariance:
