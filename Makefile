@@ -18,7 +18,9 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 demo: $(READY)
-	$(BIN)/decant run configs/campaigns/quickstart.yaml
+	@$(BIN)/python -c 'import rtde_receive' 2>/dev/null || echo "ur-rtde has no wheel for this Python: the demo runs on the bench of numbers (twin.yaml). With Python 3.11 or 3.12 it runs over the wires of a real one."
+	$(BIN)/decant run configs/campaigns/quickstart.yaml \
+		$$($(BIN)/python -c 'import rtde_receive' 2>/dev/null || echo --laboratory configs/laboratories/twin.yaml)
 
 test: lint unit
 

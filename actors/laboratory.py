@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib.util
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
-    """Whether what a laboratory needs from outside this machine is there. Starts nothing that stays.
+    """Whether what a laboratory needs, on this machine and from others, is there. Starts nothing that stays.
 
     Args:
         spec: where to run.
@@ -42,6 +43,12 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
     Raises:
         LaboratoryError: with what is wrong and what would be right.
     """
+    if spec.arm is not None and need_bench and importlib.util.find_spec("rtde_receive") is None:
+        raise LaboratoryError(
+            f"laboratory {spec.name}: its arm needs the package ur-rtde, which is not installed; it has no wheel for "
+            "Python 3.13 yet. Use Python 3.11 or 3.12, or a bench of numbers "
+            "(--laboratory configs/laboratories/twin.yaml)"
+        )
     if spec.ray is not None and not spec.in_process:
         from actors.cluster.probe import check_cluster
 

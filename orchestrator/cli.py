@@ -16,6 +16,7 @@ from orchestrator.commands.options import (
     Campaign,
     InProcess,
     Json,
+    OtherLaboratory,
     Parameters,
     Receiver,
     Resume,
@@ -63,6 +64,7 @@ def run(
     answer: Answer = None,
     in_process: InProcess = False,
     arm: Arm = False,
+    laboratory: OtherLaboratory = None,
     as_json: Json = False,
 ) -> None:
     """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/.
@@ -78,6 +80,7 @@ def run(
         run_id=run_id,
         answer=answer,
         in_process=in_process,
+        laboratory=laboratory,
         as_json=as_json,
         armed=arm,
     )
@@ -96,9 +99,10 @@ def calibrate(
     answer: Answer = None,
     in_process: InProcess = False,
     arm: Arm = False,
+    laboratory: OtherLaboratory = None,
     as_json: Json = False,
 ) -> None:
-    """Only calibrate: find the θ whose simulated spills match the weighed ones (C1 to C4), and score it on unseen pours.
+    """Only calibrate: find the θ whose simulated spills match the weighed ones (C1 to C4), scored on unseen pours.
 
     θ* goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
     """
@@ -111,6 +115,7 @@ def calibrate(
         run_id=run_id,
         answer=answer,
         in_process=in_process,
+        laboratory=laboratory,
         as_json=as_json,
         armed=arm,
     )

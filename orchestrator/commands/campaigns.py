@@ -35,11 +35,12 @@ def run(
     in_process: bool,
     as_json: bool,
     armed: bool = False,
+    laboratory: Path | None = None,
 ) -> None:
     """The whole campaign."""
-    plan = read_campaign(path)
+    plan = read_campaign(path, laboratory)
     check_campaign_can_run(plan)
-    finished = _run(plan, "run", path, resume, run_id, answer, in_process, None, armed)
+    finished = _run(plan, "run", path, resume, run_id, answer, in_process, None, armed, laboratory)
     if as_json:
         print_json({"run": finished.result.directory.name, **finished.summary})
 
@@ -53,18 +54,19 @@ def calibrate(
     in_process: bool,
     as_json: bool,
     armed: bool = False,
+    laboratory: Path | None = None,
 ) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
     from orchestrator.stages import calibration_stages
 
-    plan = read_campaign(path)
+    plan = read_campaign(path, laboratory)
     if plan.calibration is None:
         raise RefusalError(f"{path}: has no 'calibration' section; there is nothing to calibrate", BAD_INPUT)
     # The deployment stays out: its vessels need not be there yet.
     stages = calibration_stages(plan.calibration)
     plan = dataclasses.replace(plan, deployment=None)
     check_campaign_can_run(plan)
-    finished = _run(plan, "calibrate", path, resume, run_id, answer, in_process, stages, armed)
+    finished = _run(plan, "calibrate", path, resume, run_id, answer, in_process, stages, armed, laboratory)
     if as_json:
         print_json(calibration_json(finished))
 
@@ -204,6 +206,7 @@ def _run(
     in_process: bool,
     stages: list[StageDefinition] | None,
     armed: bool,
+    laboratory: Path | None,
 ) -> Finished:
     from orchestrator.commands.arming import arm_campaign
     from orchestrator.commands.people import check_somebody_is_there
@@ -217,7 +220,8 @@ def _run(
         check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(plan, chosen, in_process=in_process)
     directory = run_directory(plan, resume=resume, run_id=run_id)
-    flag = " --arm" if plan.laboratory.mode == "hardware" else ""
+    flag = "" if laboratory is None else f" --laboratory {laboratory}"
+    flag += " --arm" if plan.laboratory.mode == "hardware" else ""
     again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
     finished = run_in_front_of_people(
         plan,

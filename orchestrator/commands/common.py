@@ -55,8 +55,8 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def read_campaign(path: Path) -> CampaignPlan:
-    """A campaign's plan.
+def read_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
+    """A campaign's plan, on another laboratory if one is given.
 
     Raises:
         RefusalError: with all problems of its files, exit code 2.
@@ -65,7 +65,7 @@ def read_campaign(path: Path) -> CampaignPlan:
     from orchestrator.config.load import load_campaign
 
     try:
-        return load_campaign(path)
+        return load_campaign(path, laboratory)
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
 
@@ -85,12 +85,12 @@ def check_campaign_can_run(plan: CampaignPlan) -> None:
 
 
 def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool) -> None:
-    """What the laboratory needs from other machines, before anything starts.
+    """What the laboratory needs, here and from other machines, before anything starts.
 
     Args:
         plan: with its laboratory.
         stages: that are to run.
-        in_process: everything in this process: nothing is needed.
+        in_process: everything in this process: no other machine is needed.
 
     Raises:
         RefusalError: with what is missing, exit code 2.
@@ -98,12 +98,11 @@ def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinitio
     from actors.laboratory import check_laboratory
     from actors.protocols import LaboratoryError
 
-    if in_process or plan.laboratory.in_process:
-        return
-    if plan.laboratory.ray is not None:
-        say(f"looking at the Ray cluster at {plan.laboratory.ray.address} …")
+    laboratory = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
+    if laboratory.ray is not None and not laboratory.in_process:
+        say(f"looking at the Ray cluster at {laboratory.ray.address} …")
     try:
-        check_laboratory(plan.laboratory, need_bench=any(stage.pours for stage in stages))
+        check_laboratory(laboratory, need_bench=any(stage.pours for stage in stages))
     except LaboratoryError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
 

@@ -23,6 +23,10 @@ Answer = Annotated[
     ),
 ]
 Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
+OtherLaboratory = Annotated[
+    Path | None,
+    typer.Option("--laboratory", help="Laboratory file (YAML) in place of the campaign's.", show_default=False),
+]
 Assignments = Annotated[
     list[str] | None,
     typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),

@@ -27,8 +27,12 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.spec import VesselSpec
 
 
-def load_campaign(path: Path) -> CampaignPlan:
+def load_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
     """The plan of a campaign file, with everything that it refers to.
+
+    Args:
+        path: of the file.
+        laboratory: of a file in place of the campaign's own.
 
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
@@ -38,6 +42,8 @@ def load_campaign(path: Path) -> CampaignPlan:
     if (other := wrong_kind(place.document, "campaign")) is not None:
         raise ConfigError([other])
     section = validate(CampaignFile, place, report)
+    if section is not None and laboratory is not None:
+        section = section.model_copy(update={"laboratory": str(laboratory.resolve())})
     plan = None if section is None else resolve_campaign(section, place, report)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"

@@ -403,3 +403,23 @@ def test_help_teaches_units_and_shows_examples(verb: str) -> None:
     assert result.exit_code == 0
     for words in HELP[verb]:
         assert words in result.stdout
+
+
+def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from orchestrator.config.load import load_campaign
+
+    twin = ROOT / "configs" / "laboratories" / "twin.yaml"
+    plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml", twin)
+    assert plan.laboratory.arm is None
+    assert plan.laboratory.bench is not None
+    campaign = str(ROOT / "configs" / "campaigns" / "quickstart.yaml")
+    refused = CliRunner().invoke(app, ["run", campaign, "--laboratory", str(tmp_path / "none.yaml")])
+    assert refused.exit_code == 2
+    assert "none.yaml" in refused.stderr
+    # What the bench is reached with is missed before anything starts.
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.chdir(tmp_path)
+    refused = CliRunner().invoke(app, ["run", campaign])
+    assert refused.exit_code == 2
+    assert "ur-rtde" in refused.stderr
+    assert "twin.yaml" in refused.stderr
