@@ -6,7 +6,8 @@
 One thread on one core. Set-up is not counted for either: kernels are compiled (or loaded from the cache) by a short
 pour before anything is measured, and the peer's first step, which samples its walls, is left out. Ours is over when
 nothing can change any more, at most 6 s; the peer always runs for 6 s, so the ratio is given per simulated second as
-well. Runs of both take turns. Outflow, delivery and density of both are measured in the same way.
+well. Runs of both take turns. Outflow, delivery and density of both are measured in the same way. The peer has no
+surface tension, and so has the standard pour; what Decant's default cohesion costs is measured beside it.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from standard_pour import (
     standard_action,
 )
 
+from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import PourSimulator
 
 __all__ = ["SCENE", "main", "standard_action"]
@@ -128,16 +130,23 @@ def main() -> None:
     simulator.simulate(short_task(particles))
     first = time.perf_counter() - begun
     ours: list[Measured] = []
+    tense: list[Measured] = []
     theirs: list[PeerRun] = []
     for turn in turns(options.repeats, options.peer):
         if turn == "ours":
             ours.append(measure(simulator, particles, seed=len(ours) + 1))
+            tense.append(measure(simulator, particles, len(ours), SimulationParameters().cohesion))
             say(f"ours, seed {len(ours)}: {ours[-1].cpu_s:.2f} CPU s")
         elif python is not None:
             say(f"{peer.NAME}, seed {len(theirs) + 1}: running")
             theirs.append(peer.pour(python, particles, seed=len(theirs) + 1))
             say(f"{peer.NAME}, seed {len(theirs)}: {theirs[-1].cpu_s:.2f} CPU s")
     result: dict[str, Any] = {"particles": particles, **of_ours(particles, ours), "first_pour_s": round(first, 2)}
+    result["with_cohesion"] = {
+        "cohesion": SimulationParameters().cohesion,
+        "cpu_s": round(statistics.median(run.cpu_s for run in tense), 3),
+        "left": [round(statistics.mean(values), 3) for values in zip(*(run.left for run in tense), strict=True)],
+    }
     if theirs:
         result["peer"] = of_theirs(particles, theirs)
         result["ratio"] = round(result["peer"]["cpu_s"] / result["cpu_s"], 2)

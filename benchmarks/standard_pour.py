@@ -63,9 +63,9 @@ def standard_action(angular_velocity: float = 30 * DEG, hold_time: float = 2.0) 
     )
 
 
-def standard_task(particles: int, seed: int, *, record_rate: float = 0.0) -> PourTask:
-    """The standard pour at the default θ but for N."""
-    theta = SimulationParameters(particles=particles)
+def standard_task(particles: int, seed: int, *, record_rate: float = 0.0, cohesion: float = 0.0) -> PourTask:
+    """The standard pour at the default θ but for N, and without surface tension, which the peer hasn't either."""
+    theta = SimulationParameters(particles=particles, cohesion=cohesion)
     return PourTask(SCENE, standard_action(), theta, seed, record_rate=record_rate)
 
 
@@ -112,14 +112,20 @@ class Measured:
     outcome: PourOutcome
 
 
-def measure(simulator: PourSimulator, particles: int, seed: int) -> Measured:
+def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float = 0.0) -> Measured:
     """Pour once.
+
+    Args:
+        simulator: of this process.
+        particles: N.
+        seed: of the initial positions.
+        cohesion: surface tension [N/m].
 
     Raises:
         SystemExit: the outcome is invalid, so that its time means nothing.
     """
     begun = time.perf_counter()
-    run = simulator.simulate(standard_task(particles, seed, record_rate=10.0))
+    run = simulator.simulate(standard_task(particles, seed, record_rate=10.0, cohesion=cohesion))
     wall = time.perf_counter() - begun
     outcome = run.outcome
     if outcome.invalid is not None:
