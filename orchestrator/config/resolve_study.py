@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from orchestrator.config.yaml_source import Place, Report
-from orchestrator.plan import CalibrationName, CalibrationPlan, DeploymentName, DeploymentPlan
+from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from orchestrator.study.plan import CalibrationArm, DeploymentArm
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def calibration_arms(
             if not report.is_broken(at.at(key)):
                 report.add(at, f"key '{key}' is missing; add for example '{key}: {example}'", key=True)
             continue
-        changes: dict[str, Any] = {"strategy": cast("CalibrationName", name), "grid": {}, "thetas": 0}
+        changes: dict[str, Any] = {"strategy": name, "grid": {}, "thetas": 0}
         match name:
             case "C1":
                 changes |= {"grid": dict.fromkeys(base.parameters.names, budget)}
@@ -116,7 +116,7 @@ def deployment_arms(
             continue
         common = replace(
             base,
-            strategy=cast("DeploymentName", name),
+            strategy=name,
             pours=1 if name == "D1" else arm.pours,
             per_pour=0,
             data=None,

@@ -70,8 +70,8 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
     if any(arm.plan.strategy == "C1" for arm in study.calibrations):
         grid = math.prod(study.calibration("C1").plan.grid.values())
         add("grid", grid * study.pour_count, 0)
-    repetitions = max(arm.repetitions for arm in (*study.calibrations, *study.deployments))
-    for number in range(1, repetitions + 1):
+    numbers = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
+    for number in range(1, max(numbers) + 1):
         for level in study.levels:
             place: dict[str, str | int] = {"level": level.name, "repetition": number}
             arms = [a for a in study.calibrations if number <= a.repetitions and level.name in a.levels]

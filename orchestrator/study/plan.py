@@ -87,7 +87,7 @@ class StudyPlan:
 
     def calibration(self, strategy: str) -> CalibrationArm:
         """The arm of C1, C2, C3 or C4. Raises KeyError."""
-        return {arm.plan.strategy: arm for arm in self.calibrations}[strategy]
+        return {str(arm.plan.strategy): arm for arm in self.calibrations}[strategy]
 
     def deployment(self, label: str) -> DeploymentArm:
         """The arm by its label. Raises KeyError."""

@@ -86,7 +86,7 @@ class AnsweredByTable:
     @property
     def decisions(self) -> list[Decision]:
         """The strategy's."""
-        return list(self._inner.decisions)
+        return list(getattr(self._inner, "decisions", ()))
 
     def ask(self, slots: Slots) -> list[Request]:
         """What the strategy wants beside simulations."""
