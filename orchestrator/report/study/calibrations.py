@@ -21,7 +21,7 @@ def draw_calibrations(study: StudyPlan, found: Gathered) -> list[Drawn]:
     drawn = [_boxes(known)] if known else []
     if strategies:
         drawn.append(_against_simulations(strategies))
-        drawn.append(_over_theta(strategies))
+        drawn.append(_over_theta(study, strategies))
     return drawn
 
 
@@ -104,10 +104,11 @@ def _curve(name: str, result: Mapping[str, Any], expected: list[list[float]]) ->
     return [final]
 
 
-def _over_theta(known: Mapping[str, Calibrated]) -> Drawn:
+def _over_theta(study: StudyPlan, known: Mapping[str, Calibrated]) -> Drawn:
     figure, grid = style.new_figure(1, len(known), size=(1.0 + 3.4 * len(known), 3.9), squeeze=False)
     rows: list[list[object]] = []
     names: list[str] = []
+    box = {axis.name: axis for axis in study.calibrations[0].plan.parameters.axes}
     shown = None
     top = 100 * max((_largest(one) for one in known.values()), default=1.0)
     for axes, (name, one) in zip(grid[0], known.items(), strict=True):
@@ -139,8 +140,13 @@ def _over_theta(known: Mapping[str, Calibrated]) -> Drawn:
         stars = [(r["theta"][names[0]], r["theta"][names[1]]) for r in one.results]
         axes.plot([x for x, _ in stars], [y for _, y in stars], "x", color=style.BEST, markersize=8, label="θ*")
         rows += [[name, "theta*", names[0], x, names[1], y, ""] for x, y in stars]
-        if names[0] == "particles":
-            axes.set_xscale("log")
+        for axis, limit, scale in (
+            (box[names[0]], axes.set_xlim, axes.set_xscale),
+            (box[names[1]], axes.set_ylim, axes.set_yscale),
+        ):
+            if axis.scale == "log":
+                scale("log")
+            limit(axis.lower, axis.upper)
         first = axes is grid[0][0]
         style.dress(axes, title=name, x=style.label(names[0]), y=style.label(names[1]) if first else "", grid=None)
     if shown is not None:

@@ -103,6 +103,8 @@ def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
 
 def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
     levels, receivers, arms = places(study, found)
+    from matplotlib.ticker import MaxNLocator
+
     unit, numbers = deployment_unit(study.deployments[0].plan), list(range(1, most_pours(study) + 1))
     size = (1.2 + 3.4 * len(receivers), 0.8 + 2.8 * len(levels))
     figure, grid = style.new_figure(len(levels), len(receivers), size=size, squeeze=False, sharex=True, sharey=True)
@@ -122,6 +124,7 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
             x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if j == 0 else ""
             style.dress(axes, title=f"{receiver}, {level} mismatch", x=x, y=y, grid="both")
             axes.set_ylim(bottom=0.0)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return Drawn(
         "figure-6",
