@@ -15,12 +15,14 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from orchestrator.config.check import touch
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.study import load_study
 from orchestrator.study.cells import cells_of
 from orchestrator.study.folder import RESULT, StudyError, finished_results, is_finished, opened, run_folder
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.worker import run_cell
+from sim_engine.vessel.build import build_vessel
 from tests.orchestrator import toy_study
 from tests.orchestrator.toy import logical_record
 from tests.orchestrator.toy_study import PAUSE, ToyLaboratory, run_toy_study
@@ -90,6 +92,19 @@ def test_another_seed_gives_other_seeds_to_all_cells(tmp_path: Path) -> None:
     one, other = cells_of(small(tmp_path / "a", seed=1)), cells_of(small(tmp_path / "b", seed=2))
     assert [cell.id for cell in one] == [cell.id for cell in other]
     assert not {cell.seed for cell in one} & {cell.seed for cell in other}
+
+
+@pytest.mark.parametrize("name", ["paper", "quick"])
+def test_no_mismatch_lets_the_cups_touch_in_calibration(name: str) -> None:
+    study = load_study(STUDIES / f"{name}.yaml")
+    assert study.base.calibration is not None
+    scene, actions = study.base.calibration.scene, study.base.calibration.actions
+    pourer, receiver = build_vessel(scene.pourer), build_vessel(scene.receiver)
+    action = scene.action(actions.decode([1.0] * actions.dimension))
+    for level in study.levels:
+        error, noise = level.bench.pose_error, level.bench.pose_noise
+        nearest = action.with_values(x_offset=action.x_offset + error.x - 3 * noise.x)
+        assert touch(scene, nearest, pourer, receiver) is None, level.name
 
 
 # -- files that can't be used ---------------------------------------------------------------------------------------
