@@ -160,6 +160,36 @@ def plan(
 
 @app.command(
     epilog=examples(
+        "decant study configs/studies/quick.yaml",
+        "decant study configs/studies/paper.yaml --dry-run   # what it would take",
+        "decant study configs/studies/paper.yaml --jobs 2    # goes on where it stopped, however it was stopped",
+    )
+)
+def study(
+    file: Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False)],
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes at a time; one per core if not given.", show_default=False)
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List what is left, with an estimate of its cost; start nothing.")
+    ] = False,
+    report_only: Annotated[
+        bool, typer.Option("--report", help="Only write figures, tables and page of what is there.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Compare C1 to C4 and D1 to D3, repeated, on virtual benches that are more or less like the simulator.
+
+    Figures (PNG, SVG, CSV), tables and a page go to runs/study-NAME/report/. Stopped or killed, the same command goes
+    on.
+    """
+    from orchestrator.commands import study as verb
+
+    call(verb.study, file, jobs=jobs, dry_run=dry_run, report_only=report_only, as_json=as_json)
+
+
+@app.command(
+    epilog=examples(
         "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
         "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
     )
@@ -207,7 +237,9 @@ def simulate(
     epilog=examples("decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml"),
 )
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Campaign, vessel or laboratory files.", show_default=False)],
+    files: Annotated[
+        list[Path], typer.Argument(help="Campaign, study, vessel or laboratory files.", show_default=False)
+    ],
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and that some action can be poured."""
     from orchestrator.commands import single
@@ -219,7 +251,7 @@ def validate(
     epilog=examples("decant schema > campaign.json", "decant schema vessel > vessel.json"),
 )
 def schema(
-    which: Annotated[str, typer.Argument(help="campaign, vessel or laboratory.")] = "campaign",
+    which: Annotated[str, typer.Argument(help="campaign, study, vessel or laboratory.")] = "campaign",
 ) -> None:
     """Print the JSON schema of campaign files (editors complete YAML with it)."""
     from orchestrator.commands import single

@@ -203,7 +203,9 @@ def validate(paths: list[Path]) -> None:
     from orchestrator.config.errors import ConfigError
     from orchestrator.config.kinds import kind_of
     from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
+    from orchestrator.config.study import load_study
     from orchestrator.config.yaml_source import Document
+    from orchestrator.study.cells import cells_of
     from sim_engine.vessel.build import build_vessel
     from sim_engine.vessel.errors import VesselError
 
@@ -217,6 +219,9 @@ def validate(paths: list[Path]) -> None:
                 note = f"vessel, holds {1e6 * vessel.capacity:.4g} mL to the brim"
             elif kind == "laboratory":
                 note = f"laboratory, {load_laboratory(path).mode}"
+            elif kind == "study":
+                study = load_study(path)
+                note = f"study, {len(cells_of(study))} cells, seed {study.seed}"
             else:
                 plan = load_campaign(path)
                 problems = [f"{path}: {problem}" for problem in check_campaign(plan)]
@@ -242,6 +247,7 @@ def schema(which: str) -> None:
         "campaign": schemas.campaign_schema,
         "vessel": schemas.vessel_schema,
         "laboratory": schemas.laboratory_schema,
+        "study": schemas.study_schema,
     }
     if which not in known:
         raise RefusalError(f"no schema '{which}'; there are {', '.join(known)}", BAD_INPUT)

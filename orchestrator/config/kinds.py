@@ -8,6 +8,7 @@ from orchestrator.config.errors import Problem
 from orchestrator.config.yaml_source import Document
 
 TELLING = {
+    "study": {"mismatch", "compared", "campaign"},
     "campaign": {"calibration", "deployment", "seed", "liquid", "pourer", "receiver", "laboratory"},
     "vessel": {"profile", "mesh", "inner", "wall", "up"},
     "laboratory": {"bench", "mode", "simulators", "arm", "cell"},
@@ -15,6 +16,7 @@ TELLING = {
 """Top-level keys that only one kind of file has, or that give away what was meant; looked for in this order."""
 
 NEEDED = {
+    "study": "a study has keys such as campaign, mismatch, calibration, deployment",
     "campaign": "a campaign has keys such as laboratory, liquid, calibration, deployment",
     "vessel": "a vessel has a name and a profile or mesh",
     "laboratory": "a laboratory has keys such as mode, simulators, arm, bench",
@@ -22,7 +24,7 @@ NEEDED = {
 
 
 def kind_of(data: Any) -> str | None:
-    """'campaign', 'vessel' or 'laboratory'; None if no key tells."""
+    """'study', 'campaign', 'vessel' or 'laboratory'; None if no key tells."""
     keys = set(data) if isinstance(data, dict) else set()
     return next((kind for kind, telling in TELLING.items() if keys & telling), None)
 

@@ -9,6 +9,7 @@ from typing import Any
 from orchestrator.config.campaign import CampaignFile
 from orchestrator.config.laboratory import LaboratoryFile
 from orchestrator.config.sections import SchemaGenerator, Section
+from orchestrator.config.study import StudyFile
 from orchestrator.config.vessel import VesselFile
 
 
@@ -27,11 +28,21 @@ def laboratory_schema() -> dict[str, Any]:
     return _schema(LaboratoryFile, "Laboratory")
 
 
+def study_schema() -> dict[str, Any]:
+    """Schema of study files."""
+    return _schema(StudyFile, "Study")
+
+
 def write_schemas(directory: Path) -> list[Path]:
-    """Write campaign.json, vessel.json and laboratory.json into a directory; the paths written."""
+    """Write campaign.json, vessel.json, laboratory.json and study.json into a directory; the paths written."""
     directory.mkdir(parents=True, exist_ok=True)
     paths = []
-    tables = (("campaign", campaign_schema), ("vessel", vessel_schema), ("laboratory", laboratory_schema))
+    tables = (
+        ("campaign", campaign_schema),
+        ("vessel", vessel_schema),
+        ("laboratory", laboratory_schema),
+        ("study", study_schema),
+    )
     for name, schema in tables:
         path = directory / f"{name}.json"
         path.write_text(schema_text(schema()), encoding="utf-8")

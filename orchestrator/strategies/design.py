@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,11 +110,28 @@ class DesignedPours:
     Source: Lopez-Guevara et al., CoRL 2017, section 4.1 (32 actions, stratified; 28 train, 4 test).
     """
 
-    def __init__(self, scene: Scene, actions: Space, count: int, holdout: int, seed: int) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        actions: Space,
+        count: int,
+        holdout: int,
+        seed: int,
+        *,
+        points: Sequence[Point] | None = None,
+    ) -> None:
+        """Plan.
+
+        Args:
+            points: the actions themselves, in the unit cube, in place of drawn ones: pours that are to be repeated.
+        """
         self._scene = scene
         self._actions = actions
         self._seeds = SeedStream(seed, "design")
-        strata = stratified(count, actions.dimension, self._seeds.rng)
+        if points is None:
+            strata = stratified(count, actions.dimension, self._seeds.rng)
+        else:
+            strata = [Stratum(point, point) for point in points]
         kept = choose_holdout(strata, holdout, self._seeds.rng)
         self._planned = [_Planned(s, "test" if i in kept else "train") for i, s in enumerate(strata)]
         self._current = 0

@@ -153,7 +153,7 @@ BAD: dict[str, str] = {
     f"{SIMULATE} --png folder": "--png folder: is a folder; name a file in it",
     f"{SIMULATE} --png pour.doc": "--png pour.doc: should end in .png",
     f"{SIMULATE} --rrd folder": "--rrd folder: is a folder; name a file in it",
-    "schema zebra": "no schema 'zebra'; there are campaign, vessel, laboratory",
+    "schema zebra": "no schema 'zebra'; there are campaign, vessel, laboratory, study",
 }
 
 # click's own, in a frame after the usage

@@ -20,7 +20,7 @@ from orchestrator.config.check import check_campaign
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign, load_laboratory, load_parameters, load_vessel
 from orchestrator.config.quantities import format_quantity, parse_quantity
-from orchestrator.config.schema import campaign_schema, laboratory_schema, schema_text, vessel_schema
+from orchestrator.config.schema import campaign_schema, laboratory_schema, schema_text, study_schema, vessel_schema
 from orchestrator.config.yaml_source import Document
 from orchestrator.fingerprint import fingerprint
 from sim_engine.action import DEG
@@ -29,7 +29,12 @@ from sim_engine.vessel.spec import MeshShape
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CAMPAIGNS = sorted((CONFIGS / "campaigns").glob("*.yaml"))
-SCHEMAS = {"campaigns": campaign_schema, "vessels": vessel_schema, "laboratories": laboratory_schema}
+SCHEMAS = {
+    "campaigns": campaign_schema,
+    "vessels": vessel_schema,
+    "laboratories": laboratory_schema,
+    "studies": study_schema,
+}
 SHIPPED = [path for kind in SCHEMAS for path in sorted((CONFIGS / kind).glob("*.yaml"))]
 
 
@@ -61,7 +66,7 @@ def test_shipped_file_names_its_schema_and_satisfies_it(path: Path) -> None:
 
 @pytest.mark.parametrize("kind", SCHEMAS)
 def test_committed_schema_is_current(kind: str) -> None:
-    name = {"campaigns": "campaign", "vessels": "vessel", "laboratories": "laboratory"}[kind]
+    name = {"campaigns": "campaign", "vessels": "vessel", "laboratories": "laboratory", "studies": "study"}[kind]
     assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(SCHEMAS[kind]())
 
 

@@ -1,0 +1,146 @@
+"""From a study's strategies as written to their plans: which keys are whose, and what they may spend."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.config.yaml_source import Place, Report
+from orchestrator.plan import CalibrationPlan, DeploymentPlan
+from orchestrator.study.plan import CalibrationArm, DeploymentArm
+
+if TYPE_CHECKING:
+    from orchestrator.config.sections import Section
+
+CALIBRATION_KEYS = {
+    "per_axis": ("C1",),
+    "samples": ("C2",),
+    "iterations": ("C3",),
+    "simulations": ("C4",),
+    "initial": ("C3", "C4"),
+    "kappa": ("C3", "C4"),
+}
+BUDGET = {"C1": ("per_axis", 10), "C2": ("samples", 18), "C3": ("iterations", 59), "C4": ("simulations", 108)}
+"""What a calibration has to spend, with the paper's number as an example."""
+
+DEPLOYMENT_KEYS = {
+    "pours": ("D2", "D3"),
+    "iterations": ("D1",),
+    "simulations_per_iteration": ("D1",),
+    "prior_simulations": ("D3",),
+    "per_pour": ("D3",),
+    "mean": ("D2",),
+}
+
+
+def calibration_arms(
+    section: Section | None,
+    base: CalibrationPlan,
+    train: int,
+    levels: tuple[str, ...],
+    compared: str,
+    root: Place,
+    report: Report,
+) -> tuple[CalibrationArm, ...]:
+    """The calibrations of a study; what is wrong goes to the report.
+
+    Args:
+        base: with space and scene; pours and budget are filled in here and later.
+        train: pours that every θ of C1 to C3 is simulated on.
+        levels: all names; C4 is run at all of them, the others at `compared`.
+    """
+    arms = []
+    for name in ("C1", "C2", "C3", "C4") if section is not None else ():
+        arm: Any = section.value(name) if section is not None else None
+        at = root.at("calibration", name)
+        if arm is None:
+            continue
+        _check_keys(arm, name, CALIBRATION_KEYS, at, report)
+        key, example = BUDGET[name]
+        budget = arm.value(key)
+        if budget is None:
+            if not report.is_broken(at.at(key)):
+                report.add(at, f"key '{key}' is missing; add for example '{key}: {example}'", key=True)
+            continue
+        changes: dict[str, Any] = {"strategy": name, "grid": {}, "thetas": 0}
+        match name:
+            case "C1":
+                changes |= {"grid": dict.fromkeys(base.parameters.names, budget)}
+                changes |= {"simulations": train * budget**base.parameters.dimension}
+            case "C4":
+                changes |= {"simulations": budget}
+            case _:
+                changes |= {"thetas": budget, "simulations": train * budget}
+        trials = budget if name in ("C3", "C4") else math.inf
+        initial = base.initial if arm.initial is None else arm.initial
+        if arm.initial is not None and initial > trials:
+            report.add(at.at("initial"), f"{initial} random θ don't fit into {key}: {budget}")
+        changes |= {"initial": int(min(initial, trials)), "kappa": base.kappa if arm.kappa is None else arm.kappa}
+        where = levels if name == "C4" else (compared,)
+        arms.append(CalibrationArm(replace(base, **changes), arm.repetitions or 1, where))
+    return tuple(arms)
+
+
+def deployment_arms(
+    section: Section | None,
+    base: DeploymentPlan | None,
+    calibrations: tuple[CalibrationArm, ...],
+    root: Place,
+    report: Report,
+) -> tuple[DeploymentArm, ...]:
+    """The deployments of a study; what is wrong goes to the report."""
+    if section is None:
+        return ()
+    if base is None:
+        report.add(root.at("deployment"), "the base campaign has no 'deployment' section to take receivers from")
+        return ()
+    most = max((arm.repetitions for arm in calibrations if arm.plan.strategy == "C4"), default=0)
+    arms: list[DeploymentArm] = []
+    for name in ("D1", "D2", "D3"):
+        arm: Any = section.value(name)
+        at = root.at("deployment", name)
+        if arm is None:
+            continue
+        _check_keys(arm, name, DEPLOYMENT_KEYS, at, report)
+        repetitions = arm.repetitions or 1
+        if name != "D2" and repetitions > most:
+            report.add(
+                at.at("repetitions") if arm.repetitions is not None else at,
+                f"{name} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
+                f"add 'calibration: {{C4: {{repetitions: {repetitions}, simulations: 108}}}}'",
+            )
+        if name != "D1" and arm.pours is None:
+            if not report.is_broken(at.at("pours")):
+                report.add(at, "key 'pours' is missing; add for example 'pours: 15'", key=True)
+            continue
+        common = replace(
+            base,
+            strategy=name,
+            pours=1 if name == "D1" else arm.pours,
+            per_pour=0,
+            data=None,
+            mean=arm.mean or "constant",
+            kappa=base.kappa if arm.kappa is None else arm.kappa,
+            initial=base.initial if arm.initial is None else arm.initial,
+        )
+        if name == "D1":
+            numbers = sorted(set(arm.iterations or [15]))
+            repeats = arm.simulations_per_iteration or 2
+            arms += [
+                DeploymentArm(f"D1-{n}", replace(common, iterations=n, simulations_per_iteration=repeats), repetitions)
+                for n in numbers
+            ]
+        elif name == "D3":
+            prior = 37 if arm.prior_simulations is None else arm.prior_simulations
+            beside = 2 if arm.per_pour is None else arm.per_pour
+            arms.append(DeploymentArm(name, replace(common, prior_simulations=prior, per_pour=beside), repetitions))
+        else:
+            arms.append(DeploymentArm(name, common, repetitions))
+    return tuple(arms)
+
+
+def _check_keys(arm: Any, name: str, belongs: dict[str, tuple[str, ...]], at: Place, report: Report) -> None:
+    for key, strategies in belongs.items():
+        if arm.value(key) is not None and name not in strategies:
+            report.add(at.at(key), f"belongs to {' and '.join(strategies)}, not to {name}; remove it", key=True)

@@ -1,0 +1,324 @@
+"""Studies as written in files: which strategies are compared, how often, and on benches that are how far off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from orchestrator.config.campaign import Kappa
+from orchestrator.config.errors import ConfigError
+from orchestrator.config.kinds import wrong_kind
+from orchestrator.config.laboratory import (
+    HiddenLiquid,
+    LaboratoryFile,
+    PoseErrorSection,
+    PoseNoiseSection,
+)
+from orchestrator.config.load import load_campaign
+from orchestrator.config.references import References
+from orchestrator.config.resolve_study import calibration_arms, deployment_arms
+from orchestrator.config.sections import Count, Name, PathOr, PositiveCount, Section, Text
+from orchestrator.config.validate import validate
+from orchestrator.config.vessel import missing_file
+from orchestrator.config.yaml_source import Document, Place, Report
+from orchestrator.plan import CampaignPlan
+from orchestrator.study.plan import Level, StudyPlan
+from sim_engine.space import Space
+from sim_engine.task import PoseError
+
+
+class LevelSection(Section):
+    """How far the bench is from what the simulator can be."""
+
+    required: ClassVar[dict[str, str]] = {"name": "moderate", "liquid": "{particles: 4000, cohesion: 0.05 N/m}"}
+
+    name: Name | None = None
+    """Its name in figures and folders."""
+
+    liquid: HiddenLiquid | None = None
+    """Hidden θ of the 'real' liquid; calibration never reads it."""
+
+    pose_error: PoseErrorSection = PoseErrorSection()
+    """Systematic error of grip and placement."""
+
+    pose_noise: PoseNoiseSection = PoseNoiseSection()
+    """Its scatter, drawn anew for each pour."""
+
+
+class CalibrationArmSection(Section):
+    """One of C1 to C4: how often, and what it may spend."""
+
+    required: ClassVar[dict[str, str]] = {"repetitions": "10"}
+
+    repetitions: PositiveCount | None = None
+    """How often it is run, each time on pours of its own."""
+
+    per_axis: PositiveCount | None = None
+    """C1: values of every searched parameter."""
+
+    samples: PositiveCount | None = None
+    """C2: θ in all."""
+
+    iterations: PositiveCount | None = None
+    """C3: θ in all, each simulated on all training pours."""
+
+    simulations: PositiveCount | None = None
+    """C4: single simulated pours."""
+
+    initial: PositiveCount | None = None
+    """C3, C4: random θ before the surrogate takes over."""
+
+    kappa: Kappa | None = None
+    """C3, C4: κ of the lower confidence bound."""
+
+
+class CalibrationsSection(Section):
+    """The calibrations that are compared."""
+
+    C1: CalibrationArmSection | None = None
+    """Uniform grid."""
+
+    C2: CalibrationArmSection | None = None
+    """Stratified sampling."""
+
+    C3: CalibrationArmSection | None = None
+    """Bayesian optimisation, each θ on all training pours."""
+
+    C4: CalibrationArmSection | None = None
+    """Bayesian optimisation, one simulation an iteration; its θ* are what D1 and D3 simulate with."""
+
+
+class DeploymentArmSection(Section):
+    """One of D1 to D3: how often, and what it may spend."""
+
+    required: ClassVar[dict[str, str]] = {"repetitions": "10"}
+
+    repetitions: PositiveCount | None = None
+    """How often it is run into each receiver."""
+
+    pours: PositiveCount | None = None
+    """D2, D3: real pours."""
+
+    iterations: list[PositiveCount] | None = None
+    """D1: iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
+
+    simulations_per_iteration: PositiveCount | None = None
+    """D1: simulations averaged in each."""
+
+    prior_simulations: Count | None = None
+    """D3: simulations before the first pour."""
+
+    per_pour: Count | None = None
+    """D3: simulations told between two pours."""
+
+    mean: Literal["constant", "zero"] | None = None
+    """D2: prior mean of the surrogate."""
+
+    initial: PositiveCount | None = None
+    """Random actions before the surrogate takes over."""
+
+    kappa: Kappa | None = None
+    """κ of the lower confidence bound."""
+
+
+class DeploymentsSection(Section):
+    """The deployments that are compared, into each of the base campaign's receivers."""
+
+    D1: DeploymentArmSection | None = None
+    """Plan in simulation, pour once."""
+
+    D2: DeploymentArmSection | None = None
+    """Learn on real pours."""
+
+    D3: DeploymentArmSection | None = None
+    """Real pours with a simulated prior."""
+
+
+class StudyFile(Section):
+    """A study: a campaign's calibrations and deployments, repeated and compared."""
+
+    required: ClassVar[dict[str, str]] = {
+        "name": "paper",
+        "campaign": "../campaigns/paper.yaml",
+        "mismatch": "[{name: moderate, liquid: {particles: 4000}}]",
+    }
+
+    name: Name | None = None
+    """Its name; runs go to study-NAME."""
+
+    seed: Count = 0
+    """Of every random choice."""
+
+    campaign: Text | None = None
+    """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""
+
+    laboratory: PathOr[LaboratoryFile] | None = None
+    """In place of the campaign's; a virtual one, with a bench."""
+
+    search: list[Text] | None = None
+    """Which of the campaign's searched parameters are searched; the others have the middle of what they may be."""
+
+    pours: PositiveCount | None = None
+    """Calibration pours of a repetition, in place of the campaign's."""
+
+    holdout: PositiveCount | None = None
+    """How many of them are kept for testing."""
+
+    mismatch: list[LevelSection] | None = None
+    """Levels of mismatch between bench and simulator."""
+
+    compared: Text | None = None
+    """Level at which C1 to C4 are compared; the first unless given. C4 is run at all levels, for D1 and D3."""
+
+    calibration: CalibrationsSection | None = None
+    """The calibrations."""
+
+    deployment: DeploymentsSection | None = None
+    """The deployments."""
+
+    directory: Text | None = None
+    """Where the study's folder goes; 'runs' in the working directory unless given."""
+
+
+def load_study(path: Path) -> StudyPlan:
+    """The plan of a study file, with everything that it refers to.
+
+    Raises:
+        ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
+    """
+    report = Report()
+    place = Place(Document.read(path.resolve()))
+    if (other := wrong_kind(place.document, "study")) is not None:
+        raise ConfigError([other])
+    section = validate(StudyFile, place, report)
+    study = None if section is None else _resolve(section, place, report)
+    report.raise_if_any()
+    assert study is not None, "a study without problems has a plan"
+    return study
+
+
+def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
+    base = _base(file, root, report)
+    levels = _levels(file, root, report)
+    if base is None:
+        return None
+    calibration = base.calibration
+    if calibration is None or calibration.pour_count < 1:
+        report.add(root.at("campaign"), "has no calibration on pours that are to be made (calibration.pours.count)")
+        return None
+    searched = _searched(file, base, root, report)
+    count = file.pours or calibration.pour_count
+    holdout = file.holdout or min(calibration.holdout, count - 1)
+    if not 0 < holdout < count - 1:
+        report.add(
+            root.at("holdout") if file.holdout else root.at("campaign"),
+            f"{holdout} of {count} pours for testing: a study needs at least one, and leaves two or more to fit",
+        )
+    bench = base.laboratory.bench
+    if base.laboratory.mode != "virtual" or bench is None:
+        report.add(
+            root.at("laboratory" if file.laboratory is not None else "campaign"),
+            f"laboratory '{base.laboratory.name}' has no virtual bench, and a study sets what is hidden there; name "
+            "one that has, for example ../laboratories/twin.yaml",
+        )
+        return None
+    names = tuple(level.name or "" for level in file.mismatch or [])
+    compared = file.compared or (names[0] if names else "")
+    if names and compared not in names:
+        report.add(root.at("compared"), f"no such level; there are {', '.join(names)}")
+    if (
+        file.calibration is None
+        and file.deployment is None
+        and not any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
+    ):
+        report.add(root, "there is nothing to compare; add a 'calibration' or a 'deployment' section", key=True)
+    plan = replace(
+        calibration,
+        parameters=searched,
+        pour_count=0,
+        holdout=0,
+        random_baseline=0,
+        fixed_parameters={
+            name: value for name, value in base.parameters.model_dump().items() if name not in searched.names
+        },
+    )
+    calibrations = calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
+    deployments = deployment_arms(file.deployment, base.deployment, calibrations, root, report)
+    if report.problems or file.name is None:
+        return None
+    return StudyPlan(
+        name=file.name,
+        seed=file.seed,
+        source=root.document.path,
+        base=replace(base, name=file.name, seed=file.seed, calibration=plan, deployment=None),
+        levels=tuple(
+            Level(
+                name,
+                replace(
+                    bench,
+                    liquid=liquid.parameters(),
+                    pose_error=PoseError(**error.model_dump()),
+                    pose_noise=PoseError(**noise.model_dump()),
+                    # Numbers need not be waited for; an arm over wires needs its time.
+                    time_scale=bench.time_scale if base.laboratory.arm is not None else 0.0,
+                ),
+            )
+            for name, liquid, error, noise in levels
+        ),
+        calibrations=calibrations,
+        deployments=deployments,
+        pour_count=count,
+        holdout=holdout,
+        compared=compared,
+        directory=Path("runs").resolve() if file.directory is None else (root.directory / file.directory).resolve(),
+    )
+
+
+def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
+    laboratory = None
+    if file.laboratory is not None:
+        laboratory = References(report).laboratory(file.laboratory, root.at("laboratory"))
+    if file.campaign is None:
+        return None
+    path = (root.directory / file.campaign).resolve()
+    if not path.is_file():
+        report.add(root.at("campaign"), missing_file(path))
+        return None
+    try:
+        base = load_campaign(path)
+    except ConfigError as error:
+        report.problems.extend(error.problems)
+        return None
+    return base if laboratory is None else replace(base, laboratory=laboratory)
+
+
+def _levels(file: StudyFile, root: Place, report: Report) -> list[tuple[str, Any, PoseErrorSection, PoseNoiseSection]]:
+    found: list[tuple[str, Any, PoseErrorSection, PoseNoiseSection]] = []
+    if file.mismatch == []:
+        report.add(root.at("mismatch"), "is empty; name at least one level")
+    for i, level in enumerate(file.mismatch or []):
+        if level.name is None or level.liquid is None:
+            continue  # reported as missing
+        if level.name in [name for name, *_ in found]:
+            report.add(root.at("mismatch", i), f"a level '{level.name}' stands above already")
+        found.append((level.name, level.liquid, level.pose_error, level.pose_noise))
+    return found
+
+
+def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) -> Space:
+    assert base.calibration is not None
+    axes = {axis.name: axis for axis in base.calibration.parameters.axes}
+    if file.search is None:
+        return base.calibration.parameters
+    for i, name in enumerate(file.search):
+        if name not in axes:
+            report.add(
+                root.at("search", i), f"'{name}' is not searched by the campaign; searched are {', '.join(axes)}"
+            )
+    known = list(dict.fromkeys(name for name in file.search if name in axes))
+    if not known:
+        if not file.search:
+            report.add(root.at("search"), "is empty; name parameters, or remove the key")
+        return base.calibration.parameters
+    return Space(tuple(axes[name] for name in known))

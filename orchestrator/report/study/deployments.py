@@ -1,0 +1,193 @@
+"""Figures of the deployments: 5a, 5b and 6 loss against pours, 7 what pays off at which prices."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from orchestrator.report import style
+from orchestrator.report.study.calibrations import error
+from orchestrator.report.study.drawing import Drawn, colour, line
+from orchestrator.report.study.gather import Gathered, Key, at_pour, mean
+from orchestrator.report.study.intervals import Estimate, estimate
+from orchestrator.report.units import deployment_unit
+from orchestrator.study.cells import deployment_simulations
+from orchestrator.study.plan import StudyPlan
+
+SECONDS_OF_SIMULATION = (0.1, 1.0, 25.0)
+SECONDS_OF_POUR = (5.0, 90.0, 600.0)
+CHECKPOINTS = (3, 9, 15)
+
+
+def draw_deployments(study: StudyPlan, found: Gathered) -> list[Drawn]:
+    """The figures that what is there allows."""
+    if not found.losses:
+        return []
+    return [_after_pours(study, found), _mean_of_pours(study, found), _best_so_far(study, found), _prices(study, found)]
+
+
+def places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str], list[str]]:
+    """Levels, receivers and arms of which there is something, in the study's order."""
+    levels = [level.name for level in study.levels if any(key.level == level.name for key in found.losses)]
+    names = [scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes]
+    receivers = [name for name in dict.fromkeys(names) if any(key.receiver == name for key in found.losses)]
+    arms = [arm.label for arm in study.deployments if any(key.arm == arm.label for key in found.losses)]
+    return levels, receivers, arms
+
+
+def most_pours(study: StudyPlan) -> int:
+    """Pours of the longest deployment."""
+    return max(arm.plan.pours for arm in study.deployments)
+
+
+def checkpoints(study: StudyPlan, wanted: tuple[int, ...] = CHECKPOINTS) -> list[int]:
+    """Those that are reached, and the end."""
+    return sorted({min(pour, most_pours(study)) for pour in wanted})
+
+
+def _bars(axes: object, place: float, width: float, one: Estimate, arm: str, label: str | None) -> None:
+    axes.bar(place, one.mean, width, color=colour(arm), yerr=error(one), capsize=3, label=label, alpha=0.9)  # type: ignore[attr-defined]
+
+
+def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
+    levels, receivers, arms = places(study, found)
+    unit, receiver, pours = deployment_unit(study.deployments[0].plan), receivers[0], checkpoints(study)
+    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
+    rows: list[list[object]] = []
+    width = 0.8 / len(arms)
+    for axes, level in zip(grid[0], levels, strict=True):
+        for i, pour in enumerate(pours):
+            for j, arm in enumerate(arms):
+                one = estimate(at_pour(found.best_so_far(Key(level, receiver, arm)), pour)).scaled(unit.factor)
+                rows.append([level, receiver, arm, pour, one.count, one.mean, one.low, one.high])
+                _bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
+        axes.set_xticks(range(len(pours)), [str(pour) for pour in pours])
+        style.dress(axes, title=f"{level} mismatch", x="pours", y=f"least {unit.label}" if level == levels[0] else "")
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    return Drawn(
+        "figure-5a",
+        "5a",
+        f"Least loss after so many pours into '{receiver}'",
+        "Mean over repetitions of the least loss so far, with 95 % intervals. D1 pours once: its number stays.",
+        figure,
+        ("level", "receiver", "strategy", "pours", "repetitions", f"least_{unit.unit}", "low", "high"),
+        rows,
+    )
+
+
+def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
+    levels, receivers, arms = places(study, found)
+    unit = deployment_unit(study.deployments[0].plan)
+    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
+    rows: list[list[object]] = []
+    width = 0.8 / len(arms)
+    for axes, level in zip(grid[0], levels, strict=True):
+        for i, receiver in enumerate(receivers):
+            for j, arm in enumerate(arms):
+                losses = found.losses.get(Key(level, receiver, arm), [])
+                one = estimate([mean(pours) for pours in losses]).scaled(unit.factor)
+                rows.append([level, receiver, arm, one.count, one.mean, one.low, one.high])
+                _bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
+        axes.set_xticks(range(len(receivers)), receivers)
+        style.dress(axes, title=f"{level} mismatch", y=f"mean {unit.label}" if level == levels[0] else "")
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    return Drawn(
+        "figure-5b",
+        "5b",
+        "Mean loss of a pour",
+        "Over all pours of a repetition, exploring ones too; mean over repetitions with 95 % intervals.",
+        figure,
+        ("level", "receiver", "strategy", "repetitions", f"mean_{unit.unit}", "low", "high"),
+        rows,
+    )
+
+
+def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
+    levels, receivers, arms = places(study, found)
+    from matplotlib.ticker import MaxNLocator
+
+    unit, numbers = deployment_unit(study.deployments[0].plan), list(range(1, most_pours(study) + 1))
+    size = (1.2 + 3.4 * len(receivers), 0.8 + 2.8 * len(levels))
+    figure, grid = style.new_figure(len(levels), len(receivers), size=size, squeeze=False, sharex=True, sharey=True)
+    rows: list[list[object]] = []
+    for i, level in enumerate(levels):
+        for j, receiver in enumerate(receivers):
+            axes = grid[i][j]
+            for arm in arms:
+                curves = found.best_so_far(Key(level, receiver, arm))
+                if not curves:
+                    continue
+                points = [estimate(at_pour(curves, pour)).scaled(unit.factor) for pour in numbers]
+                rows += [[level, receiver, arm, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points)]  # noqa: B905
+                axes.plot(numbers, [e.mean for e in points], line(arm, arms), color=colour(arm), label=arm)
+                low, high = [e.low for e in points], [e.high for e in points]
+                axes.fill_between(numbers, low, high, color=colour(arm), alpha=0.15, linewidth=0)
+            x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if j == 0 else ""
+            style.dress(axes, title=f"{receiver}, {level} mismatch", x=x, y=y, grid="both")
+            axes.set_ylim(bottom=0.0)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    return Drawn(
+        "figure-6",
+        "6",
+        "Least loss so far against real pours",
+        "Mean over repetitions with 95 % intervals. D1 is planned in simulation alone and poured once.",
+        figure,
+        ("level", "receiver", "strategy", "pour", "repetitions", f"least_{unit.unit}", "low", "high"),
+        rows,
+    )
+
+
+def _prices(study: StudyPlan, found: Gathered) -> Drawn:
+    levels, receivers, arms = places(study, found)
+    level = study.compared if study.compared in levels else levels[0]
+    unit = deployment_unit(study.deployments[0].plan)
+    shape = (len(SECONDS_OF_SIMULATION), len(SECONDS_OF_POUR))
+    figure, grid = style.new_figure(*shape, size=(11.0, 8.6), squeeze=False, sharey=True)
+    rows: list[list[object]] = []
+    for i, simulation in enumerate(SECONDS_OF_SIMULATION):
+        for j, pour in enumerate(SECONDS_OF_POUR):
+            axes, planned = grid[i][j], []
+            for arm in arms:
+                times, values = _spent(study, found, level, receivers, arm, simulation, pour)
+                rows += [[level, simulation, pour, arm, t, unit.factor * v] for t, v in zip(times, values)]  # noqa: B905
+                shown = [max(unit.factor * value, 0.01) for value in values]
+                if arm.startswith("D1"):
+                    planned += list(zip(times, shown))  # noqa: B905
+                else:
+                    axes.plot(times, shown, ".-", color=colour(arm), label=arm, markersize=4)
+            if planned:
+                planned.sort()
+                axes.plot(*np.transpose(planned), "s--", color=colour("D1"), label="D1", markersize=5)
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            x, y = "total time [s]" if i == shape[0] - 1 else "", f"least {unit.label}" if j == 0 else ""
+            style.dress(axes, title=f"{simulation:g} s a simulation, {pour:g} s a pour", x=x, y=y, grid="both")
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    return Drawn(
+        "figure-7",
+        "7",
+        "What pays off at which prices",
+        f"Least loss so far, mean over repetitions and receivers ({level} mismatch), against the time that it would "
+        "have taken at hypothesised prices. D3's simulations beside a pour cost time only where they take longer than "
+        "the pour. Calibration is not counted: D1 and D3 share it.",
+        figure,
+        ("level", "seconds_per_simulation", "seconds_per_pour", "strategy", "total_seconds", f"least_{unit.unit}"),
+        rows,
+    )
+
+
+def _spent(
+    study: StudyPlan, found: Gathered, level: str, receivers: list[str], arm: str, simulation: float, pour: float
+) -> tuple[list[float], list[float]]:
+    """Total time after each pour, and the least loss so far, averaged over receivers."""
+    plan = study.deployment(arm).plan
+    curves = [curve for name in receivers for curve in found.best_so_far(Key(level, name, arm))]
+    length = max((len(curve) for curve in curves), default=0)
+    if plan.strategy == "D1":
+        before, each = deployment_simulations(plan) * simulation, pour
+    elif plan.strategy == "D3":
+        before, each = plan.prior_simulations * simulation, max(pour, (plan.per_pour or 0) * simulation)
+    else:
+        before, each = 0.0, pour
+    numbers = range(1, length + 1)
+    return [before + n * each for n in numbers], [mean(at_pour(curves, n)) for n in numbers]

@@ -1,0 +1,137 @@
+"""From the results of a study's cells to the numbers that figures and tables are made of. Works with what is there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from orchestrator.stages import CALIBRATION, EVALUATION
+from orchestrator.study.cells import Cell, cells_of
+from orchestrator.study.plan import StudyPlan
+
+UNCALIBRATED = "uncalibrated"
+
+
+@dataclass
+class Calibrated:
+    """What one strategy found in its repetitions at the compared level.
+
+    Attributes:
+        test, train: |r − c_s| of every pour, one list a repetition.
+        simulations: spent by each repetition; a grid that all of them score counts whole.
+        results: of the calibration stages; none of the uncalibrated simulator.
+        expected: C4: [simulations, expected mean |Δ|] of every θ that was chosen, one list a repetition.
+    """
+
+    test: list[list[float]] = field(default_factory=list)
+    train: list[list[float]] = field(default_factory=list)
+    simulations: list[int] = field(default_factory=list)
+    results: list[Mapping[str, Any]] = field(default_factory=list)
+    expected: list[list[list[float]]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Key:
+    """Where pours were made: level, receiver's name, label of the deployment."""
+
+    level: str
+    receiver: str
+    arm: str
+
+
+@dataclass
+class Gathered:
+    """Everything of a study that is finished.
+
+    Attributes:
+        calibrated: by strategy, `UNCALIBRATED` first where it is there.
+        losses: loss of every pour in order, one list a repetition; NaN where a pour gave none.
+        cells, finished: how many.
+        simulations, pours: that were made.
+        cpu_s, seconds: of all cells.
+    """
+
+    calibrated: dict[str, Calibrated] = field(default_factory=dict)
+    losses: dict[Key, list[list[float]]] = field(default_factory=dict)
+    cells: int = 0
+    finished: int = 0
+    simulations: int = 0
+    pours: int = 0
+    cpu_s: float = 0.0
+    seconds: float = 0.0
+
+    def best_so_far(self, key: Key) -> list[list[float]]:
+        """Least loss up to each pour, one list a repetition; all as long as the longest (D1 pours once)."""
+        return [running_least(losses) for losses in self.losses.get(key, [])]
+
+
+def gather(study: StudyPlan, results: Mapping[str, Mapping[str, Any]]) -> Gathered:
+    """Sort what the finished cells came to.
+
+    Args:
+        results: by cell, as `read_result` has them.
+    """
+    cells = cells_of(study)
+    found = Gathered(cells=len(cells))
+    order = [UNCALIBRATED, *(arm.plan.strategy for arm in study.calibrations)]
+    receivers = {scene.name: scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes}
+    for cell in cells:
+        if cell.id not in results:
+            continue
+        data = results[cell.id]
+        found.finished += 1
+        found.simulations += data["simulations"]
+        found.pours += data["pours"]
+        found.cpu_s += data["cpu_s"]
+        found.seconds += data["seconds"]
+        if cell.kind in ("calibration", "uncalibrated") and cell.level == study.compared:
+            _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Calibrated()), data)
+        elif cell.kind == "deployment":
+            key = Key(cell.level, receivers[cell.receiver], cell.arm)
+            found.losses.setdefault(key, []).append(_losses(cell, data))
+    found.calibrated = {name: found.calibrated[name] for name in order if name in found.calibrated}
+    return found
+
+
+def _note_calibration(noted: Calibrated, data: Mapping[str, Any]) -> None:
+    pairs = [
+        (pair["split"], abs(pair["measured"] - pair["simulated"]))
+        for pair in data["results"][EVALUATION]["pairs"]
+        if pair["theta"] == "theta" and pair["simulated"] is not None
+    ]
+    noted.test.append([difference for split, difference in pairs if split == "test"])
+    noted.train.append([difference for split, difference in pairs if split == "train"])
+    result = data["results"].get(CALIBRATION)
+    noted.simulations.append(0 if result is None else result["simulations"])
+    if result is not None:
+        noted.results.append(result)
+        noted.expected.append(data.get("expected", []))
+
+
+def _losses(cell: Cell, data: Mapping[str, Any]) -> list[float]:
+    rows = next(iter(data["results"].values()))["pours"]
+    counted = [row for row in rows if row["status"] in ("weighed", "failed")]
+    return [math.nan if row["loss"] is None else float(row["loss"]) for row in counted]
+
+
+def running_least(values: Sequence[float]) -> list[float]:
+    """Least value up to each place; NaN before the first that is a number."""
+    best, running = math.nan, []
+    for value in values:
+        if not math.isnan(value):
+            best = value if math.isnan(best) else min(best, value)
+        running.append(best)
+    return running
+
+
+def mean(values: Sequence[float]) -> float:
+    """NaN of nothing."""
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan
+
+
+def at_pour(curves: Sequence[Sequence[float]], pour: int) -> list[float]:
+    """Each repetition's value at a pour, from 1; its last one where it has fewer (D1 goes on with its one action)."""
+    return [curve[min(pour, len(curve)) - 1] for curve in curves if curve]

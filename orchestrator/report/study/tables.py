@@ -1,0 +1,154 @@
+"""Tables of a study: discrepancies of the calibrations, losses of the deployments, pours to the same loss."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.report.study.deployments import checkpoints, most_pours, places
+from orchestrator.report.study.gather import UNCALIBRATED, Gathered, Key, at_pour, mean
+from orchestrator.report.study.intervals import Estimate, estimate, statistic
+from orchestrator.report.units import deployment_unit
+from orchestrator.study.plan import StudyPlan
+
+TABLE_POURS = (1, 3, 15)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells are texts, numbers, or estimates (three columns in CSV)."""
+
+    name: str
+    title: str
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str | int | float | Estimate]]
+
+    def flat(self) -> tuple[list[str], list[list[object]]]:
+        """Header and rows for CSV."""
+        header: list[str] = []
+        for i, name in enumerate(self.header):
+            wide = any(isinstance(row[i], Estimate) for row in self.rows)
+            header += [name, f"{name}, low", f"{name}, high"] if wide else [name]
+        rows: list[list[object]] = []
+        for row in self.rows:
+            flat: list[object] = []
+            for value in row:
+                flat += [value.mean, value.low, value.high] if isinstance(value, Estimate) else [value]
+            rows.append(flat)
+        return header, rows
+
+
+def tables(study: StudyPlan, found: Gathered) -> list[Table]:
+    """Those of which there is something."""
+    made = []
+    if found.calibrated:
+        made.append(_calibrations(study, found))
+    if found.losses:
+        made.append(_deployments(study, found))
+        if rows := _needed(study, found):
+            made.append(
+                Table(
+                    "table-pours",
+                    "Pours to the same loss",
+                    "The loss that both D2 and D3 reach: the larger of their mean least losses after the last pour. "
+                    "Pours until the mean of the least loss so far is there, with 95 % intervals over the repetitions; "
+                    "a resampled mean that never gets there counts as one pour more than there were.",
+                    ("mismatch", "receiver", "loss", "D2", "D3"),
+                    rows,
+                )
+            )
+    return made
+
+
+def _calibrations(study: StudyPlan, found: Gathered) -> Table:
+    rows: list[list[str | int | float | Estimate]] = []
+    for name, one in found.calibrated.items():
+        spent = "0" if name == UNCALIBRATED else f"{mean([float(n) for n in one.simulations]):.0f}"
+        if name == "C1":
+            spent += " (scored from one grid)"
+        values = [mean(test) for test in one.test]
+        trained = [mean(train) for train in one.train]
+        rows.append(
+            [
+                name,
+                spent,
+                len(one.test),
+                estimate(trained).scaled(100),
+                estimate(values).scaled(100),
+                _thetas(one.results),
+            ]
+        )
+    return Table(
+        "table-calibration",
+        "Discrepancy of the calibrated simulators",
+        f"Mean |measured − simulated| of the normalised spillage, mean over repetitions [95 % interval], at "
+        f"{study.compared} mismatch. Uncalibrated: searched parameters at their defaults.",
+        ("strategy", "simulations", "repetitions", "training pours [%]", "test pours [%]", "θ*, mean ± deviation"),
+        rows,
+    )
+
+
+def _thetas(results: Sequence[object]) -> str:
+    texts = []
+    for name in results[0]["searched"] if results else ():  # type: ignore[index]
+        values = [result["theta"][name] for result in results]  # type: ignore[index]
+        texts.append(f"{name} {np.mean(values):.3g} ± {np.std(values):.2g}")
+    return ", ".join(texts)
+
+
+def _deployments(study: StudyPlan, found: Gathered) -> Table:
+    levels, receivers, arms = places(study, found)
+    unit, pours = deployment_unit(study.deployments[0].plan), checkpoints(study, TABLE_POURS)
+    rows: list[list[str | int | float | Estimate]] = []
+    for level in levels:
+        for receiver in receivers:
+            for arm in arms:
+                curves = found.best_so_far(Key(level, receiver, arm))
+                if curves:
+                    values = [estimate(at_pour(curves, pour)).scaled(unit.factor) for pour in pours]
+                    rows.append([level, receiver, arm, len(curves), *values])
+    return Table(
+        "table-deployment",
+        f"Least {unit.label} so far",
+        "Mean over repetitions [95 % interval]. D1 pours once: its number stays.",
+        ("mismatch", "receiver", "strategy", "repetitions", *(f"after {n} pour{'s' * (n > 1)}" for n in pours)),
+        rows,
+    )
+
+
+def _needed(study: StudyPlan, found: Gathered) -> list[list[str | int | float | Estimate]]:
+    levels, receivers, _ = places(study, found)
+    unit, pours = deployment_unit(study.deployments[0].plan), most_pours(study)
+    rows: list[list[str | int | float | Estimate]] = []
+    for level in levels:
+        for receiver in receivers:
+            curves = {
+                arm: [
+                    [math.inf if math.isnan(v) else v for v in (at_pour([curve], n)[0] for n in range(1, pours + 1))]
+                    for curve in found.best_so_far(Key(level, receiver, arm))
+                    if curve
+                ]
+                for arm in ("D2", "D3")
+            }
+            if all(curves.values()):
+                loss = max(float(np.mean([curve[-1] for curve in each])) for each in curves.values())
+                needed = [pours_needed(curves[arm], loss) for arm in ("D2", "D3")]
+                rows.append([level, receiver, unit.text(loss), *needed])
+    return rows
+
+
+def pours_needed(curves: Sequence[Sequence[float]], loss: float) -> Estimate:
+    """Pours until the mean of the curves is at most `loss`; one more than there are where it never is."""
+
+    def first(data: NDArray[np.float64]) -> NDArray[np.float64]:
+        reached = data.mean(axis=-2) <= loss + 1e-12
+        ever = reached.any(axis=-1)
+        first_place: NDArray[np.float64] = np.where(ever, 1.0 + reached.argmax(axis=-1), data.shape[-1] + 1.0)
+        return first_place
+
+    return statistic(curves, first)

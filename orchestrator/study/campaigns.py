@@ -1,0 +1,158 @@
+"""From a cell to the campaign that it is: the base campaign's plan with other pours, budget, θ, bench and seed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orchestrator.plan import CampaignPlan, OutputPlan, RecordedPour, RecordSet
+from orchestrator.stages import (
+    CALIBRATION,
+    EVALUATION,
+    POURS,
+    Results,
+    StageDefinition,
+    calibration_stages,
+    deployment_stages,
+    measured_pours,
+    stage_seed,
+)
+from orchestrator.strategies.design import DesignedPours, stratified
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.scorecard import Scorecard
+from orchestrator.study.cells import GRID, Cell
+from orchestrator.study.plan import StudyPlan
+from orchestrator.study.strategies import AnsweredByTable, SimulatedTable
+from sim_engine.action import Action
+from sim_engine.liquid import SimulationParameters
+
+Load = Callable[[str], Mapping[str, Any]]
+"""Stage results of a finished cell, by its id."""
+
+
+def campaign_of(
+    study: StudyPlan, cell: Cell, load: Load, directory: Path
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    """The campaign of a cell, with its stages.
+
+    Args:
+        load: of the cells that it needs.
+        directory: of its run.
+    """
+    base = study.base
+    bench = base.laboratory.bench if not cell.level else study.level(cell.level).bench
+    plan = replace(
+        base,
+        name=cell.id,
+        seed=cell.seed,
+        laboratory=replace(base.laboratory, bench=bench),
+        outputs=OutputPlan(directory, rrd=False, figures=False, record_rate=0.0, recorded_simulations=0),
+        on_unknown="repeat",
+        resolved={},
+    )
+    match cell.kind:
+        case "grid":
+            return plan, [StageDefinition(GRID, lambda results, seed: _table(study, seed))]
+        case "pours":
+            return plan, [StageDefinition(POURS, lambda results, seed: _pours(study, seed), pours=True)]
+        case "calibration":
+            return _calibration(study, cell, plan, load)
+        case "uncalibrated":
+            plan = _with_pours(study, cell, plan, load)
+            return plan, [StageDefinition(EVALUATION, lambda results, seed: _score_of_default(plan, seed))]
+        case "deployment":
+            return _deployment(study, cell, plan, load)
+
+
+def calibration_actions(study: StudyPlan) -> list[tuple[float, ...]]:
+    """The actions of all calibration pours, in the unit cube of the action space: the same in every repetition."""
+    calibration = study.base.calibration
+    assert calibration is not None
+    rng = np.random.default_rng(stage_seed(study.seed, "actions"))
+    return [stratum.draw(rng) for stratum in stratified(study.pour_count, calibration.actions.dimension, rng)]
+
+
+def _actions(study: StudyPlan) -> list[Action]:
+    calibration = study.base.calibration
+    assert calibration is not None
+    return [calibration.scene.action(calibration.actions.decode(point)) for point in calibration_actions(study)]
+
+
+def _table(study: StudyPlan, seed: int) -> Strategy:
+    plan = study.calibration("C1").plan
+    middles = [[(i + 0.5) / plan.grid[name] for i in range(plan.grid[name])] for name in plan.parameters.names]
+    thetas = [
+        SimulationParameters.from_values({**plan.fixed_parameters, **plan.parameters.decode(point)})
+        for point in itertools.product(*middles)
+    ]
+    return SimulatedTable(plan.scene.name, _actions(study), thetas, seed)
+
+
+def _pours(study: StudyPlan, seed: int) -> Strategy:
+    plan = study.base.calibration
+    assert plan is not None
+    points = calibration_actions(study)
+    return DesignedPours(plan.scene, plan.actions, len(points), study.holdout, seed, points=points)
+
+
+def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load) -> CampaignPlan:
+    """The plan with the repetition's weighed pours as records."""
+    calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
+    assert calibration is not None
+    mass, pours = calibration.scene.liquid.mass, []
+    for row in load(cell.needs[0])[POURS]["pours"]:
+        if "action_si" in row:  # a pour that was given up has none
+            poured = row["poured"] * mass
+            pours.append(
+                RecordedPour(
+                    calibration.scene.action(row["action_si"]),
+                    poured,
+                    (row["spillage"] or 0.0) * poured,
+                    mass - poured,
+                    row["split"],
+                )
+            )
+    records = RecordSet(calibration.scene, tuple(pours), Path(cell.needs[0]))
+    return replace(plan, calibration=replace(calibration, records=records))
+
+
+def _calibration(
+    study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    plan = _with_pours(study, cell, plan, load)
+    assert plan.calibration is not None
+    stages = calibration_stages(plan.calibration)
+    if cell.arm != "C1":
+        return plan, stages
+    rows = load(GRID)[GRID]["rows"]
+
+    def answered(stage: StageDefinition) -> StageDefinition:
+        def build(results: Results, seed: int) -> Strategy:
+            return AnsweredByTable(stage.build(results, seed), rows)
+
+        return replace(stage, build=build)
+
+    return plan, [answered(stage) if stage.name == CALIBRATION else stage for stage in stages]
+
+
+def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
+    assert plan.calibration is not None
+    pours = measured_pours(plan.calibration, {})
+    return Scorecard(plan.parameters, {}, pours, plan.calibration.actions, seed)
+
+
+def _deployment(
+    study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    arm = study.deployment(cell.arm).plan
+    deployment = replace(arm, scenes=tuple(scene for scene in arm.scenes if scene.name == cell.receiver))
+    if cell.needs:
+        theta = SimulationParameters.model_validate(load(cell.needs[0])[CALIBRATION]["theta"])
+        plan = replace(plan, parameters=theta)
+    plan = replace(plan, calibration=None, deployment=deployment)
+    return plan, deployment_stages(plan, deployment)

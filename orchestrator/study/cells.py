@@ -1,0 +1,132 @@
+"""The cells of a study: small campaigns, each with a folder of its own. A pure function of the study's plan.
+
+What a repetition resamples: the errors of grip and placement, the liquid's initial positions and the balance's noise of
+every pour; which of the calibration's actions are kept for testing; and the strategies' own seeds. The calibration's
+actions are those of the study, the same in every repetition: so C1's grid is simulated once and only scored anew.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from orchestrator.plan import CalibrationPlan, DeploymentPlan
+from orchestrator.stages import stage_seed
+from orchestrator.study.plan import StudyPlan
+
+Kind = Literal["grid", "pours", "calibration", "uncalibrated", "deployment"]
+
+GRID = "grid"
+
+PARTICLE_SECONDS = 0.0007
+"""CPU seconds of a simulation by particle, for a first estimate; pours of a known study are timed instead."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One small campaign.
+
+    Attributes:
+        id: unique in the study, good as a folder's name.
+        kind: what is done: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment.
+        level: of mismatch; '' for the grid, which knows no bench.
+        arm: 'C1' … 'C4', or the label of a deployment; '' otherwise.
+        receiver: name of a deployment's scene.
+        repetition: from 1; 0 for the grid.
+        needs: ids of the cells whose results it is made from.
+        simulations, pours: at most.
+        seed: of its campaign.
+    """
+
+    id: str
+    kind: Kind
+    needs: tuple[str, ...]
+    simulations: int
+    pours: int
+    seed: int
+    level: str = ""
+    arm: str = ""
+    receiver: str = ""
+    repetition: int = 0
+
+
+def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
+    """All cells, each after those that it needs; repetition by repetition, so that an unfinished study is balanced."""
+    train = study.pour_count - study.holdout
+    cells: list[Cell] = []
+
+    def add(kind: Kind, simulations: int, pours: int, *needs: str, **place: str | int) -> str:
+        parts = [str(place[key]) for key in ("level", "arm", "receiver") if place.get(key)]
+        number = place.get("repetition")
+        name = _name(kind, *parts, number=number)
+        # Arms of a repetition share a seed: what they are scored by then differs by what they found alone.
+        shared = [str(place[key]) for key in ("level", "receiver") if place.get(key)]
+        family = "calibration" if kind == "uncalibrated" else kind
+        seed = stage_seed(study.seed, _name(family, *shared, number=number))
+        cells.append(Cell(name, kind, needs, simulations, pours, seed, **place))  # type: ignore[arg-type]
+        return name
+
+    if any(arm.plan.strategy == "C1" for arm in study.calibrations):
+        grid = math.prod(study.calibration("C1").plan.grid.values())
+        add("grid", grid * study.pour_count, 0)
+    numbers = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
+    for number in range(1, max(numbers) + 1):
+        for level in study.levels:
+            place: dict[str, str | int] = {"level": level.name, "repetition": number}
+            arms = [a for a in study.calibrations if number <= a.repetitions and level.name in a.levels]
+            if arms:
+                pours = add("pours", 0, study.pour_count, **place)
+                if level.name == study.compared:
+                    add("uncalibrated", study.pour_count, 0, pours, **place)
+            for arm in arms:
+                known = arm.plan.strategy == "C1"
+                spent = 0 if known else calibration_simulations(arm.plan, train)
+                needs = (pours, GRID) if known else (pours,)
+                add("calibration", spent + study.pour_count, 0, *needs, **place, arm=arm.plan.strategy)
+            for deployment in (a for a in study.deployments if number <= a.repetitions):
+                plan = deployment.plan
+                theta = f"calibration.{level.name}.C4.{number:02d}"
+                for scene in plan.scenes:
+                    add(
+                        "deployment",
+                        deployment_simulations(plan),
+                        plan.pours,
+                        *([theta] if plan.strategy != "D2" else []),
+                        **place,
+                        arm=deployment.label,
+                        receiver=scene.name,
+                    )
+    return tuple(cells)
+
+
+def _name(*parts: str, number: str | int | None) -> str:
+    return ".".join([*parts, *([] if number is None else [f"{int(number):02d}"])])
+
+
+def calibration_simulations(plan: CalibrationPlan, train: int) -> int:
+    """Simulations that a calibration spends on so many training pours."""
+    if plan.strategy == "C4":
+        return plan.simulations
+    return train * (math.prod(plan.grid.values()) if plan.strategy == "C1" else plan.thetas)
+
+
+def deployment_simulations(plan: DeploymentPlan) -> int:
+    """Simulations that a deployment into one receiver spends."""
+    match plan.strategy:
+        case "D1":
+            return plan.iterations * plan.simulations_per_iteration
+        case "D3":
+            return plan.prior_simulations + plan.pours * (plan.per_pour or 0)
+        case _:
+            return 0
+
+
+def estimated_seconds(study: StudyPlan, cell: Cell) -> float:
+    """CPU seconds that a cell may take, from how many particles are simulated [s]. Rough: within a factor of two."""
+    axes = {axis.name: axis for arm in study.calibrations for axis in arm.plan.parameters.axes}
+    usual = float(study.base.parameters.particles)
+    if "particles" in axes:
+        usual = math.sqrt(axes["particles"].lower * axes["particles"].upper)
+    hidden = study.level(cell.level).bench.liquid.particles if cell.level else 0
+    return PARTICLE_SECONDS * (cell.simulations * usual + cell.pours * hidden) + 3.0

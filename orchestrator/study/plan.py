@@ -1,0 +1,115 @@
+"""A study with everything resolved: the base campaign, levels of mismatch, strategies with budgets and repetitions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from actors.bench.spec import VirtualBenchSpec
+from orchestrator.codec import to_json
+from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+
+
+@dataclass(frozen=True)
+class Level:
+    """How far the bench is from what the simulator can be.
+
+    Attributes:
+        name: for people and folders.
+        bench: with the hidden θ, the errors of grip and placement, and their scatter.
+    """
+
+    name: str
+    bench: VirtualBenchSpec
+
+
+@dataclass(frozen=True)
+class CalibrationArm:
+    """One of C1 to C4 with its budget (in `plan`, which has no pours yet).
+
+    Attributes:
+        levels: names of the levels that it is run at.
+    """
+
+    plan: CalibrationPlan
+    repetitions: int
+    levels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class DeploymentArm:
+    """One of D1 to D3 with its budget (in `plan`, which has all receivers).
+
+    Attributes:
+        label: 'D1-15' for D1 with 15 iterations, otherwise the strategy.
+    """
+
+    label: str
+    plan: DeploymentPlan
+    repetitions: int
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """A whole study.
+
+    Attributes:
+        source: the YAML file.
+        base: the campaign that all cells are made from, with the study's laboratory.
+        pour_count: calibration pours of a repetition.
+        holdout: how many of them are kept for testing.
+        compared: level at which C1 to C4 and the uncalibrated simulator are compared.
+        directory: in which the study has its folder.
+    """
+
+    name: str
+    seed: int
+    source: Path
+    base: CampaignPlan
+    levels: tuple[Level, ...]
+    calibrations: tuple[CalibrationArm, ...]
+    deployments: tuple[DeploymentArm, ...]
+    pour_count: int
+    holdout: int
+    compared: str
+    directory: Path = field(default_factory=lambda: Path("runs"))
+
+    @property
+    def folder(self) -> Path:
+        """Where everything of the study is."""
+        return self.directory / f"study-{self.name}"
+
+    def level(self, name: str) -> Level:
+        """A level by its name. Raises KeyError."""
+        return {level.name: level for level in self.levels}[name]
+
+    def calibration(self, strategy: str) -> CalibrationArm:
+        """The arm of C1, C2, C3 or C4. Raises KeyError."""
+        return {str(arm.plan.strategy): arm for arm in self.calibrations}[strategy]
+
+    def deployment(self, label: str) -> DeploymentArm:
+        """The arm by its label. Raises KeyError."""
+        return {arm.label: arm for arm in self.deployments}[label]
+
+
+def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
+    """JSON-ready copy of what decides what is asked for. Repetitions are left out: more may be added later.
+
+    Raises:
+        OSError: a mesh file can't be read.
+    """
+    base = fingerprint(study.base)
+    base["laboratory"].pop("bench", None)  # every level has its own
+    base.pop("deployment", None)
+    return {
+        "name": study.name,
+        "seed": study.seed,
+        "base": base,
+        "levels": {level.name: to_json(level.bench, VirtualBenchSpec) for level in study.levels},
+        "calibrations": {arm.plan.strategy: to_json(arm.plan, CalibrationPlan) for arm in study.calibrations},
+        "deployments": {arm.label: to_json(arm.plan, DeploymentPlan) for arm in study.deployments},
+        "pours": [study.pour_count, study.holdout],
+        "compared": study.compared,
+    }

@@ -1,0 +1,142 @@
+"""What only a study asks for: simulations that many repetitions score, and a strategy that is answered by them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from orchestrator.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
+from sim_engine.action import Action
+from sim_engine.liquid import SimulationParameters
+from sim_engine.outcome import PourOutcome
+
+Key = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, float | None], ...]]
+
+
+class SimulatedTable:
+    """Simulate every θ at every action once. An action has the same seed under every θ, as in C1."""
+
+    def __init__(
+        self, scene: str, actions: Sequence[Action], thetas: Sequence[SimulationParameters], seed: int
+    ) -> None:
+        seeds = SeedStream(seed, "table")
+        each = [(action, seeds.next()) for action in actions]
+        self._rows: list[dict[str, object]] = []
+        self._total = len(actions) * len(thetas)
+        self._unissued = deque(Simulate(scene, action, theta, s, "table") for theta in thetas for action, s in each)
+        self._open: list[Simulate] = []
+        self.decisions: list[Decision] = [Decision(f"{len(thetas)} θ at {len(actions)} actions, {self._total} in all")]
+
+    @property
+    def finished(self) -> bool:
+        """Every simulation has been answered."""
+        return not self._unissued and not self._open
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The next simulations."""
+        asked = [self._unissued.popleft() for _ in range(min(slots.simulations, len(self._unissued)))]
+        self._open += asked
+        return list(asked)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a simulation. Raises ValueError if it was not asked for."""
+        if not isinstance(request, Simulate) or request not in self._open:
+            raise ValueError(f"this simulation was not asked for: {request}")
+        self._open.remove(request)
+        row: dict[str, object] = {"theta": request.parameters.model_dump(), "action": request.action.values()}
+        match outcome:
+            case Simulated(result) if result.invalid is None and is_sound(result.fractions):
+                row["fractions"] = [result.received, result.spilled, result.retained, result.in_flight]
+                row["particles"] = result.particles
+            case _:
+                row["lost"] = getattr(outcome, "reason", "") or "invalid outcome"
+        self._rows.append(row)
+
+    def progress(self) -> tuple[int, int]:
+        """Simulations answered, simulations in all."""
+        return len(self._rows), self._total
+
+    def result(self) -> dict[str, object]:
+        """One row for each simulation, once all are there: watchers are told how many until then."""
+        return {"simulations": len(self._rows), "rows": list(self._rows) if self.finished else []}
+
+
+class AnsweredByTable:
+    """A strategy whose simulations were made beforehand: only its other requests reach the laboratory."""
+
+    def __init__(self, inner: Strategy, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Take over.
+
+        Args:
+            inner: any strategy that simulates at the θ and actions of the table alone.
+            rows: of a `SimulatedTable`.
+        """
+        self._inner = inner
+        self._known = {_key(row["theta"], row["action"]): row for row in rows}
+
+    @property
+    def finished(self) -> bool:
+        """The strategy is."""
+        return self._inner.finished
+
+    @property
+    def decisions(self) -> list[Decision]:
+        """The strategy's."""
+        return list(getattr(self._inner, "decisions", ()))
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """What the strategy wants beside simulations."""
+        others: list[Request] = []
+        while not self._inner.finished:
+            requests = self._inner.ask(slots)
+            simulations = [request for request in requests if isinstance(request, Simulate)]
+            others += [request for request in requests if not isinstance(request, Simulate)]
+            for request in simulations:
+                self._inner.tell(request, self._answer(request))
+            if not simulations:
+                break
+        return others
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """Passed on."""
+        self._inner.tell(request, outcome)
+
+    def progress(self) -> tuple[int, int]:
+        """The strategy's."""
+        return self._inner.progress()
+
+    def result(self) -> dict[str, object]:
+        """The strategy's."""
+        return self._inner.result()
+
+    def _answer(self, request: Simulate) -> Outcome:
+        row = self._known.get(_key(request.parameters.model_dump(), request.action.values()))
+        if row is None:
+            raise ValueError(f"the table has no simulation of {request.parameters} at {request.action}")
+        if "fractions" not in row:
+            return Failed("simulation", str(row["lost"]))
+        received, spilled, retained, in_flight = row["fractions"]
+        return Simulated(
+            PourOutcome(
+                received=received,
+                spilled=spilled,
+                retained=retained,
+                in_flight=in_flight,
+                escaped=0.0,
+                particles=row["particles"],
+                spacing=0.0,
+                density_error=0.0,
+                simulated_time=0.0,
+                steps=0,
+                cpu_s=0.0,
+                seed=request.seed,
+            )
+        )
+
+
+def _key(theta: Mapping[str, float], action: Mapping[str, float | None]) -> Key:
+    return tuple(sorted(theta.items())), tuple(sorted(action.items()))

@@ -1,0 +1,30 @@
+"""The quick study, with the real simulator: every part of `decant study` at work."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.orchestrator.test_study import ROOT, read, written
+
+
+@pytest.mark.slow
+def test_the_quick_study_runs_and_a_second_call_has_nothing_left_to_do(tmp_path: Path) -> None:
+    path = written(tmp_path, read("quick"))
+    command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "study", str(path), "--json"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    answers = []
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=1800)
+        assert done.returncode == 0, done.stderr
+        answers.append(json.loads(done.stdout.splitlines()[-1]))
+    assert answers[0] == answers[1]
+    assert answers[0]["finished"] == answers[0]["cells"] == 29
+    page = Path(answers[0]["page"]).read_text(encoding="utf-8")
+    assert "Unfinished" not in page
+    assert all(f'id="figure-{number}"' in page for number in ("3b", "3c", "4", "5a", "5b", "6", "7"))

@@ -1,0 +1,155 @@
+"""What a study shows, on results that are made up so that the right numbers are known."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orchestrator.config.study import load_study
+from orchestrator.report.study.gather import at_pour, gather, running_least
+from orchestrator.report.study.intervals import estimate
+from orchestrator.report.study.page import write_report
+from orchestrator.report.study.tables import pours_needed
+from orchestrator.study.cells import Cell, cells_of
+from orchestrator.study.folder import run_folder, write_result
+from orchestrator.study.plan import StudyPlan
+from tests.orchestrator.test_study import read, written
+
+FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7")
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> StudyPlan:
+    return load_study(written(tmp_path_factory.mktemp("study"), read("quick")))
+
+
+# Test discrepancies of the two repetitions of each strategy: their means are 10, 2 (C4) and so on [%].
+DISCREPANCY = {"": (0.10, 0.10), "C1": (0.03, 0.05), "C2": (0.05, 0.05), "C3": (0.02, 0.04), "C4": (0.01, 0.03)}
+
+
+def made_up(cell: Cell) -> dict[str, Any]:
+    """A cell's result as the worker would have written it."""
+    results: dict[str, Any] = {}
+    if cell.kind in ("calibration", "uncalibrated"):
+        off = DISCREPANCY[cell.arm][cell.repetition - 1]
+        results["evaluation"] = {
+            "pairs": [
+                {"theta": "theta", "split": split, "measured": 0.3, "simulated": 0.3 + sign * off}
+                for split, sign in (("test", 1), ("test", -1), ("train", 1))
+            ]
+            + [{"theta": "theta", "split": "test", "measured": 0.3, "simulated": None}]
+        }
+    if cell.kind == "calibration":
+        axes = {"particles": [500.0, 1000.0, 1500.0], "cohesion": [0.0, 0.05, 0.1]}
+        results["calibration"] = {
+            "simulations": 12,
+            "training_pours": 4,
+            "searched": ["particles", "cohesion"],
+            "theta": {"particles": 700 + 10 * cell.repetition, "cohesion": 0.04},
+            "predicted_discrepancy": 0.04,
+            "trials": [
+                {"theta": {"particles": 600 + 100 * i, "cohesion": 0.02 * i}, "discrepancy": d}
+                for i, d in enumerate((0.2, None, 0.1, 0.3))
+            ],
+            "map": {"over": ["particles", "cohesion"], "axes": axes, "mean": np.full((3, 3), 0.1).tolist()},
+        }
+    if cell.kind == "deployment":
+        losses = {"D1": [0.08], "D2": [0.5, 0.2, 0.1], "D3": [0.1, 0.3, 0.05]}[cell.arm.split("-")[0]]
+        off = 0.02 if cell.repetition == 1 else 0.0
+        results["deployment:narrow"] = {"pours": [{"status": "weighed", "loss": loss + off} for loss in losses]}
+        results["deployment:narrow"]["pours"].append({"status": "refused", "loss": 1.0})
+    expected = [[4, 0.2], [5, 0.3], [6, -0.1]]
+    return {"results": results, "simulations": 10, "pours": 3, "cpu_s": 36.0, "seconds": 72.0, "expected": expected}
+
+
+def rows(folder: Path, name: str) -> list[dict[str, str]]:
+    with (folder / "report" / f"{name}.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_study_of_which_nothing_is_there_yet_has_a_page(study: StudyPlan, tmp_path: Path) -> None:
+    page = write_report(study, tmp_path).read_text(encoding="utf-8")
+    assert "Unfinished: 0 of 29 cells" in page
+    assert "<img" not in page
+
+
+def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
+    study: StudyPlan, tmp_path: Path
+) -> None:
+    for cell in cells_of(study):
+        run_folder(tmp_path, cell.id).mkdir(parents=True)
+        write_result(tmp_path, cell.id, made_up(cell))
+    page = write_report(study, tmp_path).read_text(encoding="utf-8")
+    for number in FIGURES:
+        assert f'id="figure-{number}"' in page
+        for suffix in ("png", "svg", "csv"):
+            assert (tmp_path / "report" / f"figure-{number}.{suffix}").stat().st_size > 100, f"{number}.{suffix}"
+    assert "Unfinished" not in page
+    assert not re.search(r'(src|href)="(?!data:)', page), "the page refers to something beside it"
+    assert "A repetition resamples the pours" in page
+
+    boxes = {row["strategy"]: row for row in rows(tmp_path, "figure-3b")}
+    assert list(boxes) == ["uncalibrated", "C1", "C2", "C3", "C4"]
+    assert float(boxes["C4"]["mean_percent"]) == pytest.approx(2.0)
+    assert (float(boxes["C4"]["low"]), float(boxes["C4"]["high"])) == pytest.approx((1.0, 3.0))
+    assert int(boxes["C4"]["pours"]) == 4, "two defined test pours in each of two repetitions"
+    curves = [row for row in rows(tmp_path, "figure-3c") if row["strategy"] == "C3"]
+    assert [int(row["simulations"]) for row in curves] == [4, 8, 12, 16]
+    assert [float(row["best_percent"]) for row in curves] == pytest.approx([20, 20, 10, 10])
+    hybrid = [r for r in rows(tmp_path, "figure-6") if (r["level"], r["strategy"]) == ("large", "D3")]
+    assert [float(row["least_%"]) for row in hybrid] == pytest.approx([11, 11, 6])
+    planned = [r for r in rows(tmp_path, "figure-6") if (r["level"], r["strategy"]) == ("large", "D1-2")]
+    assert [float(row["least_%"]) for row in planned] == pytest.approx([9, 9, 9])
+    mean = next(r for r in rows(tmp_path, "figure-5b") if (r["level"], r["strategy"]) == ("small", "D2"))
+    assert float(mean["mean_%"]) == pytest.approx(100 * (0.8 / 3 + 0.01)), "a refused pour is none"
+    price = [r for r in rows(tmp_path, "figure-7") if r["strategy"] == "D3" and r["seconds_per_pour"] == "90.0"]
+    first = next(r for r in price if r["seconds_per_simulation"] == "25.0")
+    assert float(first["total_seconds"]) == 4 * 25 + 90
+    needed = rows(tmp_path, "table-pours")[0]
+    assert (float(needed["D2"]), float(needed["D3"])) == (3, 1), "D3 is at its first pour where D2 is at its last"
+
+
+def test_half_a_study_shows_what_is_there(study: StudyPlan, tmp_path: Path) -> None:
+    for cell in cells_of(study):
+        if cell.repetition == 1 and cell.arm in ("C4", "D2"):
+            run_folder(tmp_path, cell.id).mkdir(parents=True)
+            write_result(tmp_path, cell.id, made_up(cell))
+    page = write_report(study, tmp_path).read_text(encoding="utf-8")
+    assert "Unfinished: 4 of 29 cells" in page
+    assert all(f'id="figure-{number}"' in page for number in FIGURES)
+    only = rows(tmp_path, "figure-3b")[0]
+    assert only["low"] == "nan", "one repetition has no interval"
+
+
+def test_interval_of_known_numbers() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.normal(5.0, 2.0, 400)
+    found = estimate(values.tolist())
+    half = 1.96 * values.std() / math.sqrt(400)
+    assert found.mean == pytest.approx(values.mean())
+    assert found.low == pytest.approx(values.mean() - half, abs=0.03)
+    assert found.high == pytest.approx(values.mean() + half, abs=0.03)
+    assert estimate([0.2, math.nan, 0.4]).count == 2
+    assert math.isnan(estimate([]).mean)
+    assert estimate([3.0, 3.0, 3.0]).low == 3.0
+
+
+def test_pours_needed_counts_from_one_and_says_when_it_is_never_reached() -> None:
+    assert pours_needed([[0.5, 0.2, 0.1], [0.5, 0.2, 0.1]], 0.2).mean == 2
+    assert pours_needed([[0.5, 0.2, 0.1]], 0.05).mean == 4
+
+
+def test_pours_without_a_loss_and_curves_of_different_lengths() -> None:
+    assert running_least([math.nan, 0.3, 0.4, 0.1])[1:] == [0.3, 0.3, 0.1]
+    assert at_pour([[0.3], [0.4, 0.2]], 2) == [0.3, 0.2]
+
+
+def test_only_the_compared_level_enters_the_comparison(study: StudyPlan) -> None:
+    results = {cell.id: made_up(cell) for cell in cells_of(study)}
+    assert len(gather(study, results).calibrated["C4"].test) == 2
