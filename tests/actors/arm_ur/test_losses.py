@@ -93,11 +93,11 @@ def test_a_lost_line_ends_the_pour_and_the_arm_stands_until_released(make_rig: M
 
 def test_after_a_reboot_in_mid_pour_tool_and_payload_are_set_again(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT)
-    rig.fault("reboot", seconds=0.5, joint=5, above=START[5] + 0.4)
+    rig.fault("reboot", seconds=4.0, joint=5, above=START[5] + 0.4)
     lost(rig.pouring())
     with pytest.raises(ArmLostError):
         rig.arm.connect()
-    time.sleep(0.8)
+    time.sleep(4.0)
     facts = rig.arm.connect()
     assert (facts.robot_mode, facts.payload) == ("off", 0.0)
     rig.arm.release()

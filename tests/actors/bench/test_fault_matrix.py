@@ -160,7 +160,7 @@ class Recorder:
 async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any]) -> float:
     """Have a fault happen in the middle of a phase; the controller's time then [s]."""
     spans = {name: (begin, end) for name, begin, end in planner(SPEC.arm)(SCENE, SLOWLY).phases}
-    end = time.monotonic() + 60.0
+    end = time.monotonic() + 150.0
     while True:
         assert time.monotonic() < end, f"never came to {phase}"
         state = await stage.bench.arm.state()
