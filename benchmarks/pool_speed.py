@@ -169,7 +169,7 @@ async def throughput(options: argparse.Namespace) -> dict[str, Any]:
     """Pool and plain processes in turns, and the pool's overhead with tiny pours."""
     plain = Plain(options.workers)
     spec = LaboratorySpec("benchmark", simulators=options.workers)
-    async with RayLaboratory(spec, None) as laboratory:
+    async with RayLaboratory(spec) as laboratory:
         pool = cast(RaySimulatorPool, laboratory.simulators)
         await pour_in_pool(pool, TINY, 2 * options.workers)
         rounds: list[tuple[Block, Block]] = []
@@ -213,7 +213,7 @@ async def nothing(options: argparse.Namespace) -> dict[str, Any]:
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     spec = LaboratorySpec("benchmark", simulators=options.workers)
-    async with RayLaboratory(spec, None, make=Nothing) as laboratory:
+    async with RayLaboratory(spec, make=Nothing) as laboratory:
         pool = cast(RaySimulatorPool, laboratory.simulators)
         await pour_in_pool(pool, TINY, 10 * options.workers)
         many = await pour_in_pool(pool, TINY, 1000)
