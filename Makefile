@@ -18,9 +18,9 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 demo: $(READY)
-	@$(BIN)/python -c 'import rtde_receive' 2>/dev/null || echo "ur-rtde has no wheel for this Python: the demo runs on the bench of numbers (twin.yaml). With Python 3.11 or 3.12 it runs over the wires of a real one."
-	$(BIN)/decant run configs/campaigns/quickstart.yaml \
-		$$($(BIN)/python -c 'import rtde_receive' 2>/dev/null || echo --laboratory configs/laboratories/twin.yaml)
+	@bench=; $(BIN)/python -c 'import rtde_receive' 2>/dev/null || { bench="--laboratory configs/laboratories/twin.yaml"; \
+		echo "ur-rtde has no wheel for this Python: the demo runs on the bench of numbers ($$bench)"; }; \
+	$(BIN)/decant run configs/campaigns/quickstart.yaml $$bench
 
 test: lint unit
 
@@ -28,6 +28,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	MYPYPATH=benchmarks $(BIN)/mypy benchmarks/*.py
 	$(BIN)/lint-imports
 
 unit: $(READY)

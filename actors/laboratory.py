@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
+from actors.arm.ur.errors import client_missing
 from actors.arm.virtual_arm import VirtualArm
 from actors.balance.virtual_balance import BalanceSettings, VirtualBalance
 from actors.bench.bench import VirtualBench
@@ -43,10 +43,9 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
     Raises:
         LaboratoryError: with what is wrong and what would be right.
     """
-    if spec.arm is not None and need_bench and importlib.util.find_spec("rtde_receive") is None:
+    if spec.arm is not None and need_bench and (missing := client_missing()) is not None:
         raise LaboratoryError(
-            f"laboratory {spec.name}: its arm needs the package ur-rtde, which is not installed; it has no wheel for "
-            "Python 3.13 yet. Use Python 3.11 or 3.12, or a bench of numbers "
+            f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
             "(--laboratory configs/laboratories/twin.yaml)"
         )
     if spec.ray is not None and not spec.in_process:

@@ -33,7 +33,7 @@ from machine import describe, pin, say, show, single_threaded
 from optimiser_problems import BY_NAME, PROBLEMS, World
 from optimiser_rivals import RIVALS, luckiest, play
 
-from actors.optimizer.core.problem import Data, SuggestProblem
+from actors.optimizer.core.problem import Data, MeanName, NoiseName, SuggestProblem
 from actors.optimizer.core.propose import propose
 from sim_engine.cache import cache_directory
 from sim_engine.space import Axis, Space
@@ -209,14 +209,15 @@ def speed() -> list[dict[str, Any]]:
             return Data(tuple(map(tuple, points[part].tolist())), tuple(costs[part].tolist()))
 
         everything, pours, simulations = data(slice(None)), data(slice(15)), data(slice(15, None))
-        for mean, noise in (
+        models: tuple[tuple[MeanName, NoiseName], ...] = (
             ("constant", "constant"),
             ("constant", "varying"),
             ("simulated", "constant"),
             ("pooled", "constant"),
             ("scaled", "constant"),
-        ):
-            question = SuggestProblem(space, everything, noise=noise)  # type: ignore[arg-type]
+        )
+        for mean, noise in models:
+            question = SuggestProblem(space, everything, noise=noise)
             if mean != "constant":
                 question = replace(question, data=pours, simulated=simulations, mean=mean)
             fit = min(propose(replace(question, count=0)).seconds for _ in range(5))

@@ -14,14 +14,17 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from actors.arm.spec import Joints
+from actors.arm.ur import dashboard as dashboard_port
+from actors.arm.ur import primary
+from actors.arm.ur.dashboard import Dashboard, DashboardError
+from actors.arm.ur.primary import RobotState
 from actors.protocols import LaboratoryError
-from actors.virtual_ur.wire import primary, rtde
+from actors.virtual_ur.wire import rtde
 
-DASHBOARD, PRIMARY, SCRIPTS, RTDE = 29999, 30001, 30003, 30004
+SCRIPTS, RTDE = 30003, 30004
 PORTS: dict[int, str] = {
-    DASHBOARD: "dashboard",
-    PRIMARY: "primary interface",
+    dashboard_port.PORT: "dashboard",
+    primary.PORT: "primary interface",
     SCRIPTS: "programs",
     RTDE: "real-time data exchange",
 }
@@ -39,32 +42,10 @@ QUESTIONS = (
 """Asked on the dashboard; none of them does anything."""
 
 ROUND_TRIPS = 20
-_JOINT, _JOINTS = struct.Struct(">3d4fB"), 6
 
 
 class SurveyError(LaboratoryError):
     """A port says nothing, or nothing that can be understood."""
-
-
-@dataclass(frozen=True)
-class RobotState:
-    """What the primary port tells.
-
-    Attributes:
-        joints: [rad].
-        pose: of the TCP in the base's frame, x y z [m] and rotation vector [rad].
-        tool: TCP in the flange's frame, likewise.
-        checksum: of the safety configuration; None if the controller tells none.
-        joint_ranges: lowest and highest position of each joint [rad]; empty if it doesn't tell.
-        joint_speeds: fastest speed of each joint [rad/s]; empty if it doesn't tell.
-    """
-
-    joints: Joints
-    pose: tuple[float, ...]
-    tool: tuple[float, ...]
-    checksum: str | None
-    joint_ranges: tuple[tuple[float, float], ...] = ()
-    joint_speeds: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,19 +93,10 @@ def ask_dashboard(address: str, questions: Sequence[str] = QUESTIONS, patience: 
         SurveyError: it doesn't answer.
     """
     try:
-        with socket.create_connection((address, DASHBOARD), timeout=patience) as connection:
-            lines = connection.makefile("rb")
-            lines.readline()  # its greeting
-            answers = {}
-            for question in questions:
-                connection.sendall(question.encode("ascii") + b"\n")
-                line = lines.readline()
-                if not line:
-                    raise SurveyError(f"the dashboard at {address} hung up at '{question}'")
-                answers[question] = line.decode("utf-8", "replace").strip()
-            return answers
-    except OSError as error:
-        raise SurveyError(f"the dashboard at {address} doesn't answer: {error}") from error
+        with Dashboard(address, patience) as dashboard:
+            return {question: dashboard.ask(question) for question in questions}
+    except DashboardError as error:
+        raise SurveyError(str(error)) from error
 
 
 def read_state(address: str, patience: float = 3.0) -> RobotState:
@@ -137,55 +109,26 @@ def read_state(address: str, patience: float = 3.0) -> RobotState:
     Raises:
         SurveyError: no state came, or one that can't be read.
     """
-    begin, parts, rest = time.monotonic(), dict[int, bytes](), b""
-    needed, welcome = {primary.JOINT_DATA, primary.CARTESIAN_INFO}, {primary.SAFETY_DATA, primary.CONFIGURATION_DATA}
+    begin, rest, parts = time.monotonic(), b"", dict[int, bytes]()
+    needed, welcome = {primary.JOINTS, primary.CARTESIAN}, {primary.SAFETY, primary.CONFIGURATION}
     try:
-        with socket.create_connection((address, PRIMARY), timeout=patience) as connection:
+        with socket.create_connection((address, primary.PORT), timeout=patience) as connection:
             while not (needed | welcome) <= parts.keys():
                 spent = time.monotonic() - begin
                 if spent > patience or (needed <= parts.keys() and spent > patience / 2.0):
                     break
-                connection.settimeout(patience)
                 data = connection.recv(65536)
                 if not data:
                     break
-                rest += data
-                rest = _take_states(rest, parts)
-    except (OSError, ValueError, struct.error) as error:
+                packages, rest = primary.split(rest + data)
+                for kind, body in packages:
+                    if kind == primary.STATE:
+                        parts |= dict(primary.split(body)[0])
+    except (OSError, primary.PrimaryError) as error:
         raise SurveyError(f"the primary port at {address} can't be read: {error}") from error
     if not needed <= parts.keys():
         raise SurveyError(f"the primary port at {address} sent no robot state within {patience:g} s")
-    return _state(parts)
-
-
-def _take_states(data: bytes, parts: dict[int, bytes]) -> bytes:
-    """Keep the parts of whole robot states; what is left over is returned."""
-    while len(data) >= 5:
-        size = int.from_bytes(data[:4], "big")
-        if not 5 <= size <= 1_000_000:
-            raise ValueError(f"a package of {size} bytes")
-        if len(data) < size:
-            break
-        if data[4] == primary.ROBOT_STATE:
-            parts |= dict(primary.split(data[5:size]))
-        data = data[size:]
-    return data
-
-
-def _state(parts: Mapping[int, bytes]) -> RobotState:
-    joints = [_JOINT.unpack_from(parts[primary.JOINT_DATA], _JOINT.size * i)[0] for i in range(_JOINTS)]
-    cartesian = struct.unpack_from(">12d", parts[primary.CARTESIAN_INFO])
-    safety = parts.get(primary.SAFETY_DATA, b"")
-    limits = parts.get(primary.CONFIGURATION_DATA, b"")
-    numbers = struct.unpack_from(">24d", limits) if len(limits) >= 24 * 8 else ()
-    return RobotState(
-        joints=(joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]),
-        pose=cartesian[:6],
-        tool=cartesian[6:],
-        checksum=f"{int.from_bytes(safety[:4], 'big'):08X}" if len(safety) >= 4 else None,
-        joint_ranges=tuple(zip(numbers[0:12:2], numbers[1:12:2], strict=True)),
-        joint_speeds=tuple(numbers[12:24:2]),
-    )
+    return primary.robot_state(parts)
 
 
 def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patience: float = 3.0) -> Exchange:

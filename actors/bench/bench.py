@@ -13,10 +13,10 @@ from actors.arm.protocol import ArmState, ExecutedMotion
 from actors.arm.virtual_arm import APPROACH_TIME, Grip
 from actors.balance.actor import DeviceBalance
 from actors.balance.virtual_balance import Load
-from actors.bench.operator import CARRYING_TIME, VirtualOperator
 from actors.bench.planning import plan_pour
 from actors.bench.progress import PourReport
 from actors.bench.spec import VirtualBenchSpec
+from actors.bench.twin_operator import CARRYING_TIME, TwinOperator
 from actors.bench.world import Spill, World, draw_pose_error, stream
 from actors.device import Device
 from actors.protocols import InvalidActionError, LaboratoryError, ProgressCallback, SimulatorPool
@@ -62,7 +62,7 @@ class VirtualBench:
         self._plan = plan
         self.arm = DeviceArm(arm, spec.time_scale)
         self.balance = DeviceBalance(balance, spec.time_scale)
-        self._operator = VirtualOperator(self.balance, spec.operator_time)
+        self._operator = TwinOperator(self.balance, spec.operator_time)
         self._one_pour = asyncio.Lock()
 
     @property

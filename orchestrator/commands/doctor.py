@@ -109,7 +109,7 @@ def _accept(path: Path, found: Findings) -> SafetyRecord:
     Raises:
         RefusalError: the controller doesn't tell them, or the record can't be written.
     """
-    if found.state is None or found.state.checksum is None or not found.serial:
+    if found.state is None or not found.state.checksum or not found.serial:
         raise RefusalError(
             "the controller doesn't tell its safety checksum and serial number, so nothing can be accepted; run "
             f"'decant doctor {path}' without --accept-safety to see why",

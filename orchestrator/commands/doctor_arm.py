@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from actors.arm.spec import Pose, UrArmSpec
-from actors.arm.survey import PORTS, SCRIPTS, Exchange, RobotState
+from actors.arm.survey import PORTS, SCRIPTS, Exchange
+from actors.arm.ur.primary import RobotState
 from orchestrator.commands.doctor_look import Check, Findings, State
 from orchestrator.safety import SafetyRecord
 
@@ -178,7 +179,7 @@ def _safety_mode(mode: str) -> Check:
 def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virtual: bool) -> Check:
     assert found.state is not None
     checksum = found.state.checksum
-    if checksum is None:
+    if not checksum:
         return Check(
             "safety checksum",
             "fail",

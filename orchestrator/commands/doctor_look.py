@@ -10,18 +10,18 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from actors.arm.survey import (
-    DASHBOARD,
     PORTS,
-    PRIMARY,
     RTDE,
     Exchange,
-    RobotState,
     SurveyError,
     ask_dashboard,
     port_problem,
     read_exchange,
     read_state,
 )
+from actors.arm.ur import dashboard as dashboard_port
+from actors.arm.ur import primary
+from actors.arm.ur.primary import RobotState
 
 PATIENT_GAP = 0.1
 """Between two packages over RTDE [s]; beyond it they are looked at once more."""
@@ -99,10 +99,10 @@ def look_at(host: str) -> Findings:
     ports = {port: port_problem(address, port) for port in PORTS}
     dashboard = state = exchange = None
     problems: list[str] = []
-    if ports[DASHBOARD] is None:
+    if ports[dashboard_port.PORT] is None:
         with _noting(problems):
             dashboard = ask_dashboard(address)
-    if ports[PRIMARY] is None:
+    if ports[primary.PORT] is None:
         with _noting(problems):
             state = read_state(address)
     if ports[RTDE] is None:

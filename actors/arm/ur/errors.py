@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from typing import Any
 
 from actors.arm.joint_path import ExecutedPath
@@ -57,3 +58,10 @@ class ArmStoppedError(ArmError):
 
     def __reduce__(self) -> Any:
         return type(self), (self.text, self.kind, self.phase, self.time, self.tilt, self.executed)
+
+
+def client_missing() -> str | None:
+    """Why no arm can be reached from here at all: the client library isn't installed; None if it is."""
+    if importlib.util.find_spec("rtde_receive") is not None:
+        return None
+    return "the arm needs the package ur-rtde, which is not installed; it has no wheel for Python 3.13 yet"

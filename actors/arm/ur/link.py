@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+from actors.arm.ur.errors import client_missing
 from actors.arm.ur.messages import (
     CLOCK,
     GO,
@@ -64,14 +65,11 @@ class Link:
     def __init__(self, address: str, rate: float, silence: float) -> None:
         for port, name in PORTS.items():
             _probe(address, port, name)
-        try:
-            from rtde_io import RTDEIOInterface  # type: ignore[import-not-found]
-            from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
-        except ImportError as error:
-            raise TroubleError(
-                "refused",
-                f"the arm needs ur-rtde, which is missing here ({error}); it has no wheel for Python 3.13 yet",
-            ) from None
+        if (missing := client_missing()) is not None:
+            raise TroubleError("refused", missing)
+        from rtde_io import RTDEIOInterface  # type: ignore[import-not-found]
+        from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
+
         for attempt in range(1, ATTEMPTS + 1):
             try:
                 with _bounded(CONSTRUCTION_TIME):

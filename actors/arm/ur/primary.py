@@ -14,16 +14,20 @@ import struct
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 PORT = 30001
 PATIENCE = 2.0
 """Longest wait for the first robot state [s]."""
 
 _LONGEST = 1_000_000
-_STATE, _MESSAGE = 16, 20
-_CARTESIAN, _CONFIGURATION, _SAFETY = 4, 6, 10
+STATE, _MESSAGE = 16, 20
+JOINTS, CARTESIAN, CONFIGURATION, SAFETY = 1, 4, 6, 10
+"""Parts of a robot state."""
 _ERROR, _KEY, _EXCEPTION = 6, 7, 10
 _HEAD = struct.Struct(">iB")
+_JOINT = struct.Struct(">3d4fB")
 
 
 class PrimaryError(Exception):
@@ -48,6 +52,43 @@ def split(data: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
     return found, data[place:]
 
 
+@dataclass(frozen=True)
+class RobotState:
+    """What the parts of a robot state say; empty where one has not come.
+
+    Attributes:
+        joints: [rad].
+        pose: of the TCP in the base's frame, x y z [m] and rotation vector [rad].
+        tool: TCP in the flange's frame, likewise.
+        checksum: of the safety configuration, eight hexadecimal digits.
+        joint_ranges: lowest and highest position of each joint [rad].
+        joint_speeds: fastest speed of each joint [rad/s].
+    """
+
+    joints: tuple[float, ...] = ()
+    pose: tuple[float, ...] = ()
+    tool: tuple[float, ...] = ()
+    checksum: str = ""
+    joint_ranges: tuple[tuple[float, float], ...] = ()
+    joint_speeds: tuple[float, ...] = ()
+
+
+def robot_state(parts: Mapping[int, bytes]) -> RobotState:
+    """Read the parts of a robot state, by type."""
+    joints, cartesian = parts.get(JOINTS, b""), parts.get(CARTESIAN, b"")
+    safety, limits = parts.get(SAFETY, b""), parts.get(CONFIGURATION, b"")
+    numbers = struct.unpack_from(">24d", limits) if len(limits) >= 24 * 8 else ()
+    places = struct.unpack_from(">12d", cartesian) if len(cartesian) >= 12 * 8 else ()
+    return RobotState(
+        joints=tuple(_JOINT.unpack_from(joints, _JOINT.size * i)[0] for i in range(len(joints) // _JOINT.size)),
+        pose=places[:6],
+        tool=places[6:],
+        checksum=f"{int.from_bytes(safety[:4], 'big'):08X}" if len(safety) >= 4 else "",
+        joint_ranges=tuple(zip(numbers[0:12:2], numbers[1:12:2], strict=True)),
+        joint_speeds=tuple(numbers[12:24:2]),
+    )
+
+
 class Primary:
     """One connection, read by a thread until it is closed.
 
@@ -55,9 +96,7 @@ class Primary:
         address: of the controller.
 
     Attributes:
-        checksum: of the safety configuration, eight hexadecimal digits; '' if it is not told.
-        tool: TCP in the flange's frame.
-        ranges, speeds: limits of the joints [rad], [rad/s]; empty where they aren't told.
+        state: as it was told first, with the tool in it.
         complaints: the last things it said about programs.
         broken: it said that a program can't be read, or can't go on.
 
@@ -66,20 +105,20 @@ class Primary:
     """
 
     def __init__(self, address: str) -> None:
-        self.checksum = ""
-        self.tool: tuple[float, ...] = ()
-        self.ranges: tuple[tuple[float, float], ...] = ()
-        self.speeds: tuple[float, ...] = ()
+        self.state = RobotState()
         self.complaints: deque[str] = deque(maxlen=8)
         self.broken = False
         self._rest = b""
+        parts: dict[int, bytes] = {}
         try:
             self._socket = socket.create_connection((address, PORT), timeout=PATIENCE)
             end = time.monotonic() + PATIENCE
-            while self.tool == ():
+            while self.state.tool == ():
                 if time.monotonic() > end:
                     raise PrimaryError(f"{address}:{PORT} sends no robot state")
-                self._take(self._socket.recv(65536))
+                for body in self._take(self._socket.recv(65536)):
+                    parts |= dict(split(body)[0])
+                self.state = robot_state(parts)
             self._socket.settimeout(None)
         except OSError as error:
             raise PrimaryError(f"{address}:{PORT}: {error}") from error
@@ -105,28 +144,17 @@ class Primary:
     def _read(self) -> None:
         with contextlib.suppress(OSError, PrimaryError):
             while data := self._socket.recv(65536):
-                self._take(data, whole=False)
+                self._take(data)
 
-    def _take(self, data: bytes, *, whole: bool = True) -> None:
+    def _take(self, data: bytes) -> list[bytes]:
+        """Note what messages say; robot states are returned."""
         if not data:
             raise PrimaryError("hung up")
         packages, self._rest = split(self._rest + data)
         for kind, body in packages:
-            if kind == _STATE and whole:
-                self._state(body)
-            elif kind == _MESSAGE:
+            if kind == _MESSAGE:
                 self._message(body)
-
-    def _state(self, body: bytes) -> None:
-        parts = dict(split(body)[0])
-        if len(parts.get(_SAFETY, b"")) >= 4:
-            self.checksum = f"{int.from_bytes(parts[_SAFETY][:4], 'big'):08X}"
-        if len(parts.get(_CARTESIAN, b"")) >= 96:
-            self.tool = struct.unpack_from(">6d", parts[_CARTESIAN], 48)
-        if len(parts.get(_CONFIGURATION, b"")) >= 24 * 8:
-            numbers = struct.unpack_from(">24d", parts[_CONFIGURATION])
-            self.ranges = tuple(zip(numbers[0:12:2], numbers[1:12:2], strict=True))
-            self.speeds = numbers[12:24:2]
+        return [body for kind, body in packages if kind == STATE]
 
     def _message(self, body: bytes) -> None:
         if len(body) < 10:

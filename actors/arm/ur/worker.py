@@ -118,7 +118,7 @@ class Worker:
             raise TroubleError("lost", str(error)) from None
         return Facts(
             *(model, serial, version, remote, program, reading),
-            *(primary.checksum, primary.tool, primary.ranges, primary.speeds),
+            *(primary.state.checksum, primary.state.tool, primary.state.joint_ranges, primary.state.joint_speeds),
         )
 
     def read(self) -> Reading:

@@ -330,9 +330,9 @@ def test_without_the_client_library_it_is_said_which_one_is_missing(
     make_rig: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = make_rig(connect=False)
-    (tmp_path / "rtde_io.py").write_text("raise ImportError('No module named rtde_io')")
+    (tmp_path / "sitecustomize.py").write_text("import sys; sys.modules['rtde_receive'] = None")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(ArmRefusedError, match=r"needs ur-rtde.*3\.13"):
+    with pytest.raises(ArmRefusedError, match=r"needs the package ur-rtde.*3\.13"):
         rig.arm.connect()
 
 

@@ -24,7 +24,7 @@ def laboratory(ray_running):
     import ray
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[Trickle.__module__])  # workers can't import test modules
-    spec = replace(wired_spec(pace=8.0, hurried=True), in_process=False, simulators=1)
+    spec = replace(wired_spec(pace=2.0, hurried=True), in_process=False, simulators=1)
     return RayLaboratory(spec, Trickle, need_bench=True)
 
 
@@ -52,8 +52,10 @@ def test_a_stop_and_the_death_of_the_driver_are_told_and_the_bench_pours_on(labo
             first, _ = await stopped(opened, slow, lambda: site.fault("protective_stop"))
             asked = next(question for question in operator.heard if question.about == "recover")
 
+            driver = await opened.bench.arm.device.pid()  # asked before, so that it dies while it tilts
+
             async def kill() -> None:
-                os.kill(await opened.bench.arm.device.pid(), signal.SIGKILL)
+                os.kill(driver, signal.SIGKILL)
 
             second, _ = await stopped(opened, slow, kill)
             return first, second, asked, await opened.bench.pour(SCENE, ACTION, seed=6)

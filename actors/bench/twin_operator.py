@@ -1,4 +1,4 @@
-"""The person at the bench, simulated: refills, wipes, and carries the pourer to the balance."""
+"""The person at the bench of numbers: refills, wipes, and carries the pourer to the balance. Asked nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ CARRYING_TIME = 2.0
 """Bench time to put something on the balance or take it off [s]."""
 
 
-class VirtualOperator:
+class TwinOperator:
     """Works in bench time.
 
     Args:
