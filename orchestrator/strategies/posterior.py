@@ -46,7 +46,7 @@ def posterior_result(posterior: Posterior, space: Space) -> dict[str, object]:
         "open": [name for name, width in zip(names, high - low, strict=True) if width > WIDE * LEVEL],
         "correlation": correlation.tolist(),
         "directions": directions(points, names),
-        "remaining_discrepancy": {"low": lacking[0], "median": lacking[1], "high": lacking[2]},
+        "remaining_discrepancy": dict(zip(("low", "median", "high"), map(float, lacking), strict=True)),
         "effective": posterior.effective,
         "thetas": [space.decode(tuple(point)) for point in posterior.points],
     }

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 WALKERS = 32
 """At least; a stretch move needs more than twice as many as there are dimensions."""
-STEPS, BURN_IN = 150, 50
+STEPS, BURN_IN = 300, 100
 STRETCH = 2.0
 STARTS = 256
 """Even places of which the walkers begin at the likeliest, drawn by their likelihood."""
@@ -57,9 +57,9 @@ def sample_posterior(
     """Draw θ from p(θ | pours) ∝ N(e(θ); 0, S(θ) + n² I + σ_δ² M), uniform in the cube.
 
     e_i(θ) = m(θ, a_i) + o_i is weighed minus simulated spillage of pour i; S(θ) the surrogate's posterior covariance
-    over the pours, n the scatter of a weighing, σ_δ² M what even the best θ lacks, a Matérn 5/2 over actions.
-    σ_δ is sampled with θ. The chain is an affine-invariant ensemble, at home on long narrow ridges: there θ make up for
-    each other.
+    over the pours; n² the variances of a weighing and of simulations around the surrogate, which hold what it can't
+    follow (a kink); σ_δ² M what even the best θ lacks, a Matérn 5/2 over actions. σ_δ is sampled with θ. The
+    chain is an affine-invariant ensemble, at home on the long narrow ridges along which θ make up for each other.
 
     Args:
         process: of signed differences c_r − c_s over (θ, a).
@@ -122,7 +122,7 @@ class _Likelihood:
         # Within one θ the prior covariance of a stationary process depends on the actions alone.
         at_one = np.concatenate([np.full((n, dimension), 0.5), contexts], axis=1)
         self._prior = process.prior_covariance(at_one)
-        self._scatter = (noise**2 + 1e-10) * np.eye(n)
+        self._scatter = (noise**2 + process.noise**2 + 1e-10) * np.eye(n)
         lengths = np.full(contexts.shape[1], DISCREPANCY_LENGTH)
         self._lack = matern(contexts, contexts, lengths)[0]
 
