@@ -178,4 +178,4 @@ def _effective(chain: Array) -> float:
                 break
             time += 2.0 * float(correlation)
         worst = max(worst, time)
-    return steps * walkers / worst
+    return float(steps * walkers / worst)
