@@ -31,7 +31,7 @@ from orchestrator.runs import write_provenance
 from orchestrator.scheduler import StageScheduler
 from orchestrator.stages import StageDefinition, scenes_of, stage_seed, stages_of
 from orchestrator.states import RESTING, State, check_transition
-from orchestrator.unknown import AskOperator, settle_unknown_pours
+from orchestrator.unknown import AskOperator, OperatorNeededError, settle_open_questions, settle_unknown_pours
 
 
 @dataclass(frozen=True)
@@ -148,6 +148,9 @@ class _Run:
                 if not self._is_finished():
                     self._come_to_rest(State.PAUSED, "paused on request")
                 raise
+            except OperatorNeededError as error:
+                self._come_to_rest(State.PAUSED, str(error))
+                raise
             except Exception as error:
                 if self._is_finished():  # the results are safe; only the tidying up went wrong
                     self._watchers.log("warning", f"while closing the laboratory: {error}")
@@ -166,8 +169,9 @@ class _Run:
             self._enter(found, "found interrupted: its process ended without a word")
         self._enter(State.PREPARING, "resumed" if resume else "begun")
         for stage in self._stages:
-            if histories[stage.name].unknown_pours():
-                histories[stage.name] = await self._settle(stage, histories[stage.name])
+            history = histories[stage.name]
+            if history.unknown_pours() or history.open_questions():
+                histories[stage.name] = await self._settle(stage, history)
         async with self._laboratory as laboratory:
             if isinstance(laboratory, Telling):
                 laboratory.listen(self._hear)
@@ -241,6 +245,13 @@ class _Run:
             stage.name,
             plan=self._plan,
             scenes=self._scenes,
+            ask=self._ask_operator,
+            on_waiting=lambda question: self._enter(State.WAITING_FOR_OPERATOR, question),
+        )
+        await settle_open_questions(
+            self._journal,
+            history,
+            stage.name,
             ask=self._ask_operator,
             on_waiting=lambda question: self._enter(State.WAITING_FOR_OPERATOR, question),
         )

@@ -136,6 +136,10 @@ def plan(
     seeds: Annotated[
         int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction and its spread.")
     ] = 5,
+    thetas: Annotated[
+        int,
+        typer.Option(min=0, max=50, help="Predict with so many θ of the posterior in --parameters; 0: with θ* alone."),
+    ] = 0,
     in_process: InProcess = False,
     as_json: Json = False,
 ) -> None:
@@ -153,6 +157,7 @@ def plan(
         iterations=iterations,
         seed=seed,
         seeds=seeds,
+        thetas=thetas,
         in_process=in_process,
         as_json=as_json,
     )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 from orchestrator.codec import to_json
-from orchestrator.plan import CampaignPlan
+from orchestrator.plan import CampaignPlan, ModelName, TrustPlan
 from sim_engine.liquid import Liquid
 from sim_engine.task import Scene
 from sim_engine.vessel.spec import MeshShape
@@ -26,9 +28,29 @@ _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "han
 
 _YOUNGER: dict[str, dict[str, Any]] = {
     "calibration": {"grid": {}, "thetas": 0},
-    "deployment": {"data": None, "objectives": None},
+    "deployment": {"data": None, "objectives": None, "model": "residual", "trust": None},
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
+
+NEW_MODEL: ModelName = "scaled"
+"""`deployment.model` of campaigns that name none."""
+
+
+def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
+    """The plan of a run that began before D3 had a model to choose and a policy, if the campaign asks for neither.
+
+    Such a run goes on as it began: with the paper's model, and with an alarm that only tells.
+
+    Args:
+        plan: of the campaign, as it is read today.
+        begun: the fingerprint that the run began with.
+    """
+    before, today = begun.get("deployment") or {}, plan.deployment
+    if today is None or "model" in before or "trust" in before:
+        return plan
+    if (today.model, today.trust) != (NEW_MODEL, TrustPlan()):
+        return plan
+    return replace(plan, deployment=replace(today, model="residual", trust=None))
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:

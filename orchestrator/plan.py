@@ -16,6 +16,8 @@ from sim_engine.task import Scene
 
 CalibrationName = Literal["C1", "C2", "C3", "C4"]
 DeploymentName = Literal["D1", "D2", "D3"]
+ModelName = Literal["residual", "pooled", "scaled"]
+PolicyName = Literal["ask", "D2", "widen"]
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,21 @@ class CalibrationPlan:
 
 
 @dataclass(frozen=True)
+class TrustPlan:
+    """D3: what the first pours may tell about the simulator.
+
+    Attributes:
+        pours: that are compared with what simulations say of them.
+        limit: mean |z| above which the simulator is called wrong.
+        policy: what follows. 'D2': its simulations are forgotten; 'widen': they are believed less; 'ask'.
+    """
+
+    pours: int = 4
+    limit: float = 2.5
+    policy: PolicyName = "D2"
+
+
+@dataclass(frozen=True)
 class DeploymentPlan:
     """D1, D2 or D3: how to pour into vessels that calibration never saw.
 
@@ -136,6 +153,8 @@ class DeploymentPlan:
         on_failed_pour: how a failed pour enters the data.
         data: D2, D3: pours of before the campaign.
         objectives: what is minimised in place of the loss.
+        model: D3: how simulations enter the surrogate: 'residual' is the paper's; see docs/optimiser.md.
+        trust: D3: when the simulator is called wrong, and what follows; None: pours are only compared.
     """
 
     strategy: DeploymentName
@@ -153,6 +172,8 @@ class DeploymentPlan:
     on_failed_pour: Literal["penalise", "ignore"] = "penalise"
     data: ExistingPours | None = None
     objectives: Objectives | None = None
+    model: ModelName = "residual"
+    trust: TrustPlan | None = None
 
     @property
     def loss_name(self) -> str:

@@ -10,7 +10,7 @@ from orchestrator.codec import canonical, decode_outcome, decode_request, encode
 from orchestrator.errors import RunError
 from orchestrator.events import RequestFinished
 from orchestrator.journal import JournalReader, Kind
-from orchestrator.requests import Outcome, Request, Slots
+from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.strategies.protocol import Strategy
 
 
@@ -72,6 +72,11 @@ class StageHistory:
         """Pours that had begun and have no outcome."""
         return [key for key in self.pour_attempts if key not in self.outcomes and key not in self.withdrawn]
 
+    def open_questions(self) -> dict[int, Ask]:
+        """Questions to a person that nobody has answered."""
+        asked = {key: self.request(key) for key, body in self.requests.items() if body["type"] == Ask.__name__}
+        return {key: ask for key, ask in asked.items() if isinstance(ask, Ask) and key not in self.outcomes}
+
 
 def read_history(journal: JournalReader, stage: str) -> StageHistory:
     """Everything that the journal holds about a stage."""
@@ -93,6 +98,8 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
             case Kind.FINISHED | Kind.POUR_FINISHED:
                 history.outcomes[body["id"]] = decode_outcome(body["outcome"])
                 history.finished_at[body["id"]] = entry.t
+            case Kind.OPERATOR_ANSWERED if "outcome" in body:
+                history.outcomes[body["id"]] = decode_outcome(body["outcome"])
             case Kind.TOLD:
                 history.steps.append(ToldStep(body["id"]))
             case Kind.DECISION:
@@ -105,6 +112,8 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
 def replayed_events(history: StageHistory, stage: str) -> Iterator[RequestFinished]:
     """What watchers of the interrupted run have seen, for those of the resumed one."""
     for key, outcome in history.outcomes.items():
+        if isinstance(outcome, Answered):  # nothing in the laboratory was asked for it
+            continue
         yield RequestFinished(
             time=history.finished_at[key],
             stage=stage,

@@ -66,7 +66,20 @@ class Suggest:
     purpose: str = "suggest"
 
 
-Request = Simulate | Pour | Suggest
+@dataclass(frozen=True)
+class Ask:
+    """Ask a person to decide. The run pauses; the answer is given on resume, journalled and replayed.
+
+    Attributes:
+        question: with the facts that the answer depends on.
+        options: allowed answers.
+    """
+
+    question: str
+    options: tuple[str, ...]
+
+
+Request = Simulate | Pour | Suggest | Ask
 
 
 @dataclass(frozen=True)
@@ -91,6 +104,13 @@ class Suggested:
 
 
 @dataclass(frozen=True)
+class Answered:
+    """Outcome of an `Ask`: one of its options."""
+
+    answer: str
+
+
+@dataclass(frozen=True)
 class Failed:
     """The request came to nothing: a simulation that leaked or diverged, a touching pair of vessels, a pour that was
     declared lost by the operator.
@@ -104,7 +124,7 @@ class Failed:
     reason: str
 
 
-Outcome = Simulated | Poured | Suggested | Failed
+Outcome = Simulated | Poured | Suggested | Answered | Failed
 
 
 @dataclass(frozen=True)
@@ -117,7 +137,12 @@ class Slots:
 
 @dataclass(frozen=True)
 class Decision:
-    """Why a strategy asked for what it asked for; shown, streamed and journalled."""
+    """Why a strategy asked for what it asked for; shown, streamed and journalled.
+
+    Attributes:
+        urgent: people should read it now, in the terminal too.
+    """
 
     text: str
     values: dict[str, float] = field(default_factory=dict)
+    urgent: bool = False

@@ -33,8 +33,9 @@ from orchestrator.flights import Flight, Order, free_slots, is_recorded, next_to
 from orchestrator.journal import Draft, Journal, Kind
 from orchestrator.lanes import Lanes
 from orchestrator.replay import StageHistory, replay, replayed_events
-from orchestrator.requests import Decision, Outcome, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.requests import Ask, Decision, Outcome, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.strategies.protocol import Strategy
+from orchestrator.unknown import needs_answer
 
 _REPORT_INTERVAL = 0.3
 """Least time between two reports of a strategy's progress to watchers, unless one matters [s]."""
@@ -221,6 +222,9 @@ class StageScheduler:
                     self._watchers.log("warning", text, self._stage)
 
                 outcome = await self._lanes.suggest(request, started=started, retrying=retrying)
+            case Ask():
+                # A question is answered on resume: nobody types into a display that is redrawn, and no arm waits.
+                raise needs_answer(request)
         self._finish(flight, outcome, time.monotonic() - begin, frames)
 
     def _finish(self, flight: Flight, outcome: Outcome, seconds: float, frames: Frames | None) -> None:
@@ -277,6 +281,8 @@ class StageScheduler:
         self._decisions += len(decisions)
         for decision in decisions:
             self._watchers.emit(DecisionMade(stage=self._stage, decision=decision))
+            if decision.urgent:
+                self._watchers.log("warning", decision.text, self._stage)
 
     def _report_progress(self, *, urgent: bool = True) -> None:
         """Tell watchers where the strategy stands; often only now and then, as results grow long."""

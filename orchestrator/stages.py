@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -144,11 +144,14 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
     ]
 
 
-def prediction_stages(plan: CampaignPlan, deployment: DeploymentPlan, seeds: int) -> list[StageDefinition]:
+def prediction_stages(
+    plan: CampaignPlan, deployment: DeploymentPlan, seeds: int, thetas: Sequence[SimulationParameters] = ()
+) -> list[StageDefinition]:
     """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
 
     Args:
         seeds: how many, each.
+        thetas: draws of a posterior that the seeds take turns with; none: the θ that was planned with.
     """
 
     def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
@@ -156,7 +159,7 @@ def prediction_stages(plan: CampaignPlan, deployment: DeploymentPlan, seeds: int
             values = results[DEPLOYMENT + name].get("action_si")
             action = None if values is None else scene.action(dict(values))
             costing = Costing.of(deployment, scene, _theta(plan, results))
-            return RepeatedSimulation(costing, action, seeds, seed)
+            return RepeatedSimulation(costing, action, seeds, seed, thetas)
 
         return build
 

@@ -10,7 +10,7 @@ from orchestrator.errors import RunError
 from orchestrator.journal import Draft, Journal, Kind
 from orchestrator.plan import CampaignPlan
 from orchestrator.replay import StageHistory
-from orchestrator.requests import Failed, Outcome, Pour, Poured
+from orchestrator.requests import Answered, Ask, Failed, Outcome, Pour, Poured
 from sim_engine.outcome import PourMeasurement
 from sim_engine.task import Scene
 
@@ -75,6 +75,47 @@ async def settle_unknown_pours(
             body = {"id": key, "outcome": encode_outcome(outcome), "seconds": 0.0}
             drafts.append(Draft(Kind.POUR_FINISHED, body, stage))
         journal.append_all(drafts)
+
+
+async def settle_open_questions(
+    journal: Journal,
+    history: StageHistory,
+    stage: str,
+    *,
+    ask: AskOperator | None,
+    on_waiting: Callable[[str], None],
+) -> None:
+    """Have each question that a strategy paused the run with answered, and write the answer down.
+
+    Raises:
+        OperatorNeededError: nobody is there, or no sensible answer came.
+    """
+    for key, request in history.open_questions().items():
+        if ask is None:
+            raise needs_answer(request)
+        on_waiting(request.question)
+        text = request.question
+        for _ in range(_TRIES):
+            reply = ask(text, request.options)
+            answer = await reply if inspect.isawaitable(reply) else reply
+            meant = next((o for o in request.options if o.lower() == " ".join(answer.lower().split())), None)
+            if meant is not None:
+                break
+            text = f"{request.question}\n'{answer}' is no answer; answer with one of: {'; '.join(request.options)}"
+        else:
+            raise needs_answer(request)
+        asked = {"id": key, "question": request.question, "options": list(request.options)}
+        answered = {"id": key, "answer": meant, "outcome": encode_outcome(Answered(meant))}
+        journal.append_all([Draft(Kind.OPERATOR_ASKED, asked, stage), Draft(Kind.OPERATOR_ANSWERED, answered, stage)])
+
+
+def needs_answer(request: Ask) -> OperatorNeededError:
+    """The run pauses with this, and says how to answer."""
+    options = "; ".join(request.options)
+    return OperatorNeededError(
+        f"{request.question} The run is paused. Resume with one of these answers: {options}, for example "
+        f"--answer '{request.options[0]}'"
+    )
 
 
 def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +23,11 @@ from orchestrator.commands.common import (
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
+    from sim_engine.liquid import SimulationParameters
 
 THETA_FILE = "theta.json"
+KEPT_THETAS = 50
+"""Draws of the posterior in that file."""
 
 
 def run(
@@ -105,6 +109,7 @@ def plan_pour(
     iterations: int | None,
     seed: int | None,
     seeds: int,
+    thetas: int,
     in_process: bool,
     as_json: bool,
 ) -> None:
@@ -115,7 +120,8 @@ def plan_pour(
     check_campaign_can_run(plan)
     assert plan.deployment is not None
     planning = deployment_stages(plan, plan.deployment)
-    stages = [*planning, *prediction_stages(plan, plan.deployment, seeds)]
+    drawn = _drawn(plan, parameters, thetas)
+    stages = [*planning, *prediction_stages(plan, plan.deployment, max(seeds, len(drawn)), drawn)]
     check_laboratory_answers(plan, stages, in_process=in_process)
     directory = run_directory(plan, resume=False, run_id=None)
     if parameters is None:
@@ -150,6 +156,21 @@ def plan_pour(
         totals = {"simulations": finished.result.simulations, "cpu_s": finished.result.cpu_s, "run": str(directory)}
         first = answers[0]
         print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
+
+
+def _drawn(plan: CampaignPlan, parameters: Path | None, thetas: int) -> tuple[SimulationParameters, ...]:
+    """θ of the posterior that a prediction takes turns with."""
+    from orchestrator.config.errors import ConfigError
+    from orchestrator.config.load import load_posterior
+
+    if thetas == 0:
+        return ()
+    if parameters is None:
+        raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration", BAD_INPUT)
+    try:
+        return load_posterior(parameters, thetas, plan.parameters)
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 def planning_plan(
@@ -220,6 +241,8 @@ def _run(
         check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(plan, chosen, in_process=in_process)
     directory = run_directory(plan, resume=resume, run_id=run_id)
+    if resume:
+        plan = _as_begun(plan, directory)
     flag = "" if laboratory is None else f" --laboratory {laboratory}"
     flag += " --arm" if plan.laboratory.mode == "hardware" else ""
     again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
@@ -235,10 +258,38 @@ def _run(
     )
     calibrated = finished.result.results.get("calibration")
     if calibrated is not None:
-        content = json.dumps({"theta": calibrated["theta"]}, indent=2) + "\n"
+        content = json.dumps(theta_file(calibrated), indent=2) + "\n"
         (directory / THETA_FILE).write_text(content, encoding="utf-8")
         say(f"θ* is in {directory / THETA_FILE}; use it with --parameters")
     return finished
+
+
+def _as_begun(plan: CampaignPlan, directory: Path) -> CampaignPlan:
+    """An older run goes on as it began; a journal that can't be read is told of by whoever goes on with it."""
+    from orchestrator.errors import RunError
+    from orchestrator.fingerprint import as_begun
+    from orchestrator.journal import JOURNAL_NAME, JournalReader
+
+    try:
+        with JournalReader(directory / JOURNAL_NAME) as journal:
+            begun = journal.header.fingerprint
+    except (RunError, OSError):
+        return plan
+    older = as_begun(plan, begun)
+    if older is not plan:
+        say("this run began before 'deployment.model' and 'deployment.trust': it goes on with 'residual' and no policy")
+    return older
+
+
+def theta_file(calibrated: Mapping[str, Any]) -> dict[str, Any]:
+    """What `theta.json` holds: θ*, and where it is known the posterior as weighted θ, each complete."""
+    theta = dict(calibrated["theta"])
+    posterior = calibrated.get("posterior")
+    if posterior is None:
+        return {"theta": theta}
+    every = max(len(posterior["thetas"]) // KEPT_THETAS, 1)
+    kept = posterior["thetas"][::every]
+    return {"theta": theta, "posterior": [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]}
 
 
 def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:

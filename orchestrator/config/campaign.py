@@ -166,6 +166,19 @@ class ObjectiveSection(Section):
     """Of target_volume: by how much it may be missed; nothing unless given."""
 
 
+class TrustSection(Section):
+    """D3: when the first pours say that the simulator is wrong, and what follows."""
+
+    pours: Annotated[int, Field(strict=True, ge=3, le=10)] = 4
+    """Weighed pours that are compared with the simulations, from the third on."""
+
+    limit: Annotated[float, Quantity("1", "2.5", 0.5, 100.0)] = 2.5
+    """Mean |z| above which the simulator is called wrong."""
+
+    policy: Literal["ask", "D2", "widen"] = "D2"
+    """D2: its simulations are forgotten; widen: they are believed less; ask: the campaign pauses with a question."""
+
+
 class DeploymentSection(Section):
     """How to pour into vessels that calibration never saw."""
 
@@ -218,6 +231,12 @@ class DeploymentSection(Section):
 
     mean: Literal["constant", "zero"] | None = None
     """D2: prior mean of the surrogate; the paper's is 'zero'."""
+
+    model: Literal["residual", "pooled", "scaled"] | None = None
+    """D3: how simulations enter the surrogate of pours, 'scaled' unless given; 'residual' is the paper's."""
+
+    trust: TrustSection | None = None
+    """D3: when the first pours say that the simulator is wrong, and what follows."""
 
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from bisect import bisect_right
+from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -107,6 +110,47 @@ def _theta_model() -> type[_ThetaBase]:
 _Theta = _theta_model()
 
 THETA_KEYS = ("theta", "parameters")
+POSTERIOR_KEY = "posterior"
+
+
+def load_posterior(
+    path: Path, count: int, base: SimulationParameters | None = None
+) -> tuple[SimulationParameters, ...]:
+    """`count` of the weighted θ that a run's `theta.json` has under `posterior`, each as likely as its weight says.
+
+    Drawn evenly along the cumulated weights: the same file gives the same θ.
+
+    Args:
+        path: the file.
+        count: ≥ 1.
+        base: values of the parameters that the file does not name.
+
+    Raises:
+        ConfigError: it has no posterior, or anything is wrong with it.
+    """
+    report = Report()
+    document = Document.read(path.resolve())
+    place = Place(document)
+    rows = document.data.get(POSTERIOR_KEY) if isinstance(document.data, dict) else None
+    weights: list[float] = []
+    thetas: list[SimulationParameters] = []
+    if not isinstance(rows, list) or not rows:
+        report.add(place, f"has no '{POSTERIOR_KEY}'; C4 writes one into a run's theta.json, θ* alone has none")
+        report.raise_if_any()
+    for i, row in enumerate(rows or []):
+        at = place.at(POSTERIOR_KEY, i)
+        weight = row.get("weight") if isinstance(row, dict) else None
+        if not isinstance(weight, int | float) or isinstance(weight, bool) or not 0.0 < weight < math.inf:
+            report.add(at, "needs a 'theta' and a 'weight' above 0")
+            continue
+        section = validate(_Theta, at.at("theta"), report)
+        if section is not None:
+            given = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
+            thetas.append(SimulationParameters.from_values((base or SimulationParameters()).model_dump() | given))
+            weights.append(float(weight))
+    report.raise_if_any()
+    total = list(accumulate(weights))
+    return tuple(thetas[bisect_right(total, (i + 0.5) / count * total[-1])] for i in range(count))
 
 
 def load_parameters(path: Path, base: SimulationParameters | None = None) -> SimulationParameters:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from actors.spec import LaboratorySpec
-from orchestrator.config.campaign import DeploymentSection
+from orchestrator.config.campaign import DeploymentSection, TrustSection
 from orchestrator.config.resolve_data import resolve_data
 from orchestrator.config.resolve_objectives import resolve_objectives
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place
-from orchestrator.plan import DeploymentPlan
+from orchestrator.fingerprint import NEW_MODEL
+from orchestrator.plan import DeploymentPlan, TrustPlan
 from sim_engine.losses import Loss
 
 BELONGS_TO = {
@@ -16,6 +17,8 @@ BELONGS_TO = {
     "simulations_per_iteration": ("D1",),
     "prior_simulations": ("D3",),
     "per_pour": ("D3",),
+    "model": ("D3",),
+    "trust": ("D3",),
     "mean": ("D2",),
     "data": ("D2", "D3"),
 }
@@ -69,6 +72,7 @@ def resolve_deployment(
     data = None
     if section.data is not None and strategy in BELONGS_TO["data"]:
         data = resolve_data(section.data, place.at("data"), complete, actions, laboratory, report)
+    trust = section.trust or TrustSection()
     per_pour = section.per_pour if section.per_pour is not None else 2
     return DeploymentPlan(
         strategy=strategy,
@@ -86,4 +90,6 @@ def resolve_deployment(
         on_failed_pour=section.on_failed_pour,
         data=data,
         objectives=objectives,
+        model=(section.model or NEW_MODEL) if strategy == "D3" else "residual",
+        trust=TrustPlan(trust.pours, trust.limit, trust.policy) if strategy == "D3" else None,
     )

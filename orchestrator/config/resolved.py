@@ -141,6 +141,9 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
         case "D3":
             table["prior_simulations"] = plan.prior_simulations
             table["per_pour"] = "free" if plan.per_pour is None else plan.per_pour
+            table["model"] = plan.model
+            if plan.trust is not None:
+                table["trust"] = {"pours": plan.trust.pours, "limit": plan.trust.limit, "policy": plan.trust.policy}
     return table
 
 

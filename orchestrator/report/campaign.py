@@ -10,6 +10,7 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.report.figures import draw_discrepancy, draw_spillage
 from orchestrator.report.maps import draw_surrogate, draw_trials
 from orchestrator.report.names import receiver_name
+from orchestrator.report.posterior import draw_posterior
 from orchestrator.report.results import (
     Results,
     calibration_of,
@@ -21,6 +22,7 @@ from orchestrator.report.results import (
     pour_series,
 )
 from orchestrator.report.style import safe_name
+from orchestrator.report.trust import draw_trust
 from orchestrator.report.units import deployment_unit
 
 _log = logging.getLogger(__name__)
@@ -33,7 +35,8 @@ def draw_figures(
     *,
     baselines: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> dict[str, Path]:
-    """Draw what the results allow: discrepancy map and trials, test discrepancy, spillage against pours, loss maps.
+    """Draw what the results allow: discrepancy map and trials, test discrepancy, spillage against pours, loss maps,
+    and the first pours against what was simulated.
 
     Of more than two searched axes a map shows the two that matter most; the trials against every axis are then a figure
     of their own.
@@ -55,6 +58,9 @@ def draw_figures(
         jobs["discrepancy map"] = lambda p=picture: draw_surrogate(directory / "discrepancy-map.png", p)  # type: ignore[misc]
         if picture.held and picture.points:
             jobs["discrepancy trials"] = lambda p=picture: draw_trials(directory / "discrepancy-trials.png", p)  # type: ignore[misc]
+    if calibration is not None and plan.calibration is not None and (posterior := calibration.get("posterior")):
+        space, theta = plan.calibration.parameters, calibration["theta"]
+        jobs["posterior"] = lambda: draw_posterior(directory / "posterior.png", posterior, space, theta)
     if evaluation is not None and (groups := discrepancy_groups(evaluation, baselines)):
         jobs["test discrepancy"] = lambda: draw_discrepancy(
             directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the scale: {plan.name}"
@@ -70,6 +76,11 @@ def draw_figures(
                 name = receiver_name(plan, scene)
                 jobs[f"loss map {name}"] = lambda p=picture, n=name: draw_surrogate(  # type: ignore[misc]
                     directory / f"loss-map-{safe_name(n)}.png", p
+                )
+            if (trust := result.get("trust") or {}).get("pours"):
+                name = receiver_name(plan, scene)
+                jobs[f"trust {name}"] = lambda t=trust, n=name: draw_trust(  # type: ignore[misc]
+                    directory / f"trust-{safe_name(n)}.png", t, unit=unit, receiver=n
                 )
     drawn: dict[str, Path] = {}
     for name, job in jobs.items():

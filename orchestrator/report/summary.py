@@ -21,6 +21,7 @@ from orchestrator.report.results import (
     predictions_of,
     weighed,
 )
+from orchestrator.report.trust import trust_line
 from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
 from sim_engine.spread import Spread
 
@@ -77,6 +78,7 @@ def summarise(
         "theta": None if calibration is None else dict(calibration["theta"]),
         "predicted_discrepancy": None if calibration is None else calibration.get("predicted_discrepancy"),
         "predicted_deviation": None if calibration is None else calibration.get("predicted_deviation"),
+        "posterior": None if calibration is None else _posterior(calibration),
         "discrepancy": _discrepancies(evaluation_of(results), baselines or {}),
         "loss": None if plan.deployment is None else plan.deployment.loss_name,
         "receivers": {
@@ -93,6 +95,12 @@ def summarise(
         "recording": None if recording is None else str(recording),
         "dropped_events": dropped_events,
     }
+
+
+def _posterior(calibration: Result) -> dict[str, Any] | None:
+    """What the pours say about θ, without the draws."""
+    posterior = calibration.get("posterior")
+    return None if posterior is None else {name: part for name, part in posterior.items() if name != "thetas"}
 
 
 def _discrepancies(
@@ -134,6 +142,7 @@ def _receiver(result: Result) -> dict[str, Any]:
         "predicted_spillage": result.get("predicted_spillage"),
         "predicted_spillage_deviation": result.get("predicted_spillage_deviation"),
         "untrustworthy_simulation": bool(result.get("trust", {}).get("alarm", False)),
+        "trust": result.get("trust"),
         "gave_up": result.get("gave_up"),
         **({"front": result["front"]} if "front" in result else {}),
     }
@@ -161,6 +170,7 @@ def summary_table(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableT
     parts: list[RenderableType] = [Text(f"\n{summary['campaign']}  seed {summary['seed']}", style="bold")]
     if summary["theta"] is not None:
         parts.append(_theta_line(plan, summary))
+        parts += _posterior_lines(summary)
     discrepancies = {split: row for split, row in summary["discrepancy"].items() if _has_numbers(row.values())}
     if discrepancies:
         parts.append(_discrepancy_table(discrepancies))
@@ -190,6 +200,21 @@ def _theta_line(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableTyp
             style="dim",
         )
     return text
+
+
+def _posterior_lines(summary: Mapping[str, Any]) -> list[RenderableType]:
+    from rich.text import Text
+
+    posterior = summary["posterior"]
+    if posterior is None:
+        return []
+    regions = [
+        f"{name.replace('_', ' ')} {style.display_value(name, low)} … {style.display_value(name, high)}"
+        + (" (open)" if name in posterior["open"] else "")
+        for name, (low, high) in posterior["region"].items()
+    ]
+    text = f"  {100 * posterior['level']:.0f} % of θ that fit the pours: {', '.join(regions)}"
+    return [Text(text, style="dim"), *(Text(f"  {line}", style="dim") for line in posterior["directions"])]
 
 
 _LOSSES = ("first_loss", "best_loss", "predicted_loss")
@@ -262,8 +287,7 @@ def _remarks(rows: Iterable[Mapping[str, Any]]) -> list[RenderableType]:
     for row in rows:
         receiver = row["receiver"]
         if row["untrustworthy_simulation"]:
-            text = "the first pours were far from what was predicted; the simulator may not fit this vessel"
-            remarks.append(Text(f"  {receiver}: {text}", style="yellow"))
+            remarks.append(Text(f"  {receiver}: {trust_line(row['trust'])}", style="yellow"))
         if row["failed_pours"]:
             remarks.append(Text(f"  {receiver}: {row['failed_pours']} pour(s) failed", style="yellow"))
         if row["gave_up"]:

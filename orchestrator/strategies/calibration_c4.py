@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
-from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
+import numpy as np
+
+from actors.optimizer.core.problem import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
 from orchestrator.errors import LearningError
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration import MAP_RESOLUTION, Calibration, described
 from orchestrator.strategies.design import MeasuredPour
+from orchestrator.strategies.posterior import directions, posterior_result
 from orchestrator.strategies.prior import actions_of_prior
 from orchestrator.strategies.trials import Trial
 from sim_engine.losses import MINIMUM_POURED
@@ -70,6 +74,7 @@ class ContinuousBayesianCalibration(Calibration):
         self._actions: tuple[Point, ...] = ()
         self._measured_at: tuple[float, ...] = ()
         self._expected_at: dict[Simulate, float] = {}
+        self._posterior: Posterior | None = None
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -127,7 +132,7 @@ class ContinuousBayesianCalibration(Calibration):
         if remaining <= 0:
             if self._trials.idle:
                 problem = self._problem(everything=True, acquisition="posterior_minimum", resolution=MAP_RESOLUTION)
-                self._questions.put(problem, "conclude", self._settle_at_minimum)
+                self._questions.put(problem, "conclude", self._conclude)
             return
         if len(self._trials) == 0:
             count = min(max(self._plan.initial, 1), remaining)
@@ -135,6 +140,38 @@ class ContinuousBayesianCalibration(Calibration):
             self._questions.put(problem, "start", self._queue)
         elif self._trials.ready:
             self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
+
+    def _conclude(self, suggestion: Suggestion) -> None:
+        """θ* is known; what the pours say about θ beside it is asked."""
+        self._settle_at_minimum(suggestion)
+        if self._averaging != "noise":
+            self._ask_posterior()
+
+    def _ask_posterior(self) -> None:
+        """Draws of θ given the training pours: first what the regression says at them, for it is in the differences."""
+        encode, names = self._plan.actions.encode, self._plan.actions.names
+        places = tuple(tuple(encode({name: _number(pour, name) for name in names})) for pour in self._usable)
+        weighed = tuple(pour.spillage for pour in self._usable if pour.spillage is not None)
+
+        def drawn(suggestion: Suggestion) -> None:
+            self._posterior = suggestion.posterior
+            if self._posterior is not None:
+                for text in directions(np.array(self._posterior.points), self._plan.parameters.names):
+                    self.decisions.append(Decision(text))
+
+        def regressed(regression: Suggestion) -> None:
+            offsets = tuple(
+                spillage - min(max(expected, 0.0), 1.0)
+                for spillage, expected in zip(weighed, regression.predictions, strict=True)
+            )
+            noise = (regression.hyperparameters or {}).get("noise", 0.0)
+            problem = replace(
+                self._problem(everything=True), count=0, posterior=PosteriorQuestion(places, offsets, noise)
+            )
+            self._questions.put(problem, "posterior", drawn)
+
+        data = Data(places, weighed)
+        self._questions.put(SuggestProblem(self._plan.actions, data, count=0, predict_at=places), "regress", regressed)
 
     def _live_resolution(self) -> int:
         """Resolution of the map that the next answer carries for those who watch; mostly 0, for none."""
@@ -176,6 +213,13 @@ class ContinuousBayesianCalibration(Calibration):
         return abs(difference) if self._averaging == "noise" else difference
 
     # -- results ---------------------------------------------------------------------------------------------------
+
+    def result(self) -> dict[str, object]:
+        """As every calibration; with what the pours say about θ beside θ*."""
+        result = super().result()
+        if self.finished and self._posterior is not None:
+            result["posterior"] = posterior_result(self._posterior, self._plan.parameters)
+        return result
 
     @property
     def _budget(self) -> int:

@@ -278,6 +278,10 @@ class Deployment(ABC):
         """Steps done, steps in all."""
         return min(self._counted, self._plan.pours), self._plan.pours
 
+    def _trusted(self, weighed: Sequence[PourTrial]) -> dict[str, object]:
+        """How far the first pours bore out what was predicted."""
+        return trust(weighed)
+
     def result(self) -> dict[str, object]:
         """What was learnt so far; actions in display units and in SI."""
         weighed = [p for p in self._pours if p.status == "weighed" and p.cost is not None]
@@ -291,7 +295,7 @@ class Deployment(ABC):
             "former_pours": len(self._former),
             "refused_pours": self._refused,
             "failed_pours": sum(p.status == "failed" for p in self._pours),
-            "trust": trust(weighed),
+            "trust": self._trusted(weighed),
         }
         if weighed:
             best = min(weighed, key=lambda p: p.cost if p.cost is not None else math.inf)

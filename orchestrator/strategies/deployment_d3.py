@@ -2,8 +2,22 @@
 
 from __future__ import annotations
 
-from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
+from collections.abc import Sequence
+
+from actors.optimizer.core.problem import Data, MeanName, Suggestion, SuggestProblem
+from orchestrator.plan import DeploymentPlan, ModelName
+from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.strategies.deployment import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment_pours import PourTrial
+from orchestrator.strategies.trust import TrustCheck
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import Scene
+
+MEANS: dict[ModelName, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
+"""How the optimiser calls the models."""
+
+WIDENING = 3.0
+"""Factor on the noise that simulations are expected to have, once they were found wrong."""
 
 
 class Hybrid(Deployment):
@@ -17,23 +31,80 @@ class Hybrid(Deployment):
     most, which are simulated beside the pour and enter the prior: learning from real trials interleaved with planning
     in a model (Dyna). With `per_pour = None`, simulations go on for as long as the pour takes.
 
+    Where the plan says so, the first pours are compared with the simulations (`TrustCheck`). One that is wrong is
+    then forgotten, believed less, or put to a person. `model` says how simulations enter the surrogate; the above is
+    'residual', the paper's.
+
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3; m2 = 37, 15 pours).
-    Limitations: a prior from an untrustworthy simulator is worse than none; see `trust` in the result.
+    Limitations: a prior from an untrustworthy simulator is worse than none; pours made before that is known are lost.
     """
 
     NAME = "D3"
 
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        super().__init__(plan, scene, parameters, seed)
+        self._check = None if plan.trust is None else TrustCheck(plan.trust, self._costing.worst)
+        self._unasked: Ask | None = None
+        self._asked: Ask | None = None
+
+    # -- asking and listening --------------------------------------------------------------------------------------
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """As every deployment; nothing new while a person has to decide."""
+        if self._unasked is not None:
+            self._asked, self._unasked = self._unasked, None
+            return [self._asked]
+        return [] if self._asked is not None else super().ask(slots)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """As every deployment, or how to go on with a simulator that is wrong."""
+        if not isinstance(request, Ask):
+            super().tell(request, outcome)
+            return
+        if request != self._asked or self._check is None or not isinstance(outcome, Answered):
+            raise ValueError(f"this was not asked, or not answered: {request.question}")
+        self._asked = None
+        self._settle(self._check, outcome.answer)
+
     def _next(self, free_simulations: int) -> None:
-        if len(self._trials) < self._plan.prior_simulations and not self._pours:
+        if self._check is not None and self._pouring is None and (pours := self._check.due(self._pours)):
+            self._compare(self._check, pours)
+        elif len(self._trials) < self._plan.prior_simulations and not self._pours:
             self._next_prior()
         elif self._pouring is not None:
-            if self._plan.per_pour is None and free_simulations > 0:
+            if self._plan.per_pour is None and free_simulations > 0 and self._followed != "D2":
                 self._refine(free_simulations)
         elif self._pours_left:
             if self._trials.idle or (self._plan.per_pour is None and self._pours):
                 self._next_pour()
         elif self._trials.idle:
             self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
+
+    def _compare(self, check: TrustCheck, pours: list[PourTrial]) -> None:
+        """Ask what the simulations alone say of the actions poured, and go by it."""
+        self._compromise.weigh(exploring=False)
+
+        def answered(suggestion: Suggestion) -> None:
+            check.compare(pours, suggestion)
+            self._unasked = check.question
+            self._heard(check)
+
+        simulated = self._trials.data(everything=True)
+        places = tuple(pour.point for pour in pours)
+        self._questions.put(self._problem(simulated, count=0, predict_at=places), "trust", answered)
+
+    def _settle(self, check: TrustCheck, answer: str) -> None:
+        check.settle(answer)
+        self._heard(check)
+
+    def _heard(self, check: TrustCheck) -> None:
+        self.decisions += check.decisions
+        check.decisions.clear()
+
+    @property
+    def _followed(self) -> str | None:
+        """What followed on an alarm."""
+        return None if self._check is None else self._check.policy
 
     def _next_prior(self) -> None:
         def simulate(suggestion: Suggestion) -> None:
@@ -50,7 +121,7 @@ class Hybrid(Deployment):
     def _next_pour(self) -> None:
         """The next pour, and with it the simulations that run beside it."""
         problem = self._hybrid(
-            count=1 + (self._plan.per_pour or 0),
+            count=1 + (0 if self._followed == "D2" else self._plan.per_pour or 0),
             acquisition="lcb" if self._pours or self._former else "posterior_minimum",
             map_resolution=MAP_RESOLUTION,
         )
@@ -72,14 +143,30 @@ class Hybrid(Deployment):
 
     def _hybrid(self, **changes: object) -> SuggestProblem:
         self._compromise.weigh(exploring=changes.get("count") != 0)
-        return self._problem(self._real(), mean="simulated", simulated=self._simulated(everything=True), **changes)
+        return self._informed(self._real(), self._simulated(everything=True), **changes)
+
+    def _informed(self, poured: Data, simulated: Data, **changes: object) -> SuggestProblem:
+        """A question about the real cost, with what the simulations are still good for."""
+        match self._followed:
+            case "D2":
+                return self._problem(poured, **changes)
+            case "widen":
+                return self._problem(poured, mean="pooled", widening=WIDENING, simulated=simulated, **changes)
+            case _:
+                return self._problem(poured, mean=MEANS[self._plan.model], simulated=simulated, **changes)
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
-        return self._problem(poured, mean="simulated", simulated=simulated)
+        return self._informed(poured, simulated)
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def _trusted(self, weighed: Sequence[PourTrial]) -> dict[str, object]:
+        return super()._trusted(weighed) if self._check is None else self._check.result()
 
     def progress(self) -> tuple[int, int]:
         """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
-        beside = self._plan.pours * (self._plan.per_pour or 0)
-        simulations = self._plan.prior_simulations + beside
+        simulations = self._plan.prior_simulations + self._plan.pours * (self._plan.per_pour or 0)
         done = min(self._trials.answered, simulations) if self._plan.per_pour is None else self._trials.answered
+        if self._followed == "D2":  # those that will not be made any more
+            simulations = done
         return done + min(self._counted, self._plan.pours), simulations + self._plan.pours

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
+from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourOutcome
 from sim_engine.spread import Spread, spreads
 
@@ -23,6 +27,7 @@ class RepeatedSimulation:
         action: Action | None,
         count: int,
         seed: int,
+        thetas: Sequence[SimulationParameters] = (),
     ) -> None:
         """Plan.
 
@@ -30,6 +35,7 @@ class RepeatedSimulation:
             costing: scene, θ and loss.
             action: None: nothing was found that could be repeated, and nothing is asked for.
             count: of seeds.
+            thetas: that the seeds take turns with, in place of the one θ: draws of a posterior.
         """
         scene, parameters = costing.scene, costing.parameters
         seeds = SeedStream(seed, f"prediction {scene.name}")
@@ -42,8 +48,13 @@ class RepeatedSimulation:
         self.decisions: list[Decision] = []
         if action is not None:
             seeds_of_all = [seeds.next() for _ in range(count)]
-            self._unissued = [Simulate(scene.name, action, parameters, s, "predict") for s in seeds_of_all]
-            self.decisions.append(Decision(f"simulate the planned action with {count} fresh seeds"))
+            turns = thetas or (parameters,)
+            self._unissued = [
+                Simulate(scene.name, action, turns[i % len(turns)], s, "predict") for i, s in enumerate(seeds_of_all)
+            ]
+            among = f" and {len(thetas)} θ of the posterior" if thetas else ""
+            self.decisions.append(Decision(f"simulate the planned action with {count} fresh seeds{among}"))
+        self._thetas = len(thetas)
 
     @property
     def finished(self) -> bool:
@@ -65,10 +76,11 @@ class RepeatedSimulation:
         if not isinstance(request, Simulate) or request not in self._open:
             raise ValueError(f"this simulation was not asked for, or has been answered already: {request}")
         self._open.discard(request)
-        cost = self._costing.simulated(outcome, request.action)
+        costing = replace(self._costing, parameters=request.parameters)
+        cost = costing.simulated(outcome, request.action)
         if isinstance(outcome, Simulated) and cost is not None:
             self._outcomes.append(outcome.outcome)
-            self._losses.append(self._costing.total(cost))
+            self._losses.append(costing.total(cost))
         else:
             self._lost += 1
 
@@ -87,5 +99,6 @@ class RepeatedSimulation:
             "prediction_of": self._costing.scene.name,
             "simulations": self.progress()[0],
             "simulations_lost": self._lost,
+            "thetas": self._thetas,
             "over_seeds": {name: spread.as_json() for name, spread in over_seeds.items()},
         }

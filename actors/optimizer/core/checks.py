@@ -49,7 +49,25 @@ def check(problem: SuggestProblem) -> None:
             raise ValueError(f"{name} = {value} is outside 0 … {limit}")
     if not (math.isfinite(problem.kappa) and 0.0 <= problem.kappa <= 100.0):
         raise ValueError(f"kappa = {problem.kappa} is outside 0 … 100")
+    if not (math.isfinite(problem.widening) and 0.01 <= problem.widening <= 100.0):
+        raise ValueError(f"widening = {problem.widening} is outside 0.01 … 100")
+    _check_posterior(problem)
     _check_constraints(problem)
+
+
+def _check_posterior(problem: SuggestProblem) -> None:
+    question = problem.posterior
+    if question is None:
+        return
+    if not problem.context:
+        raise ValueError("a posterior needs a context: differences at actions, with which pours can be compared")
+    _check_points("posterior", question.contexts, len(problem.context[0]))
+    if len(question.offsets) != len(question.contexts) or not question.contexts:
+        raise ValueError(f"posterior: {len(question.contexts)} pours but {len(question.offsets)} offsets")
+    if not all(math.isfinite(value) for value in (*question.offsets, question.noise)) or question.noise < 0.0:
+        raise ValueError("posterior: offsets and noise must be finite, the noise not negative")
+    if not 1 <= question.count <= 2000:
+        raise ValueError(f"posterior: count = {question.count} is outside 1 … 2000")
 
 
 def _check_constraints(problem: SuggestProblem) -> None:

@@ -53,6 +53,38 @@ class Linear:
 
 
 @dataclass(frozen=True)
+class PosteriorQuestion:
+    """Weighed pours, for what they say about θ.
+
+    Attributes:
+        contexts: actions of the pours, in the context's unit cube.
+        offsets: weighed minus regressed spillage at each; the regressed one is in the differences that were observed.
+        noise: standard deviation of a weighed pour.
+        count: of draws wanted.
+    """
+
+    contexts: tuple[Point, ...]
+    offsets: tuple[float, ...]
+    noise: float
+    count: int = 200
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of θ given weighed pours, equally weighted.
+
+    Attributes:
+        points: in the unit cube.
+        discrepancies: of each, the standard deviation of what it still lacks.
+        effective: how many independent draws the chain was worth.
+    """
+
+    points: tuple[Point, ...]
+    discrepancies: tuple[float, ...]
+    effective: float
+
+
+@dataclass(frozen=True)
 class SuggestProblem:
     """Everything that a proposal depends on; the optimiser actor keeps no state that matters.
 
@@ -80,6 +112,8 @@ class SuggestProblem:
             where another refusal is likely.
         constraints: that every proposal meets.
         noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
+        widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
+        posterior: with a context: weighed pours, for draws of the searched parameters given them.
     """
 
     space: Space
@@ -97,6 +131,8 @@ class SuggestProblem:
     infeasible: tuple[Point, ...] = ()
     constraints: tuple[Linear, ...] = ()
     noise: NoiseName = "constant"
+    widening: float = 1.0
+    posterior: PosteriorQuestion | None = None
 
 
 @dataclass(frozen=True)
@@ -146,6 +182,7 @@ class Suggestion:
         seconds: CPU seconds it took.
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
         feasibilities: probabilities that the proposals are not refused; empty while nothing was.
+        posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
     """
 
     points: tuple[Point, ...]
@@ -161,3 +198,4 @@ class Suggestion:
     prediction_deviations: tuple[float, ...] = ()
     noises: tuple[float, ...] = ()
     feasibilities: tuple[float, ...] = ()
+    posterior: Posterior | None = None

@@ -12,7 +12,16 @@ from threadpoolctl import threadpool_limits
 
 from actors.optimizer.core import acquisition
 from actors.optimizer.core.checks import check
-from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem, SurrogateMap
+from actors.optimizer.core.posterior import sample_posterior
+from actors.optimizer.core.problem import (
+    Data,
+    Point,
+    Posterior,
+    PosteriorQuestion,
+    Suggestion,
+    SuggestProblem,
+    SurrogateMap,
+)
 from actors.optimizer.core.region import Feasibility, Region
 from actors.optimizer.core.surrogate import (
     AbsoluteProcess,
@@ -70,6 +79,8 @@ def _answer(problem: SuggestProblem) -> Suggestion:
     answer: dict[str, object] = {}
     if model is not None:
         answer = _describe(problem, asked, model, points)
+    if model is not None and problem.posterior is not None:
+        answer["posterior"] = _posterior(problem, problem.posterior, asked.region, model, rng)
     if feasibility is not None and len(points):
         answer["feasibilities"] = tuple(map(float, np.exp(feasibility.log_probability(points))))
     return Suggestion(
@@ -155,7 +166,13 @@ def _fit(problem: SuggestProblem, asked: _Asked) -> _Model | None:
         return _Model(process, process, lengths)
     if informed:
         process = joint_process(
-            asked.simulated, asked.simulated_costs, points, costs, scaled=problem.mean == "scaled", varying=varying
+            asked.simulated,
+            asked.simulated_costs,
+            points,
+            costs,
+            scaled=problem.mean == "scaled",
+            varying=varying,
+            widening=problem.widening,
         )
         return _Model(process, process, process.lengths)
     if len(points) < 2:
@@ -247,6 +264,22 @@ def _describe(problem: SuggestProblem, asked: _Asked, model: _Model, points: Arr
         sought = problem.acquisition == "posterior_minimum" and len(points) > 0
         description["surrogate"] = _map(problem, asked.region, model, points[0] if sought else known[best])
     return description
+
+
+def _posterior(
+    problem: SuggestProblem, question: PosteriorQuestion, region: Region, model: _Model, rng: np.random.Generator
+) -> Posterior:
+    contexts = _array(question.contexts, model.process.points.shape[1] - problem.space.dimension)
+    sampled = sample_posterior(
+        model.process,
+        contexts,
+        np.array(question.offsets),
+        noise=question.noise,
+        count=question.count,
+        snap=region.snap,
+        rng=rng,
+    )
+    return Posterior(_tuples(sampled.points), tuple(map(float, sampled.discrepancies)), sampled.effective)
 
 
 def _axis_names(problem: SuggestProblem) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -114,6 +114,17 @@ class GaussianProcess:
         variance = prior - np.einsum("ij,ij->j", V, V)
         mean = self.mean(points) + self.scale * (K @ self._fitted.alpha)
         return mean, self.scale * np.sqrt(np.maximum(variance, 1e-12))
+
+    def projected(self, points: Array) -> tuple[Array, Array]:
+        """What posterior moments at points (m, d) are made of: means (m,), and V (n, m); the posterior covariance
+        is `prior_covariance` − Vᵀ V, in the cost's unit (squared)."""
+        K = self._covariance.cross(self._fitted.theta, points)
+        V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
+        return self.mean(points) + self.scale * (K @ self._fitted.alpha), self.scale * V
+
+    def prior_covariance(self, points: Array) -> Array:
+        """Of the noise-free cost between points (m, d): (m, m), in its unit squared."""
+        return np.asarray(self.scale**2 * self._covariance.between(self._fitted.theta, points, points))
 
     def noise_at(self, points: Array) -> Array:
         """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
@@ -241,7 +252,14 @@ def simulated_mean_process(
 
 
 def joint_process(
-    simulated: Array, simulated_costs: Array, points: Array, costs: Array, *, scaled: bool, varying: bool = False
+    simulated: Array,
+    simulated_costs: Array,
+    points: Array,
+    costs: Array,
+    *,
+    scaled: bool,
+    varying: bool = False,
+    widening: float = 1.0,
 ) -> GaussianProcess:
     """GP of the real cost from simulations and real observations at once.
 
@@ -253,6 +271,7 @@ def joint_process(
         points: (n, dimension), n ≥ 0, and their costs (n,).
         scaled: which of the two.
         varying: whether the noise of real observations may vary.
+        widening: factor on the median of the prior of the simulations' noise.
 
     Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
         available, Biometrika 2000.
@@ -262,6 +281,9 @@ def joint_process(
     terms = {"real": np.arange(len(both)) >= len(simulated), "scaled": scaled}
     scale = _scale(values - centre, values)
     prior = SCALED_PRIOR if scaled else POOLED_PRIOR
+    if widening != 1.0:
+        median, deviation = prior.simulated_noise
+        prior = replace(prior, simulated_noise=(widening * median, deviation))
     return _fitted(both, values, _constant(centre), scale, varying, prior, **terms)
 
 
