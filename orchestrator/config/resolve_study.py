@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from orchestrator.config.yaml_source import Place, Report
-from orchestrator.plan import CalibrationPlan, DeploymentPlan
+from orchestrator.fingerprint import NEW_MODEL
+from orchestrator.plan import CalibrationPlan, DeploymentName, DeploymentPlan, TrustPlan
 from orchestrator.study.plan import CalibrationArm, DeploymentArm
 
 if TYPE_CHECKING:
@@ -97,9 +98,9 @@ def deployment_arms(
         return ()
     most = max((arm.repetitions for arm in calibrations if arm.plan.strategy == "C4"), default=0)
     arms: list[DeploymentArm] = []
-    for name in ("D1", "D2", "D3"):
-        arm: Any = section.value(name)
-        at = root.at("deployment", name)
+    for key in ("D1", "D2", "D3", "D3_paper"):
+        arm: Any = section.value(key)
+        at, name = root.at("deployment", key), cast("DeploymentName", key[:2])
         if arm is None:
             continue
         _check_keys(arm, name, DEPLOYMENT_KEYS, at, report)
@@ -120,6 +121,8 @@ def deployment_arms(
             pours=1 if name == "D1" else arm.pours,
             per_pour=0,
             data=None,
+            model="residual",
+            trust=None,
             mean=arm.mean or "constant",
             kappa=base.kappa if arm.kappa is None else arm.kappa,
             initial=base.initial if arm.initial is None else arm.initial,
@@ -134,7 +137,11 @@ def deployment_arms(
         elif name == "D3":
             prior = 37 if arm.prior_simulations is None else arm.prior_simulations
             beside = 2 if arm.per_pour is None else arm.per_pour
-            arms.append(DeploymentArm(name, replace(common, prior_simulations=prior, per_pour=beside), repetitions))
+            common = replace(common, prior_simulations=prior, per_pour=beside)
+            if key == "D3":
+                model, trust = (base.model, base.trust) if base.strategy == "D3" else (NEW_MODEL, TrustPlan())
+                common = replace(common, model=model, trust=trust)
+            arms.append(DeploymentArm(key.replace("_", "-"), common, repetitions))
         else:
             arms.append(DeploymentArm(name, common, repetitions))
     return tuple(arms)

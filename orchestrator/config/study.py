@@ -132,7 +132,10 @@ class DeploymentsSection(Section):
     """Learn on real pours."""
 
     D3: DeploymentArmSection | None = None
-    """Real pours with a simulated prior."""
+    """Real pours with a simulated prior, the campaign's model of it and check of trust."""
+
+    D3_paper: DeploymentArmSection | None = None
+    """D3 as in the paper: a GP of the residual around the simulations' mean, always trusted."""
 
 
 class StudyFile(Section):

@@ -15,7 +15,7 @@ from orchestrator.errors import RunError
 from orchestrator.study.cells import Cell
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 
-CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "worker.log", "study.json"
+CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "worker-{}.log", "study.json"
 
 
 class StudyError(RunError):

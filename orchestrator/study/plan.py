@@ -43,7 +43,7 @@ class DeploymentArm:
     """One of D1 to D3 with its budget (in `plan`, which has all receivers).
 
     Attributes:
-        label: 'D1-15' for D1 with 15 iterations, otherwise the strategy.
+        label: 'D1-15' for D1 with 15 iterations, 'D3-paper' for D3 as in the paper, otherwise the strategy.
     """
 
     label: str

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import subprocess
 import sys
 import time
@@ -10,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from orchestrator.study.cells import Cell, cells_of, estimated_seconds
-from orchestrator.study.folder import LOG, is_finished, run_folder
+from orchestrator.study.folder import LOG, is_finished
 from orchestrator.study.plan import StudyPlan
 
 WAKE = 0.1
@@ -49,9 +52,69 @@ class Status:
 Watch = Callable[[Status], None]
 
 
-def worker_command(study: StudyPlan, cell: Cell) -> list[str]:
-    """What runs a cell in a process of its own."""
-    return [sys.executable, "-m", "orchestrator.study.worker", str(study.source), cell.id]
+def worker_command(study: StudyPlan) -> list[str]:
+    """What runs cells in a process of its own."""
+    return [sys.executable, "-m", "orchestrator.study.worker", str(study.source)]
+
+
+class Worker:
+    """A process that runs cells, one at a time.
+
+    Args:
+        command: that starts it; see `orchestrator.study.worker` for what it reads and writes.
+        log: file that takes what else it says.
+
+    Attributes:
+        cell: that it runs now.
+    """
+
+    def __init__(self, command: Sequence[str], log: Path) -> None:
+        self._log = log
+        with log.open("wb") as errors:
+            # A session of its own: Ctrl-C reaches this process alone, which then ends its workers.
+            self.process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, start_new_session=True
+            )
+        assert self.process.stdout is not None
+        os.set_blocking(self.process.stdout.fileno(), False)
+        self._heard = b""
+        self.cell: Cell | None = None
+
+    def begin(self, cell: Cell) -> None:
+        """Give it a cell."""
+        assert self.process.stdin is not None
+        self.cell = cell
+        try:
+            self.process.stdin.write(f"{cell.id}\n".encode())
+            self.process.stdin.flush()
+        except BrokenPipeError:
+            pass  # it has died; `ended` says so
+
+    def ended(self) -> tuple[Cell, str | None] | None:
+        """The cell that has just ended, if one has, and what went wrong with it."""
+        assert self.process.stdout is not None
+        dead = self.process.poll() is not None  # before the last look at what it wrote
+        self._heard += self.process.stdout.read() or b""
+        line, newline, rest = self._heard.partition(b"\n")
+        if self.cell is None or not (newline or dead):
+            return None
+        cell, self.cell = self.cell, None
+        if not newline:
+            return cell, last_words(self._log)
+        self._heard = rest
+        return cell, json.loads(line)[1]
+
+    @property
+    def dead(self) -> bool:
+        """Its process has ended."""
+        return self.process.poll() is not None
+
+    def close(self) -> None:
+        """Let go of its pipes."""
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
 
 
 def run_cells(
@@ -60,7 +123,7 @@ def run_cells(
     *,
     jobs: int,
     watch: Watch = lambda status: None,
-    command: Callable[[StudyPlan, Cell], list[str]] = worker_command,
+    command: Callable[[StudyPlan], list[str]] = worker_command,
 ) -> Status:
     """Run all cells that are not finished. What fails is noted, and the others go on.
 
@@ -75,33 +138,46 @@ def run_cells(
     status = Status(len(cells), {cell.id for cell in cells if is_finished(folder, cell.id)})
     waiting = [cell for cell in cells if cell.id not in status.finished]
     status.cost_left = sum(cost[cell.id] for cell in waiting)
-    workers: dict[str, subprocess.Popen[bytes]] = {}
+    workers: list[Worker] = []
+    started = 0
     begun = time.monotonic()
     watch(status)
     try:
-        while waiting or workers:
+        while waiting or status.running:
             _skip(waiting, status)
             ready = [cell for cell in waiting if status.finished.issuperset(cell.needs)]
-            for cell in ready[: max(jobs, 1) - len(workers)]:
+            idle = [worker for worker in workers if worker.cell is None]
+            for cell in ready[: max(jobs, 1) - len(status.running)]:
+                if not idle:
+                    started += 1
+                    workers.append(Worker(command(study), folder / LOG.format(started)))
+                    idle = workers[-1:]
                 waiting.remove(cell)
-                workers[cell.id] = _start(command(study, cell), run_folder(folder, cell.id))
+                idle.pop().begin(cell)
                 status.running.add(cell.id)
-            for name in [name for name, worker in workers.items() if worker.poll() is not None]:
-                _close(workers.pop(name))
-                status.running.discard(name)
-                status.cost_left -= cost[name]
-                if is_finished(folder, name):
-                    status.finished.add(name)
-                    status.cost_done += cost[name]
-                else:
-                    status.failed[name] = last_words(run_folder(folder, name) / LOG)
+            for worker in list(workers):
+                if (end := worker.ended()) is not None:
+                    _note(*end, folder, cost, status)
+                if worker.dead:
+                    worker.close()
+                    workers.remove(worker)
             status.seconds = time.monotonic() - begun
             watch(status)
-            if workers:
+            if status.running:
                 time.sleep(WAKE)
     finally:
-        _end(workers.values())
+        _end(workers)
     return status
+
+
+def _note(cell: Cell, problem: str | None, folder: Path, cost: dict[str, float], status: Status) -> None:
+    status.running.discard(cell.id)
+    status.cost_left -= cost[cell.id]
+    if is_finished(folder, cell.id):
+        status.finished.add(cell.id)
+        status.cost_done += cost[cell.id]
+    else:
+        status.failed[cell.id] = problem or "it ended without a result"
 
 
 def last_words(log: Path) -> str:
@@ -121,29 +197,15 @@ def _skip(waiting: list[Cell], status: Status) -> None:
             status.skipped.add(cell.id)
 
 
-def _start(command: Sequence[str], directory: Path) -> subprocess.Popen[bytes]:
-    directory.mkdir(parents=True, exist_ok=True)
-    with (directory / LOG).open("wb") as log:
-        # A session of its own: Ctrl-C reaches this process alone, which then ends its workers.
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-        )
-
-
-def _close(worker: subprocess.Popen[bytes]) -> None:
-    if worker.stdin is not None:
-        worker.stdin.close()
-
-
-def _end(workers: Iterable[subprocess.Popen[bytes]]) -> None:
+def _end(workers: Iterable[Worker]) -> None:
     mine = list(workers)
     for worker in mine:
-        worker.terminate()
+        worker.process.terminate()
     deadline = time.monotonic() + GRACE
     for worker in mine:
         try:
-            worker.wait(max(deadline - time.monotonic(), 0.1))
+            worker.process.wait(max(deadline - time.monotonic(), 0.1))
         except subprocess.TimeoutExpired:
-            worker.kill()
-            worker.wait()
-        _close(worker)
+            worker.process.kill()
+            worker.process.wait()
+        worker.close()

@@ -1,16 +1,19 @@
-"""One cell in a process of its own: `python -m orchestrator.study.worker STUDY.yaml CELL`.
+"""Cells in a process of their own, one after the other: `python -m orchestrator.study.worker STUDY.yaml`.
 
-It ends when its parent does: its stdin is a pipe that nobody writes to. Whenever it ends, the cell's journal says how
-far it came, and the next worker goes on from there.
+Each line of its stdin names a cell, each line of its stdout is the JSON list [cell, what went wrong or null]. Starting
+Python, Taichi and its kernels takes longer than a small cell, so a worker is kept. It ends when its stdin does, in the
+middle of a cell too: the cell's journal says how far it came, and the next worker goes on from there.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
 import os
+import queue
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -76,31 +79,42 @@ def _expected(directory: Path) -> list[list[float]]:
     return found
 
 
-def end_with_parent() -> None:
-    """End this process as soon as nobody holds the other end of its stdin."""
+def named_cells() -> Iterator[str]:
+    """The lines of stdin as they come; this process ends as soon as nobody holds the other end."""
+    names: queue.SimpleQueue[str] = queue.SimpleQueue()
 
-    def watch() -> None:
-        while os.read(0, 1024):
-            pass
-        os._exit(1)
+    def listen() -> None:
+        with os.fdopen(0, "r", encoding="utf-8", closefd=False) as lines:
+            for line in lines:
+                names.put(line.strip())
+        os._exit(0 if idle.is_set() else 1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    idle = threading.Event()
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        idle.set()
+        name = names.get()
+        idle.clear()
+        yield name
 
 
-def work(arguments: list[str], make: Callable[[LaboratorySpec, bool], Laboratory] = laboratory_in_process) -> int:
-    """Run the cell that the arguments name; the exit code."""
+def work(path: Path, make: Callable[[LaboratorySpec, bool], Laboratory] = laboratory_in_process) -> None:
+    """Run the cells that stdin names until it ends."""
     from orchestrator.config.study import load_study
 
-    end_with_parent()
-    study = load_study(Path(arguments[0]))
-    cell = {cell.id: cell for cell in cells_of(study)}[arguments[1]]
-    try:
-        run_cell(study, cell, study.folder, make)
-    except (RunError, LaboratoryError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    # Libraries print to stdout, which is for answers alone: from here on they print to the log.
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    study = load_study(path)
+    cells = {cell.id: cell for cell in cells_of(study)}
+    for name in named_cells():
+        problem = None
+        try:
+            run_cell(study, cells[name], study.folder, make)
+        except (RunError, LaboratoryError) as error:
+            problem = str(error)
+        print(json.dumps([name, problem]), file=answers, flush=True)
 
 
 if __name__ == "__main__":
-    sys.exit(work(sys.argv[1:]))
+    work(Path(sys.argv[1]))

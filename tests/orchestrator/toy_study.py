@@ -15,7 +15,6 @@ from actors.optimizer.core.propose import propose
 from actors.protocols import SimulationResult
 from actors.spec import LaboratorySpec
 from orchestrator.config.study import load_study
-from orchestrator.study.cells import Cell
 from orchestrator.study.folder import opened
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.runner import Status, run_cells
@@ -78,9 +77,9 @@ class ToyLaboratory:
         pass
 
 
-def toy_command(study: StudyPlan, cell: Cell) -> list[str]:
+def toy_command(study: StudyPlan) -> list[str]:
     """A worker with a toy laboratory."""
-    return [sys.executable, str(Path(__file__)), str(study.source), cell.id]
+    return [sys.executable, str(Path(__file__)), str(study.source), "worker"]
 
 
 def run_toy_study(study: StudyPlan, **arguments: Any) -> Status:
@@ -91,7 +90,7 @@ def run_toy_study(study: StudyPlan, **arguments: Any) -> Status:
 
 def main() -> int:
     if len(sys.argv) > 2:
-        return work(sys.argv[1:], ToyLaboratory)  # type: ignore[arg-type]
+        work(Path(sys.argv[1]), ToyLaboratory)  # type: ignore[arg-type]
     begun = time.monotonic()
     status = run_toy_study(load_study(Path(sys.argv[1])))
     print(f"{time.monotonic() - begun:.1f} s")

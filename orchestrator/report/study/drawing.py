@@ -22,6 +22,7 @@ COLOURS = {
     "D1": style.PREDICTED,
     "D2": style.MEASURED,
     "D3": style.BEST,
+    "D3-paper": style.GOOD,
 }
 LINES = ("-", "--", ":", "-.")
 """Of several D1, the longest first."""
@@ -64,7 +65,7 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
 
 def colour(arm: str) -> str:
     """Of a strategy; all D1 have one."""
-    return COLOURS[arm.split("-", maxsplit=1)[0]]
+    return COLOURS.get(arm) or COLOURS[arm.split("-", maxsplit=1)[0]]
 
 
 def line(arm: str, arms: Sequence[str]) -> str:
