@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from orchestrator.config.study import load_study
+from orchestrator.report.study.effects import effect
 from orchestrator.report.study.gather import at_pour, gather, running_least
 from orchestrator.report.study.intervals import estimate
 from orchestrator.report.study.page import write_report
@@ -113,6 +114,19 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
     assert float(first["total_seconds"]) == 4 * 25 + 90
     needed = rows(tmp_path, "table-pours")[0]
     assert (float(needed["D2"]), float(needed["D3"])) == (3, 1), "D3 is at its first pour where D2 is at its last"
+
+
+def test_effects_are_differences_within_repetitions() -> None:
+    ours, theirs = {1: 0.1, 2: 0.2, 3: 0.3, 5: math.nan}, {1: 0.3, 2: 0.3, 3: 0.5, 4: 9.0, 5: 1.0}
+    one = effect(ours, theirs)
+    assert one.difference.mean == pytest.approx(-0.5 / 3)
+    assert (one.difference.count, one.better, one.probability) == (3, 3, None)
+    assert one.difference.high < 0.0, "repetitions differ much more than strategies do within one"
+    shifted = {n: 10.0 * n for n in range(8)}
+    sure = effect(shifted, {n: value + 1.0 for n, value in shifted.items()})
+    assert sure.probability == pytest.approx(2 / 2**8)
+    even = effect(shifted, {n: value + (1.0 if n % 2 else -1.0) for n, value in shifted.items()})
+    assert even.probability == 1.0
 
 
 def test_half_a_study_shows_what_is_there(study: StudyPlan, tmp_path: Path) -> None:

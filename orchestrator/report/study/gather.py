@@ -22,6 +22,7 @@ class Calibrated:
         test, train: |r − c_s| of every pour, one list a repetition.
         simulations: spent by each repetition; a grid that all of them score counts whole.
         results: of the calibration stages; none of the uncalibrated simulator.
+        numbers: of the repetitions.
         expected: C4: [simulations, expected mean |Δ|] of every θ that was chosen, one list a repetition.
     """
 
@@ -29,6 +30,7 @@ class Calibrated:
     train: list[list[float]] = field(default_factory=list)
     simulations: list[int] = field(default_factory=list)
     results: list[Mapping[str, Any]] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
     expected: list[list[list[float]]] = field(default_factory=list)
 
 
@@ -48,6 +50,7 @@ class Gathered:
     Attributes:
         calibrated: by strategy, `UNCALIBRATED` first where it is there.
         losses: loss of every pour in order, one list a repetition; NaN where a pour gave none.
+        numbers: of these repetitions.
         cells, finished: how many.
         simulations, pours: that were made.
         cpu_s, seconds: of all cells.
@@ -55,6 +58,7 @@ class Gathered:
 
     calibrated: dict[str, Calibrated] = field(default_factory=dict)
     losses: dict[Key, list[list[float]]] = field(default_factory=dict)
+    numbers: dict[Key, list[int]] = field(default_factory=dict)
     cells: int = 0
     finished: int = 0
     simulations: int = 0
@@ -65,6 +69,10 @@ class Gathered:
     def best_so_far(self, key: Key) -> list[list[float]]:
         """Least loss up to each pour, one list a repetition; all as long as the longest (D1 pours once)."""
         return [running_least(losses) for losses in self.losses.get(key, [])]
+
+    def by_repetition(self, key: Key, pour: int) -> dict[int, float]:
+        """Least loss up to a pour, by the repetition's number."""
+        return dict(zip(self.numbers.get(key, []), at_pour(self.best_so_far(key), pour), strict=True))
 
 
 def gather(study: StudyPlan, results: Mapping[str, Mapping[str, Any]]) -> Gathered:
@@ -87,15 +95,16 @@ def gather(study: StudyPlan, results: Mapping[str, Mapping[str, Any]]) -> Gather
         found.cpu_s += data["cpu_s"]
         found.seconds += data["seconds"]
         if cell.kind in ("calibration", "uncalibrated") and cell.level == study.compared:
-            _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Calibrated()), data)
+            _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Calibrated()), cell, data)
         elif cell.kind == "deployment":
             key = Key(cell.level, receivers[cell.receiver], cell.arm)
             found.losses.setdefault(key, []).append(_losses(cell, data))
+            found.numbers.setdefault(key, []).append(cell.repetition)
     found.calibrated = {name: found.calibrated[name] for name in order if name in found.calibrated}
     return found
 
 
-def _note_calibration(noted: Calibrated, data: Mapping[str, Any]) -> None:
+def _note_calibration(noted: Calibrated, cell: Cell, data: Mapping[str, Any]) -> None:
     pairs = [
         (pair["split"], abs(pair["measured"] - pair["simulated"]))
         for pair in data["results"][EVALUATION]["pairs"]
@@ -103,6 +112,7 @@ def _note_calibration(noted: Calibrated, data: Mapping[str, Any]) -> None:
     ]
     noted.test.append([difference for split, difference in pairs if split == "test"])
     noted.train.append([difference for split, difference in pairs if split == "train"])
+    noted.numbers.append(cell.repetition)
     result = data["results"].get(CALIBRATION)
     noted.simulations.append(0 if result is None else result["simulations"])
     if result is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orchestrator.report.study.deployments import checkpoints, most_pours, places
+from orchestrator.report.study.effects import ALL, Effect, at_pour_of, effect, tests_of
 from orchestrator.report.study.gather import UNCALIBRATED, Gathered, Key, at_pour, mean
 from orchestrator.report.study.intervals import Estimate, estimate, statistic
 from orchestrator.report.units import deployment_unit
@@ -48,6 +49,19 @@ def tables(study: StudyPlan, found: Gathered) -> list[Table]:
     made = []
     if found.calibrated:
         made.append(_calibrations(study, found))
+    if rows := [*_calibration_effects(study, found), *_deployment_effects(study, found)]:
+        made.append(
+            Table(
+                "table-effects",
+                "Who gains how much",
+                "Differences of means over the repetitions that both have, which share pours, seeds and θ* [95 % "
+                "interval]; below 0 the first is better. Probability: that chance alone gives such a difference (sign "
+                "changes of the repetitions' differences); '—' below five repetitions. Many rows are tested: one in "
+                "twenty is below 0.05 by chance.",
+                ("compared", "of", "mismatch", "receiver", "repetitions", "difference", "better in", "probability"),
+                rows,
+            )
+        )
     if found.losses:
         made.append(_deployments(study, found))
         if rows := _needed(study, found):
@@ -91,6 +105,50 @@ def _calibrations(study: StudyPlan, found: Gathered) -> Table:
         ("strategy", "simulations", "repetitions", "training pours [%]", "test pours [%]", "θ*, mean ± deviation"),
         rows,
     )
+
+
+PAIRS = (("C4", "C3"), ("C4", "C2"), ("C4", "C1"), ("C4", UNCALIBRATED), ("C3", "C2"))
+"""Calibrations whose test discrepancies are compared."""
+
+ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"))
+"""Deployments whose losses are compared."""
+
+
+def _calibration_effects(study: StudyPlan, found: Gathered) -> list[list[str | int | float | Estimate]]:
+    rows: list[list[str | int | float | Estimate]] = []
+    for first, second in PAIRS:
+        if first in found.calibrated and second in found.calibrated:
+            one = effect(tests_of(found, first), tests_of(found, second))
+            rows.append(_effect_row(f"{first} − {second}", "test discrepancy [%]", study.compared, "—", one, 100.0))
+    return rows
+
+
+def _deployment_effects(study: StudyPlan, found: Gathered) -> list[list[str | int | float | Estimate]]:
+    if not found.losses:
+        return []
+    levels, receivers, arms = places(study, found)
+    unit, rows = deployment_unit(study.deployments[0].plan), list[list[str | int | float | Estimate]]()
+    for first, second in ARMS:
+        if first not in arms or second not in arms:
+            continue
+        for level in levels:
+            for pour in checkpoints(study, TABLE_POURS):
+                for some in [[name] for name in receivers] + ([receivers] if len(receivers) > 1 else []):
+                    values = [at_pour_of(found, level, some, arm, pour) for arm in (first, second)]
+                    one = effect(*values)
+                    if one.difference.count:
+                        of = f"least {unit.label} after {pour}"
+                        name = some[0] if len(some) == 1 else ALL
+                        rows.append(_effect_row(f"{first} − {second}", of, level, name, one, unit.factor))
+    return rows
+
+
+def _effect_row(
+    compared: str, of: str, level: str, receiver: str, one: Effect, factor: float
+) -> list[str | int | float | Estimate]:
+    chance = "—" if one.probability is None else f"{one.probability:.3f}"
+    count = one.difference.count
+    return [compared, of, level, receiver, count, one.difference.scaled(factor), f"{one.better} of {count}", chance]
 
 
 def _thetas(results: Sequence[object]) -> str:
