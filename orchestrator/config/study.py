@@ -16,6 +16,7 @@ from orchestrator.config.laboratory import (
     PoseNoiseSection,
 )
 from orchestrator.config.load import load_campaign
+from orchestrator.config.motion import Parameters, ParametersBase
 from orchestrator.config.references import References
 from orchestrator.config.resolve_study import calibration_arms, deployment_arms
 from orchestrator.config.sections import Count, Name, PathOr, PositiveCount, Section, Text
@@ -24,6 +25,7 @@ from orchestrator.config.vessel import missing_file
 from orchestrator.config.yaml_source import Document, Place, Report
 from orchestrator.plan import CampaignPlan
 from orchestrator.study.plan import Level, StudyPlan
+from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
 from sim_engine.task import PoseError
 
@@ -159,6 +161,9 @@ class StudyFile(Section):
     laboratory: PathOr[LaboratoryFile] | None = None
     """In place of the campaign's; a virtual one, with a bench."""
 
+    parameters: Parameters | None = None  # type: ignore[valid-type]
+    """In place of the campaign's parameters of the same names: a value fixes one, a range has it searched."""
+
     search: list[Text] | None = None
     """Which of the campaign's searched parameters are searched; the others have the middle of what they may be."""
 
@@ -293,7 +298,29 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
     except ConfigError as error:
         report.problems.extend(error.problems)
         return None
-    return base if laboratory is None else replace(base, laboratory=laboratory)
+    base = base if laboratory is None else replace(base, laboratory=laboratory)
+    return base if file.parameters is None else _with_parameters(base, file.parameters, root.at("parameters"), report)
+
+
+def _with_parameters(base: CampaignPlan, changes: ParametersBase, place: Place, report: Report) -> CampaignPlan:
+    """The plan with other values or ranges of θ."""
+    fixed, searched = changes.fixed(), changes.searched()
+    default = SimulationParameters().model_dump()
+    middle = {name: min(max(default[name], axis.lower), axis.upper) for name, axis in searched.items()}
+    base = replace(base, parameters=SimulationParameters.from_values(base.parameters.model_dump() | fixed | middle))
+    if base.calibration is None:
+        return base
+    axes = {axis.name: axis for axis in base.calibration.parameters.axes if axis.name not in fixed} | searched
+    if not axes:
+        report.add(place, "fixes all that the campaign searches; leave a range to at least one")
+        return base
+    known = {**base.calibration.fixed_parameters, **fixed}
+    calibration = replace(
+        base.calibration,
+        parameters=Space(tuple(axes.values())),
+        fixed_parameters={name: value for name, value in known.items() if name not in axes},
+    )
+    return replace(base, calibration=calibration)
 
 
 def _levels(file: StudyFile, root: Place, report: Report) -> list[tuple[str, Any, PoseErrorSection, PoseNoiseSection]]:

@@ -68,6 +68,17 @@ def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:
     assert [c.simulations for c in cells if c.kind == "grid"] == [100 * 32]
 
 
+def test_a_study_may_have_other_values_and_ranges_of_parameters_than_its_campaign(tmp_path: Path) -> None:
+    changes = {"particles": {"range": [300, 350], "scale": "log"}, "cohesion": "0.02 N/m"}
+    study = small(tmp_path, parameters=changes, search=["particles"])
+    plan = study.calibration("C4").plan
+    axis = plan.parameters.axes[0]
+    assert (axis.name, axis.lower, axis.upper, axis.scale) == ("particles", 300.0, 350.0, "log")
+    assert plan.fixed_parameters["cohesion"] == 0.02
+    assert study.base.parameters.particles == 350, "the default, as near as the range allows"
+    assert study.base.parameters.cohesion == 0.02
+
+
 @pytest.mark.parametrize("name", ["paper", "quick"])
 def test_cells_are_the_same_whenever_the_file_is_read_and_come_after_what_they_need(name: str) -> None:
     cells = cells_of(load_study(STUDIES / f"{name}.yaml"))
@@ -119,6 +130,13 @@ WRONG: dict[str, tuple[Any, str]] = {
     "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),
     "level twice": (lambda d: {**d, "mismatch": [d["mismatch"][0]] * 2}, "mismatch[1]: a level 'small'"),
     "not searched": (lambda d: {**d, "search": ["friction"]}, "search[0]: 'friction' is not searched"),
+    "nothing left to search": (
+        lambda d: {
+            **without(d, "search"),
+            "parameters": {"particles": 500, "cohesion": "0 N/m", "viscosity": "1 1/s"},
+        },
+        "parameters: fixes all that the campaign searches",
+    ),
     "no bench": (
         lambda d: {**d, "laboratory": str(ROOT / "configs/laboratories/planning.yaml")},
         "laboratory 'planning' has no virtual bench",
