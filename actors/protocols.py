@@ -148,10 +148,12 @@ class Notice:
     Attributes:
         level: how much it matters; a 'note' is written into the journal and not shown.
         text: whole sentences.
+        asked: whether the operator's own screen shows it too, with a question.
     """
 
     level: Literal["note", "info", "warning", "error"]
     text: str
+    asked: bool = False
 
 
 @runtime_checkable

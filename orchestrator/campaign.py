@@ -17,6 +17,7 @@ from orchestrator.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
+    LogLine,
     StageClosed,
     StageOpened,
     Watcher,
@@ -288,7 +289,7 @@ class _Run:
         with contextlib.suppress(RunError):  # a full disk ends the run with the next write that matters
             self._journal.append(Kind.NOTE, {"text": notice.text})
         if notice.level != "note":
-            self._watchers.log(notice.level, notice.text)
+            self._watchers.emit(LogLine(level=notice.level, text=notice.text, asked=notice.asked))
 
     def _enter(self, state: State, reason: str = "") -> None:
         if state is self._state:

@@ -76,13 +76,15 @@ def run(
     call(
         campaigns.run,
         campaign,
-        resume=resume,
-        run_id=run_id,
-        answer=answer,
-        in_process=in_process,
-        laboratory=laboratory,
-        as_json=as_json,
-        armed=arm,
+        campaigns.RunOptions(
+            resume=resume,
+            run_id=run_id,
+            answer=answer,
+            in_process=in_process,
+            laboratory=laboratory,
+            as_json=as_json,
+            armed=arm,
+        ),
     )
 
 
@@ -111,13 +113,15 @@ def calibrate(
     call(
         campaigns.calibrate,
         campaign,
-        resume=resume,
-        run_id=run_id,
-        answer=answer,
-        in_process=in_process,
-        laboratory=laboratory,
-        as_json=as_json,
-        armed=arm,
+        campaigns.RunOptions(
+            resume=resume,
+            run_id=run_id,
+            answer=answer,
+            in_process=in_process,
+            laboratory=laboratory,
+            as_json=as_json,
+            armed=arm,
+        ),
     )
 
 

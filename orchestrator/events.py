@@ -141,10 +141,15 @@ class DecisionMade(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class LogLine(Event):
-    """Something people should read."""
+    """Something people should read.
+
+    Attributes:
+        asked: whether the operator reads it in a question at the terminal, where it need not stand twice.
+    """
 
     level: Literal["info", "warning", "error"]
     text: str
+    asked: bool = False
 
 
 Watcher = Callable[[Event], None]

@@ -114,7 +114,8 @@ class ProgressDisplay:
             case CampaignClosed():
                 self._print(f"campaign {event.state}; {self._tally.counts_line()}")
             case LogLine():
-                self._print(event.text, _LEVEL_STYLE[event.level])
+                if not event.asked:
+                    self._print(event.text, _LEVEL_STYLE[event.level])
             case _ if event.replayed:
                 return  # an earlier run has told it
             case StageOpened() if self._live is None:

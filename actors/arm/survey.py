@@ -19,7 +19,7 @@ from actors.arm.ur import primary
 from actors.arm.ur.dashboard import Dashboard, DashboardError
 from actors.arm.ur.primary import RobotState
 from actors.protocols import LaboratoryError
-from actors.virtual_ur.wire import rtde
+from actors.ur import rtde
 
 SCRIPTS, RTDE = 30003, 30004
 PORTS: dict[int, str] = {

@@ -39,8 +39,8 @@ class Questions:
     Args:
         operator: who answers.
         spec: reminder and deadline.
-        tell: takes notices: what is asked, answered and not answered, for the journal. The operator's own screen shows
-            questions and reminders; where nobody looks at one, problems are shown as warnings.
+        tell: takes notices: what is asked, answered and not answered, for the journal; problems as warnings. The
+            operator's own screen shows questions with their problems, and reminders.
         time_scale: bench seconds per second of the clock; times of `spec` run so much faster for a virtual operator.
     """
 
@@ -48,7 +48,7 @@ class Questions:
         self, operator: Operator, spec: OperatorSpec, tell: Callable[[Notice], None], time_scale: float = 1.0
     ) -> None:
         self._operator, self._tell = operator, tell
-        self._unseen: Literal["note", "warning"] = "warning" if spec.answers == "virtual" else "note"
+        self._on_screen = spec.answers == "person"
         pace = time_scale if spec.answers == "virtual" else 1.0
         self._reminder, self._deadline = spec.reminder / pace, spec.deadline / pace
         self.log: list[Answered] = []
@@ -61,7 +61,7 @@ class Questions:
             LaboratoryError: the operator gave it up.
         """
         if question.problem:
-            self._tell(Notice(self._unseen, question.problem))
+            self._tell(Notice("warning", question.problem, asked=self._on_screen))
         begun, answer = time.monotonic(), ""
         answering = asyncio.ensure_future(self._operator.ask(question))
         try:
@@ -98,4 +98,5 @@ class Questions:
             waited = time.monotonic() - begun
             if waited >= self._deadline:
                 raise NobodyAnsweredError(f"nobody answered within {self._deadline:g} s: '{question.text}'")
-            self._tell(Notice(self._unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))
+            unseen: Literal["note", "warning"] = "note" if self._on_screen else "warning"
+            self._tell(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))

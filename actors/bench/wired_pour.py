@@ -291,7 +291,6 @@ class WiredPour:
         """
         if isinstance(error, BenchLostError):
             raise error  # nobody can mend it from here
-        self._rooms.tell(Notice("error", str(error)))
         problem = str(error)
         while await self._agreed(stopped_question(error, problem, begun=self._begun)):
             try:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntEnum
 
+from actors.ur.models import Joints
 from actors.virtual_ur.exchange import Registers, Signals
 from actors.virtual_ur.messages import Listener, Message
-from actors.virtual_ur.models import HOME, Joints, RobotModel
+from actors.virtual_ur.models import HOME, ControlledModel
 from actors.virtual_ur.motion.mover import ViolationError
 from actors.virtual_ur.power import Power, RobotMode
 from actors.virtual_ur.robot import Robot
@@ -55,7 +56,7 @@ class Controller:
 
     def __init__(
         self,
-        model: RobotModel,
+        model: ControlledModel,
         *,
         frequency: float | None = None,
         time_scale: float = 1.0,

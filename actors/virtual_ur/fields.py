@@ -7,7 +7,7 @@ from typing import Any
 
 from actors.virtual_ur.controller import Controller
 from actors.virtual_ur.exchange import REGISTERS
-from actors.virtual_ur.wire.rtde import Field
+from actors.virtual_ur.wire.recipes import Field
 
 _ZERO6 = (0.0,) * 6
 _RUNNING, _POWER_OFF, _IDLE = 253, 239, 255

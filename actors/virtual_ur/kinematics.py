@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from math import acos, asin, atan2, cos, hypot, pi, sin
 
-from actors.virtual_ur.models import Joints, RobotModel
+from actors.ur.models import Joints, RobotModel
 from actors.virtual_ur.poses import IDENTITY, Frame, Vector, compose, multiply, rotation_matrix
 
 _SINGULAR_WRIST = 1e-6

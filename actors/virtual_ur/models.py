@@ -1,53 +1,29 @@
-"""The two robots: lengths, masses, limits and the software that they pretend to run. Plain values.
-
-Source of the Denavit–Hartenberg parameters, masses and centres of mass: the manufacturer's public page "DH Parameters
-for calculations of kinematics and dynamics". Nominal: a real robot is calibrated and differs by tenths of a millimetre.
-"""
+"""The robots with the controllers that they pretend to have."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import radians
 
-from actors.virtual_ur.poses import Vector
+from actors.ur import models
+from actors.ur.models import Joints, RobotModel
 
-Joints = tuple[float, float, float, float, float, float]
 
-
-@dataclass(frozen=True)
-class RobotModel:
+@dataclass(frozen=True, kw_only=True)
+class ControlledModel(RobotModel):
     """One model of robot with its controller.
 
     Attributes:
-        name: as the controller calls it on its dashboard.
-        d1, a2, a3, d4, d5, d6: lengths [m]; a2 and a3 are negative by convention.
-        masses: of the links [kg].
-        centres: of the links' masses, in their own frames [m].
-        joint_speed: what each joint may do [rad/s].
-        joint_range: how far each joint may turn either way [rad].
         version: of the controller's software: major, minor, bugfix, build.
-        frequency: control cycles per second [Hz].
         remote_control: whether the controller knows the remote-control mode.
         serial: its number; digits only.
         primary_type: robot type and subtype in configuration data.
     """
 
-    name: str
-    d1: float
-    a2: float
-    a3: float
-    d4: float
-    d5: float
-    d6: float
-    masses: tuple[float, ...]
-    centres: tuple[Vector, ...]
     version: tuple[int, int, int, int]
-    frequency: int
     remote_control: bool
     serial: str
     primary_type: tuple[int, int]
-    joint_speed: Joints = field(default=tuple(radians(v) for v in (120.0, 120.0, 180.0, 180.0, 180.0, 180.0)))  # type: ignore[assignment]
-    joint_range: Joints = field(default=tuple(radians(363.0) for _ in range(6)))  # type: ignore[assignment]
 
     @property
     def e_series(self) -> bool:
@@ -55,52 +31,12 @@ class RobotModel:
         return self.version[0] >= 5
 
 
-UR10 = RobotModel(
-    name="UR10",
-    d1=0.1273,
-    a2=-0.612,
-    a3=-0.5723,
-    d4=0.163941,
-    d5=0.1157,
-    d6=0.0922,
-    masses=(7.1, 12.7, 4.27, 2.0, 2.0, 0.365),
-    centres=(
-        (0.021, 0.0, 0.027),
-        (0.38, 0.0, 0.158),
-        (0.24, 0.0, 0.068),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.0, -0.026),
-    ),
-    version=(3, 15, 8, 106339),
-    frequency=125,
-    remote_control=False,
-    serial="2016300123",
-    primary_type=(2, 2),
+UR10 = ControlledModel(
+    **vars(models.UR10), version=(3, 15, 8, 106339), remote_control=False, serial="2016300123", primary_type=(2, 2)
 )
 
-UR10E = RobotModel(
-    name="UR10",
-    d1=0.1807,
-    a2=-0.6127,
-    a3=-0.57155,
-    d4=0.17415,
-    d5=0.11985,
-    d6=0.11655,
-    masses=(7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
-    centres=(
-        (0.021, 0.0, 0.027),
-        (0.38, 0.0, 0.158),
-        (0.24, 0.0, 0.068),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.0, -0.026),
-    ),
-    version=(5, 12, 6, 1102099),
-    frequency=500,
-    remote_control=True,
-    serial="20205300456",
-    primary_type=(2, 1),
+UR10E = ControlledModel(
+    **vars(models.UR10E), version=(5, 12, 6, 1102099), remote_control=True, serial="20205300456", primary_type=(2, 1)
 )
 
 MODELS = {"ur10": UR10, "ur10e": UR10E}

@@ -6,8 +6,8 @@ import random
 from collections import deque
 from math import exp
 
+from actors.ur.models import Joints, RobotModel
 from actors.virtual_ur.kinematics import Kinematics
-from actors.virtual_ur.models import Joints, RobotModel
 from actors.virtual_ur.motion.lines import Arm
 from actors.virtual_ur.motion.mover import Mover, ViolationError
 from actors.virtual_ur.poses import IDENTITY, Frame, Vector, compose, distance, frame_of, pose_of

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from enum import IntEnum
 from math import degrees
 
-from actors.virtual_ur.models import Joints, RobotModel
+from actors.ur.models import Joints, RobotModel
 from actors.virtual_ur.poses import Vector
 
 UNLOCK_DELAY = 5.0

@@ -30,48 +30,45 @@ KEPT_THETAS = 50
 """Draws of the posterior in that file."""
 
 
-def run(
-    path: Path,
-    *,
-    resume: bool,
-    run_id: str | None,
-    answer: str | None,
-    in_process: bool,
-    as_json: bool,
-    armed: bool = False,
-    laboratory: Path | None = None,
-) -> None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What `run` and `calibrate` are told on the command line beside their campaign."""
+
+    resume: bool
+    run_id: str | None
+    """With resume: which run; None is the newest unfinished one."""
+    answer: str | None
+    """With resume: what came of the pour that was under way; None lets a person be asked."""
+    in_process: bool
+    laboratory: Path | None
+    """In place of the campaign's."""
+    as_json: bool
+    armed: bool
+    """Hardware may move in this run."""
+
+
+def run(path: Path, options: RunOptions) -> None:
     """The whole campaign."""
-    plan = read_campaign(path, laboratory)
+    plan = read_campaign(path, options.laboratory)
     check_campaign_can_run(plan)
-    finished = _run(plan, "run", path, resume, run_id, answer, in_process, None, armed, laboratory)
-    if as_json:
+    finished = _run(plan, "run", path, options)
+    if options.as_json:
         print_json({"run": finished.result.directory.name, **finished.summary})
 
 
-def calibrate(
-    path: Path,
-    *,
-    resume: bool,
-    run_id: str | None,
-    answer: str | None,
-    in_process: bool,
-    as_json: bool,
-    armed: bool = False,
-    laboratory: Path | None = None,
-) -> None:
+def calibrate(path: Path, options: RunOptions) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
     from orchestrator.stages import calibration_stages
 
-    plan = read_campaign(path, laboratory)
+    plan = read_campaign(path, options.laboratory)
     if plan.calibration is None:
         raise RefusalError(f"{path}: has no 'calibration' section; there is nothing to calibrate", BAD_INPUT)
     # The deployment stays out: its vessels need not be there yet.
     stages = calibration_stages(plan.calibration)
     plan = dataclasses.replace(plan, deployment=None)
     check_campaign_can_run(plan)
-    finished = _run(plan, "calibrate", path, resume, run_id, answer, in_process, stages, armed, laboratory)
-    if as_json:
+    finished = _run(plan, "calibrate", path, options, stages)
+    if options.as_json:
         print_json(calibration_json(finished))
 
 
@@ -218,42 +215,35 @@ def planning_plan(
 
 
 def _run(
-    plan: CampaignPlan,
-    verb: str,
-    path: Path,
-    resume: bool,
-    run_id: str | None,
-    answer: str | None,
-    in_process: bool,
-    stages: list[StageDefinition] | None,
-    armed: bool,
-    laboratory: Path | None,
+    plan: CampaignPlan, verb: str, path: Path, options: RunOptions, stages: list[StageDefinition] | None = None
 ) -> Finished:
     from orchestrator.commands.arming import arm_campaign
     from orchestrator.commands.people import check_somebody_is_there
     from orchestrator.stages import stages_of
 
-    if answer is not None and not resume:
-        raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
+    if options.answer is not None and not options.resume:
+        raise RefusalError(
+            f"--answer {options.answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT
+        )
     chosen = stages_of(plan) if stages is None else stages
-    checksum = arm_campaign(plan, chosen, armed=armed, verb=verb)
+    checksum = arm_campaign(plan, chosen, armed=options.armed, verb=verb)
     if any(stage.pours for stage in chosen):
         check_somebody_is_there(plan.laboratory)
-    check_laboratory_answers(plan, chosen, in_process=in_process)
-    directory = run_directory(plan, resume=resume, run_id=run_id)
-    if resume:
+    check_laboratory_answers(plan, chosen, in_process=options.in_process)
+    directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
+    if options.resume:
         plan = _as_begun(plan, directory)
-    flag = "" if laboratory is None else f" --laboratory {laboratory}"
+    flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
     flag += " --arm" if plan.laboratory.mode == "hardware" else ""
     again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
     finished = run_in_front_of_people(
         plan,
         directory,
-        resume=resume,
+        resume=options.resume,
         stages=stages,
-        in_process=in_process,
+        in_process=options.in_process,
         again=again,
-        answer=answer,
+        answer=options.answer,
         checksum=checksum,
     )
     calibrated = finished.result.results.get("calibration")

@@ -11,7 +11,7 @@ from orchestrator.config.motion import Actions as ActionsModel
 from orchestrator.config.motion import Motion as MotionModel
 from orchestrator.config.motion import Parameters as ParametersModel
 from orchestrator.config.quantities import Quantity
-from orchestrator.config.sections import Count, Name, PathOr, PositiveCount, Section, Switch, Text
+from orchestrator.config.sections import Count, CountOrFree, Name, PathOr, PositiveCount, Section, Switch, Text
 from orchestrator.config.vessel import LiquidFile, VesselFile
 from orchestrator.strategies.objectives import ObjectiveName
 from sim_engine.losses import LossName
@@ -226,7 +226,7 @@ class DeploymentSection(Section):
     prior_simulations: Count | None = None
     """D3: simulations before the first pour; 37 unless given."""
 
-    per_pour: Annotated[Count | Literal["free"], Field(union_mode="left_to_right")] | None = None
+    per_pour: CountOrFree | None = None
     """D3: simulations told between two pours, 2 unless given; 'free': as many as the wall clock allows."""
 
     mean: Literal["constant", "zero"] | None = None

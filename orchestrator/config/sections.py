@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
+
+
+def _count_form(value: Any) -> str | None:
+    if value == "free":
+        return "word"
+    return "number" if isinstance(value, int | float) else None
+
+
+CountOrFree = Annotated[
+    Annotated[Count, Tag("number")] | Annotated[Literal["free"], Tag("word")],
+    Discriminator(
+        _count_form, custom_error_type="count_or_free", custom_error_message="should be a whole number, or 'free'"
+    ),
+]
+"""A whole number, 0 or more, or 'free'."""
 
 PositiveCount = Annotated[int, Strict(), Field(ge=1)]
 """A whole number, 1 or more."""

@@ -184,6 +184,18 @@ BAD_CAMPAIGNS = {
         "count: many",
         "pours.count: should be a whole number, got the text 'many'",
     ),
+    "neither count nor word": (
+        DEPLOYED,
+        "pours: 15",
+        "pours: 15\n  per_pour: four",
+        "deployment.per_pour: should be a whole number, or 'free'",
+    ),
+    "negative count in place of a word": (
+        DEPLOYED,
+        "pours: 15",
+        "pours: 15\n  per_pour: -1",
+        "deployment.per_pour: -1 is too small; at least 0",
+    ),
     "negative seed": (CAMPAIGN, "name: test", "name: test\nseed: -1", "seed: -1 is too small; at least 0"),
     "empty value": (CAMPAIGN, "name: test", "name:", "1:1: name: has no value; give one, or remove the key"),
     "missing key": (CAMPAIGN, "liquid: {name: water, mass: 200 g}\n", "", "key 'liquid' is missing; add for example"),

@@ -4,115 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import re
-import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
-import jsonschema
 import pytest
 
 from actors.spec import RaySpec
-from orchestrator.config.assignments import assigned_action, set_action
-from orchestrator.config.check import check_campaign
 from orchestrator.config.errors import ConfigError
-from orchestrator.config.load import load_campaign, load_laboratory, load_parameters, load_vessel
-from orchestrator.config.quantities import format_quantity, parse_quantity
-from orchestrator.config.schema import campaign_schema, laboratory_schema, schema_text, study_schema, vessel_schema
-from orchestrator.config.yaml_source import Document
+from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
 from orchestrator.fingerprint import fingerprint
 from sim_engine.action import DEG
-from sim_engine.liquid import SimulationParameters
-from sim_engine.vessel.spec import MeshShape
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-CAMPAIGNS = sorted((CONFIGS / "campaigns").glob("*.yaml"))
-SCHEMAS = {
-    "campaigns": campaign_schema,
-    "vessels": vessel_schema,
-    "laboratories": laboratory_schema,
-    "studies": study_schema,
-}
-SHIPPED = [path for kind in SCHEMAS for path in sorted((CONFIGS / kind).glob("*.yaml"))]
-
-
-def named(path: Path) -> str:
-    return path.stem
-
-
-@pytest.mark.parametrize("path", CAMPAIGNS, ids=named)
-def test_shipped_campaign_can_start(path: Path) -> None:
-    assert check_campaign(load_campaign(path)) == []
-
-
-@pytest.mark.parametrize("path", CAMPAIGNS, ids=named)
-def test_resolved_campaign_loads_to_the_same_plan(path: Path, tmp_path: Path) -> None:
-    plan = load_campaign(path)
-    copy = tmp_path / "campaign.json"
-    copy.write_text(json.dumps(plan.resolved))
-    again = load_campaign(copy)
-    assert dataclasses.replace(again, source=plan.source) == plan
-
-
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: f"{p.parent.name}/{p.stem}")
-def test_shipped_file_names_its_schema_and_satisfies_it(path: Path) -> None:
-    first, _, text = path.read_text(encoding="utf-8").partition("\n")
-    reference = first.removeprefix("# yaml-language-server: $schema=")
-    schema = json.loads((path.parent / reference).read_text(encoding="utf-8"))
-    jsonschema.Draft202012Validator(schema).validate(Document.parse(text, path).data)
-
-
-@pytest.mark.parametrize("kind", SCHEMAS)
-def test_committed_schema_is_current(kind: str) -> None:
-    name = {"campaigns": "campaign", "vessels": "vessel", "laboratories": "laboratory", "studies": "study"}[kind]
-    assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(SCHEMAS[kind]())
-
-
-def test_schema_refuses_what_an_editor_should_underline() -> None:
-    good = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml").resolved
-    validator = jsonschema.Draft202012Validator(campaign_schema())
-    assert validator.is_valid(good)
-    for bad in (
-        good | {"sed": 1},
-        {k: v for k, v in good.items() if k != "liquid"},
-        good | {"liquid": {"mass": 200}},
-        good | {"motion": {"return_velocity": "step"}},
-        good | {"actions": {"x_offset": ["80 mm"]}},
-    ):
-        assert not validator.is_valid(bad)
-
-
-def test_recorded_campaign_describes_the_scene_of_its_records() -> None:
-    plan = load_campaign(CONFIGS / "campaigns" / "recorded.yaml")
-    assert plan.calibration is not None
-    records, transfer = plan.calibration.records, plan.calibration.transfer
-    assert records is not None
-    assert transfer is not None
-    first = records.pours[0]
-    assert (first.action.angular_velocity, first.action.max_angle) == pytest.approx((15.1 * DEG, 95.0 * DEG))
-    assert first.action.x_offset == pytest.approx(0.084)
-    assert first.action.height == pytest.approx(0.090)
-    assert (first.action.angular_acceleration, first.action.return_velocity) == (None, None)
-    assert first.action.hold_time == pytest.approx(1.2)
-    assert first.spilled == pytest.approx(0.4e-3)
-    assert [sum(p.split == split for p in records.pours) for split in ("train", "test")] == [28, 4]
-    assert len(transfer.pours) == 16
-    assert transfer.pours[0].action.x_offset == pytest.approx(0.1401)
-    assert transfer.pours[0].action.height == pytest.approx(0.060)
-    assert transfer.scene.receiver.name == "cone"
-    assert plan.calibration.scene.fixed["x_offset"] == pytest.approx(0.084)
-
-
-def test_hidden_liquid_of_the_bench_is_nowhere_in_what_calibration_gets() -> None:
-    plan = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
-    assert plan.laboratory.bench is not None
-    assert plan.calibration is not None
-    hidden = plan.laboratory.bench.liquid
-    assert plan.parameters != hidden
-    assert hidden.particles > plan.calibration.parameters.axes[0].upper
-    assert str(hidden.particles) not in repr(plan.calibration)
 
 
 def test_all_errors_of_a_file_and_of_what_it_names_come_at_once(
@@ -205,92 +109,6 @@ def test_error_shows_the_line_and_a_caret_under_the_culprit(tmp_path: Path, monk
         load_vessel(Path("v.yaml"))
     assert "v.yaml:3:7: unit: 'furlong' is not known here" in str(caught.value)
     assert "\n    3 | unit: furlong\n      |       ^" in str(caught.value)
-
-
-def test_paths_resolve_against_the_file_that_names_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    plan = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
-    assert plan.outputs.directory == CONFIGS.parent / "runs"
-    mug = load_vessel(CONFIGS / "vessels" / "mug.yaml")
-    assert isinstance(mug.shape, MeshShape)
-    assert mug.shape.path == CONFIGS / "vessels" / "meshes" / "mug.stl"
-    assert load_laboratory(CONFIGS / "laboratories" / "planning.yaml").bench is None
-
-
-def test_loading_a_campaign_starts_nothing_heavy() -> None:
-    code = (
-        "import sys; from pathlib import Path; from orchestrator.config.load import load_campaign;"
-        f"load_campaign(Path({str(CONFIGS / 'campaigns' / 'recorded.yaml')!r}));"
-        "print([m for m in ('ray', 'taichi', 'rerun', 'sklearn', 'matplotlib', 'trimesh') if m in sys.modules])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert result.stdout.strip() == "[]", result.stderr
-
-
-@pytest.mark.parametrize(
-    ("text", "unit", "value"),
-    [
-        ("180 deg", "rad", math.pi),
-        ("60rpm", "rad/s", 2.0 * math.pi),
-        ("1.5 cm", "m", 0.015),
-        ("0.2 kg", "kg", 0.2),
-        ("1 g/cm³", "kg/m^3", 1000.0),
-        ("72 mN/m", "N/m", 0.072),
-        ("84 mPa*s", "Pa*s", 0.084),
-        ("84 cP", "Pa*s", 0.084),
-        ("1.4 Pa s", "Pa*s", 1.4),
-        ("3 1/s", "1/s", 3.0),
-        ("3 Hz", "1/s", 3.0),
-        ("-5 mm", "m", -0.005),
-        ("1e2 mm", "m", 0.1),
-        ("−5 °", "rad", -5.0 * DEG),
-    ],
-)
-def test_quantity_means(text: str, unit: str, value: float) -> None:
-    assert parse_quantity(text, unit, "1 mm") == pytest.approx(value, rel=1e-12)
-
-
-def test_formatted_quantity_reads_back_to_the_same_float() -> None:
-    for value in (0.1, 1.0 / 3.0, 40.0 * DEG, 0.084, 2.0**-40):
-        for unit, display in (("m", "mm"), ("rad/s", "deg/s"), ("kg", "g"), ("rad", "deg")):
-            assert parse_quantity(format_quantity(value, unit, display), unit, "1 x") == value
-
-
-def test_bare_numbers_on_the_command_line_are_in_the_unit_that_is_shown() -> None:
-    values = set_action(["angular_velocity=40", "x_offset=9 cm", "height = 60", "hold_time=until_flow_ends"])
-    assert values["angular_velocity"] == pytest.approx(40.0 * DEG)
-    assert values["x_offset"] == pytest.approx(0.09)
-    assert values["height"] == pytest.approx(0.06)
-    assert values["hold_time"] is None
-
-
-def test_command_line_values_stand_over_the_scene_and_ask_for_the_rest() -> None:
-    plan = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
-    assert plan.deployment is not None
-    scene = plan.deployment.scenes[0]
-    action = assigned_action(
-        ["angular_velocity=40", "x_offset=90", "height=70"], fixed=scene.fixed, space=plan.deployment.actions
-    )
-    assert action.height == pytest.approx(0.07)
-    assert action.max_angle == pytest.approx(120.0 * DEG)
-    with pytest.raises(ValueError, match="x_offset has no value"):
-        assigned_action(["angular_velocity=40"], fixed=scene.fixed, space=plan.deployment.actions)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        '{"theta": {"particles": 1500, "cohesion": 0.03, "viscosity": 2.5}, "train_discrepancy": 0.02, "other": null}',
-        "particles: 1500\ncohesion: 30 mN/m\nviscosity: 2.5 1/s\n",
-        "parameters: {particles: 1500, cohesion: 0.03 N/m, viscosity: 2.5}",
-    ],
-)
-def test_parameters_as_a_program_or_a_person_writes_them(text: str, tmp_path: Path) -> None:
-    (tmp_path / "theta.json").write_text(text)
-    base = SimulationParameters(friction=0.2)
-    loaded = load_parameters(tmp_path / "theta.json", base)
-    expected = base.model_copy(update={"particles": 1500, "cohesion": 0.03, "viscosity": 2.5})
-    assert loaded.model_dump() == pytest.approx(expected.model_dump())
 
 
 @pytest.mark.parametrize("address", ["auto", "ray://head:10001", "head", "head:0", "head:70000", ":6379", "a b:6379"])

@@ -58,13 +58,17 @@ class Talking(ToyLaboratory):
 
     def listen(self, hear: Any) -> None:
         hear(Notice("warning", "machine b (10.0.0.4) is lost"))
+        hear(Notice("warning", "the arm was stopped", asked=True))
 
 
 def test_what_happens_to_a_laboratory_is_in_the_journal(tmp_path):
-    run(tmp_path, Talking(), stages=one_stage(Script(simulate(1))))
+    seen: list[Any] = []
+    run(tmp_path, Talking(), stages=one_stage(Script(simulate(1))), watchers=[seen.append])
     with JournalReader(tmp_path / JOURNAL_NAME) as journal:
         notes = [entry.body["text"] for entry in journal.entries(kinds=[Kind.NOTE])]
-    assert notes == ["machine b (10.0.0.4) is lost"]
+    assert notes == ["machine b (10.0.0.4) is lost", "the arm was stopped"]
+    lines = [(event.text, event.asked) for event in seen if isinstance(event, LogLine)]
+    assert lines == [(notes[0], False), (notes[1], True)], "a terminal leaves out what its operator is asked"
 
 
 @pytest.mark.parametrize(("simulators", "pointed_out"), [(2, False), (16, True)])

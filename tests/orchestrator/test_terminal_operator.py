@@ -14,8 +14,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from actors.bench.questions import Questions
+from actors.bench.wired_words import stopped_question
 from actors.operator import OperatorSpec, Question
-from actors.protocols import LaboratoryError
+from actors.protocols import LaboratoryError, Notice
 from orchestrator.events import LogLine
 from orchestrator.progress import ProgressDisplay
 from orchestrator.terminal_operator import TerminalOperator
@@ -228,6 +230,30 @@ def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:
                 await TerminalOperator(PATIENT, stdin=piped.fileno(), out=io.StringIO()).ask(DONE)
 
         played(scene)
+
+
+def test_why_the_arm_was_stopped_stands_on_the_screen_once_and_in_the_recording(keyboard: Keyboard) -> None:
+    why = "protective stop, joint 3"
+    display = ProgressDisplay(watched.campaign(), console=Console(file=keyboard.screen, width=150))
+    shown: list[LogLine] = []
+
+    def hear(notice: Notice) -> None:
+        if notice.level != "note":
+            line = LogLine(level=notice.level, text=notice.text, asked=notice.asked)
+            shown.append(line)
+            display(line)
+
+    async def scene() -> None:
+        questions = Questions(keyboard.operator(), PATIENT, hear)
+        stopped = stopped_question(LaboratoryError(why), why, begun=False)
+        asking = asyncio.create_task(questions.ask(stopped))
+        await keyboard.shows("> ")
+        keyboard.type("yes\n")
+        assert await asking == "yes"
+
+    played(scene)
+    assert keyboard.screen.getvalue().count(why) == 1
+    assert [(line.level, line.text) for line in shown] == [("warning", why)], "the other watchers are told"
 
 
 def test_progress_makes_room_for_a_question_and_goes_on_after_it() -> None:

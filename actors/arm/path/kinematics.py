@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.virtual_ur.models import MODELS, RobotModel
+from actors.ur.models import MODELS, RobotModel
 
 __all__ = ["MODELS", "RobotModel", "beyond_reach", "forward", "inverse", "link_points", "posture", "singularities"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from actors.virtual_ur.models import Joints
+from actors.ur.models import Joints
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.values import Pose, number, numbers, show
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from actors.ur.models import Joints
 from actors.virtual_ur.commands.arguments import LONGEST, is_pose, positive, rate, six
-from actors.virtual_ur.models import Joints
 from actors.virtual_ur.motion.actions import Action
 from actors.virtual_ur.motion.lines import JointLine, Line, ToolLine, UnreachableError
 from actors.virtual_ur.motion.mover import ControlledElsewhereError

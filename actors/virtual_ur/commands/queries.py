@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from actors.ur.models import Joints
 from actors.virtual_ur.commands.arguments import is_pose, six, whole
-from actors.virtual_ur.models import Joints
 from actors.virtual_ur.motion.actions import Path
 from actors.virtual_ur.motion.lines import Arm, ToolLine, UnreachableError
 from actors.virtual_ur.poses import frame_of, pose_of

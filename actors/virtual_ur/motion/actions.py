@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from math import exp, sqrt
 from typing import Protocol
 
-from actors.virtual_ur.models import Joints
+from actors.ur.models import Joints
 from actors.virtual_ur.motion.lines import Arm, Corner, Line, UnreachableError
 from actors.virtual_ur.motion.profile import Profile
 from actors.virtual_ur.poses import Frame, multiply, norm3, rotation_matrix

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from actors.ur.models import Joints
 from actors.virtual_ur.kinematics import Kinematics
-from actors.virtual_ur.models import Joints
 from actors.virtual_ur.poses import (
     Frame,
     Vector,

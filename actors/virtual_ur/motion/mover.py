@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import degrees
 
-from actors.virtual_ur.models import Joints, RobotModel
+from actors.ur.models import Joints, RobotModel
 from actors.virtual_ur.motion.actions import STILL, Action, JointSpeed, Path, Servo, ToolSpeed
 from actors.virtual_ur.motion.lines import Arm, Line, UnreachableError
 

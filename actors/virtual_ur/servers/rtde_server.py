@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import struct
 
+from actors.ur import rtde
+from actors.ur.rtde import Frames, FramingError
 from actors.virtual_ur.controller import Controller
 from actors.virtual_ur.fields import INPUT_KINDS, output_fields, write
 from actors.virtual_ur.servers.connections import Connection, Connections
-from actors.virtual_ur.wire import rtde
-from actors.virtual_ur.wire.rtde import Frames, FramingError, InputRecipe, OutputRecipe
+from actors.virtual_ur.wire.recipes import InputRecipe, OutputRecipe, text_message
 
 PORT = 30004
 
@@ -114,7 +115,7 @@ class RtdeConnection(Connection):
     def _complain(self, text: str) -> None:
         # Never before the start: a client in its setup takes whatever comes next for its answer.
         if self._started:
-            self.send(rtde.text_message(self._protocol, text, "RTDE", 1))
+            self.send(text_message(self._protocol, text, "RTDE", 1))
 
     def _setup_outputs(self, payload: bytes) -> None:
         highest = self.controller.frequency

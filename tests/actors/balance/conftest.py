@@ -22,6 +22,9 @@ PACE = 20.0
 OF_VOICE = {"kern-swt-short": "kern-swt", "sbi-identified": "sbi", "sbi-at-stability": "sbi"}
 """Dialects of voices that are not named after theirs."""
 
+SOON = {"settling": SettlingRule(deadline=4.0)}
+"""Gives up early, where giving up is what is tested."""
+
 
 def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSpec:
     """Settings that leave nothing to be found out."""

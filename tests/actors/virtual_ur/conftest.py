@@ -20,7 +20,7 @@ from actors.virtual_ur.controller import Controller, RuntimeState
 from actors.virtual_ur.messages import Message
 from actors.virtual_ur.models import UR10E
 
-CLIENTS = Path(__file__).with_name("clients.py")
+CLIENTS = Path(__file__).with_name("clients")
 _numbers = itertools.count(2)
 
 
@@ -89,7 +89,7 @@ def bench() -> Bench:
 
 
 class Client:
-    """A scenario of `clients.py` with the real client library, in a process that is ended at the deadline.
+    """A scenario of `clients` with the real client library, in a process that is ended at the deadline.
 
     The library's constructors hold the interpreter, and its calls may block for minutes: hence the process.
     """

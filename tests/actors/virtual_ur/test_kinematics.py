@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from actors.ur.models import RobotModel
 from actors.virtual_ur.kinematics import Kinematics
-from actors.virtual_ur.models import HOME, MODELS, UR10E, RobotModel
+from actors.virtual_ur.models import HOME, MODELS, UR10E
 from actors.virtual_ur.poses import (
     IDENTITY,
     angle_between,

@@ -13,7 +13,7 @@ from actors.virtual_ur.controller import RuntimeState
 from actors.virtual_ur.fields import output_fields
 from actors.virtual_ur.models import HOME
 from actors.virtual_ur.safety import Plane, SafetyConfiguration, SafetyMode
-from actors.virtual_ur.wire.rtde import OutputRecipe
+from actors.virtual_ur.wire.recipes import OutputRecipe
 
 from .conftest import Bench
 

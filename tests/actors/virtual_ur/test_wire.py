@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from actors.ur import rtde
 from actors.virtual_ur.controller import Controller
 from actors.virtual_ur.models import UR10, UR10E
 from actors.virtual_ur.servers.connections import MOST_UNSENT, Connection, Connections
@@ -18,7 +19,7 @@ from actors.virtual_ur.servers.dashboard_server import Dashboard, DashboardConne
 from actors.virtual_ur.servers.primary_server import PrimaryConnection, PrimaryServer
 from actors.virtual_ur.servers.rtde_server import RtdeConnection, RtdeServer
 from actors.virtual_ur.servers.script_server import ScriptConnection
-from actors.virtual_ur.wire import primary, rtde
+from actors.virtual_ur.wire import primary
 
 
 class _Socket:

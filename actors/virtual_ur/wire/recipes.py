@@ -1,6 +1,4 @@
-"""Real-time data exchange (port 30004): frames, field types, recipes.
-
-A frame is `uint16 size, uint8 type, payload`, big-endian, the size including these three bytes.
+"""What a controller puts into its frames of real-time data exchange: messages, and the recipes that clients set up.
 
 Source: the manufacturer's RTDE guide; what real clients send was measured.
 """
@@ -8,73 +6,11 @@ Source: the manufacturer's RTDE guide; what real clients send was measured.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-REQUEST_PROTOCOL_VERSION = ord("V")
-GET_URCONTROL_VERSION = ord("v")
-TEXT_MESSAGE = ord("M")
-DATA_PACKAGE = ord("U")
-SETUP_OUTPUTS = ord("O")
-SETUP_INPUTS = ord("I")
-START = ord("S")
-PAUSE = ord("P")
-
-HEADER = struct.Struct(">HB")
-
-FORMATS: dict[str, tuple[str, int]] = {
-    "BOOL": ("?", 1),
-    "UINT8": ("B", 1),
-    "UINT32": ("I", 1),
-    "UINT64": ("Q", 1),
-    "INT32": ("i", 1),
-    "DOUBLE": ("d", 1),
-    "VECTOR3D": ("3d", 3),
-    "VECTOR6D": ("6d", 6),
-    "VECTOR6INT32": ("6i", 6),
-    "VECTOR6UINT32": ("6I", 6),
-}
-"""Struct format and number of values by RTDE type."""
-
-
-class FramingError(Exception):
-    """Bytes that can't be a frame: the stream can't be followed any more."""
-
-
-def frame(kind: int, payload: bytes) -> bytes:
-    """One frame."""
-    return HEADER.pack(HEADER.size + len(payload), kind) + payload
-
-
-class Frames:
-    """Cuts a stream into frames."""
-
-    def __init__(self) -> None:
-        self._rest = bytearray()
-
-    def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Take bytes; give each complete frame's type and payload.
-
-        Raises:
-            FramingError: a size that no frame has.
-        """
-        rest = self._rest
-        rest += data
-        while len(rest) >= HEADER.size:
-            size, kind = HEADER.unpack_from(rest)
-            if size < HEADER.size:
-                raise FramingError(f"a frame of {size} bytes")
-            if len(rest) < size:
-                return
-            payload = bytes(rest[HEADER.size : size])
-            del rest[:size]
-            yield kind, payload
-
-
-def names(payload: bytes) -> list[str]:
-    """Field names, separated by commas; some clients put one behind the last too."""
-    return [name.strip() for name in payload.decode("ascii", "replace").strip(",\0 \n").split(",") if name.strip()]
+from actors.ur.rtde import DATA_PACKAGE, FORMATS, TEXT_MESSAGE, frame
 
 
 def text_message(protocol: int, message: str, source: str, level: int) -> bytes:

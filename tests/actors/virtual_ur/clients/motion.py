@@ -1,0 +1,160 @@
+"""Moves, streams and paths, blocking or not."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rtde_control import Path, PathEntry, RTDEControlInterface
+from rtde_receive import RTDEReceiveInterface
+from shared import HOME, attempt, keep, until
+
+
+def moves(address: str) -> dict[str, Any]:
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
+    seen: dict[str, Any] = {"home": control.moveJ(HOME, 2.0, 4.0)}
+    first = receive.getTimestamp()
+    target = [0.5, -1.4, 1.6, -1.7, -1.4, 0.3]
+    seen["moveJ"] = control.moveJ(target, 1.05, 1.4)
+    seen["moveJ time"] = [first, receive.getTimestamp()]
+    until(control.isSteady)
+    seen["moveJ target"], seen["moveJ reached"] = target, receive.getActualQ()
+    pose = receive.getActualTCPPose()
+    pose[2] += 0.1
+    first = receive.getTimestamp()
+    seen["moveL"] = control.moveL(pose, 0.25, 1.2)
+    seen["moveL time"] = [first, receive.getTimestamp()]
+    until(control.isSteady)
+    seen["moveL target"], seen["moveL reached"] = list(pose), receive.getActualTCPPose()
+    pose[1] += 0.05
+    seen["moveJ_IK"] = control.moveJ_IK(pose, 1.0, 2.0)
+    until(control.isSteady)
+    seen["moveJ_IK target"], seen["moveJ_IK reached"] = pose, receive.getActualTCPPose()
+    seen["moveL_FK"] = control.moveL_FK(target, 0.5, 1.2)
+    until(control.isSteady)
+    seen["moveL_FK reached"] = receive.getActualQ()
+    return seen
+
+
+def streams(address: str) -> dict[str, Any]:
+    """Servo and speed commands, with their stops."""
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
+    control.moveJ(HOME, 2.0, 4.0)
+    seen: dict[str, Any] = {}
+    q = list(HOME)
+    for _ in range(200):
+        cycle = control.initPeriod()
+        q[5] += 0.001
+        control.servoJ(q, 0.0, 0.0, 0.002, 0.05, 300)
+        control.waitPeriod(cycle)
+    until(lambda: abs(receive.getActualQ()[5] - q[5]) < 1e-4, 2.0)
+    seen["servoJ target"], seen["servoJ reached"] = q, receive.getActualQ()
+    control.servoStop()
+    pose = receive.getActualTCPPose()
+    for _ in range(100):
+        cycle = control.initPeriod()
+        pose[1] += 0.0003
+        control.servoL(pose, 0.0, 0.0, 0.002, 0.05, 300)
+        control.waitPeriod(cycle)
+    until(lambda: abs(receive.getActualTCPPose()[1] - pose[1]) < 1e-4, 2.0)
+    seen["servoL target"], seen["servoL reached"] = list(pose), receive.getActualTCPPose()
+    control.servoStop()
+    control.speedJ([0.0, 0.0, 0.0, 0.0, 0.0, -0.4], 2.0, 0.5)
+    until(lambda: abs(receive.getActualQd()[5] + 0.4) < 1e-3, 2.0)
+    seen["speedJ"] = receive.getActualQd()
+    control.speedStop(4.0)
+    time.sleep(0.05)  # the receiving connection may be a package behind
+    seen["speedJ after"] = receive.getTargetQd()
+    control.speedL([0.0, 0.0, 0.05, 0.0, 0.0, 0.0], 0.5, 0.5)
+    until(lambda: abs(receive.getActualTCPSpeed()[2] - 0.05) < 1e-4, 2.0)
+    seen["speedL"] = receive.getActualTCPSpeed()
+    control.speedStop(1.0)
+    time.sleep(0.05)
+    seen["speedL after"] = receive.getTargetTCPSpeed()
+    control.jogStart([0.0, 0.02, 0.0, 0.0, 0.0, 0.0], control.FEATURE_TOOL)
+    seen["jog"] = until(lambda: max(map(abs, receive.getActualTCPSpeed()[:3])) > 0.015, 3.0)
+    control.jogStop()
+    return seen
+
+
+def circular(address: str) -> dict[str, Any]:
+    """servoC, which the library handles unlike other streams."""
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
+    control.moveJ(HOME, 2.0, 4.0)
+    pose = receive.getActualTCPPose()
+    pose[2] += 0.05
+    control.servoC(pose, 0.1, 1.0)
+    until(lambda: abs(receive.getActualTCPPose()[2] - pose[2]) < 1e-3, 5.0)
+    seen: dict[str, Any] = {"target": pose, "reached": receive.getActualTCPPose()}
+    # The library doesn't wait for servoC to be done, its script says so nevertheless: the next command is lost.
+    seen["stop"] = [control.servoStop(), control.servoStop()]
+    return seen
+
+
+def paths(address: str) -> dict[str, Any]:
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
+    control.moveJ(HOME, 2.0, 4.0)
+    seen: dict[str, Any] = {}
+    joints = [[*HOME[:5], 0.1 * k, 1.0, 3.0, 0.02 if k < 5 else 0.0] for k in range(1, 6)]
+    seen["moveJ path"] = control.moveJ(joints)
+    time.sleep(0.05)  # the receiving connection may be a package behind
+    seen["moveJ path end"] = receive.getTargetQ()
+    start = receive.getActualTCPPose()
+    corners = [(0.0, 0.1, 0.0), (0.0, 0.1, 0.1), (0.0, 0.0, 0.1), (0.0, 0.0, 0.0)]
+    square = [[*(a + b for a, b in zip(start, c, strict=False)), *start[3:], 0.25, 1.2, 0.02] for c in corners]
+    square[-1][8] = 0.0
+    seen["moveL path start"], seen["moveL path began"] = start, receive.getTimestamp()
+    seen["moveL path"] = control.moveL(square)
+    seen["moveL path ended"] = receive.getTimestamp()
+    path = Path()
+    path.addEntry(PathEntry(PathEntry.MoveJ, PathEntry.PositionJoints, [*HOME, 1.0, 2.0, 0.0]))
+    path.addEntry(PathEntry(PathEntry.MoveL, PathEntry.PositionTcpPose, [*start, 0.25, 1.2, 0.0]))
+    control.movePath(path, True)
+    progress = set()
+    until(lambda: control.getAsyncOperationProgressEx().isAsyncOperationRunning(), 2.0)
+    while control.getAsyncOperationProgressEx().isAsyncOperationRunning():
+        progress.add(control.getAsyncOperationProgressEx().progress())
+        time.sleep(0.002)
+    seen["movePath progress"] = sorted(progress)
+    time.sleep(0.05)
+    seen["movePath end"] = receive.getTargetTCPPose()
+    return seen
+
+
+def asynchronous(address: str) -> dict[str, Any]:
+    """Moves that return at once, and their stop."""
+    control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
+    control.moveJ(HOME, 2.0, 4.0)
+    before = control.getAsyncOperationProgressEx().operationId()
+    seen: dict[str, Any] = {"started": control.moveJ([2.0, *HOME[1:]], 1.0, 1.4, True)}
+    seen["new operation"] = until(lambda: control.getAsyncOperationProgressEx().operationId() != before, 2.0)
+    seen["running"] = control.getAsyncOperationProgressEx().isAsyncOperationRunning()
+    until(lambda: receive.getActualQ()[0] > 0.5)
+    seen["not steady"] = control.isSteady()
+    control.stopJ(2.0)
+    seen["stands after stopJ"] = until(lambda: max(map(abs, receive.getTargetQd())) < 1e-9, 0.5)
+    seen["stopped at"] = receive.getActualQ()[0]
+    seen["finished"] = until(lambda: not control.getAsyncOperationProgressEx().isAsyncOperationRunning(), 2.0)
+    pose = receive.getActualTCPPose()
+    pose[2] += 0.2
+    control.moveL(pose, 0.1, 0.5, True)
+    until(lambda: receive.getActualTCPSpeed()[2] > 0.09)
+    control.stopL(1.0, True)
+    seen["stopL stops"] = until(lambda: max(map(abs, receive.getTargetQd())) < 1e-6, 5.0)
+    seen["moveL again"] = control.moveL(pose, 0.25, 1.2)
+    return seen
+
+
+def unreachable(address: str) -> dict[str, Any]:
+    control = keep(RTDEControlInterface(address))
+    seen: dict[str, Any] = {"moveL": control.moveL([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])}
+    seen["program runs"] = control.isProgramRunning()
+    control.reuploadScript()
+    until(control.isProgramRunning, 5.0)
+    seen["inverse"] = attempt(lambda: control.getInverseKinematics([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    control.reuploadScript()
+    until(control.isProgramRunning, 5.0)
+    seen["moves again"] = control.moveJ(HOME, 2.0, 4.0)
+    seen["force mode"] = control.forceMode([0.0] * 6, [0, 0, 1, 0, 0, 0], [0.0] * 6, 2, [0.1] * 6)
+    seen["force mode ends program"] = until(lambda: not control.isProgramRunning(), 2.0)
+    return seen
