@@ -3,7 +3,7 @@
     python docs/make_study.py runs/study-paper/report
 
 Figures go to docs/images/study; tables stand between `<!-- study: NAME ... -->` and `<!-- end of study -->`.
-What follows the name picks rows: `mismatch=small/large; strategy=D3`. A column of which one value is wanted is left out.
+What follows the name picks rows: `mismatch=small/large; strategy=D3`. A column of one wanted value is left out.
 """
 
 from __future__ import annotations
