@@ -86,10 +86,12 @@ def test_a_calibrated_simulator_beats_an_uncalibrated_one_on_pours_that_it_never
     assert found["simulations"] <= budget
     assert set(found["discrepancy"]) == {"train", "test", "transfer"}
     assert found["discrepancy"]["test"] < 0.6 * without["discrepancy"]["test"]
-    assert len(found["unseen"]) == 4 + 16
+    assert {split: len(errors) for split, errors in found["errors"].items()} == {"train": 28, "test": 4, "transfer": 16}
     shown = bench.table_row(row, priced.calibration, [found, found])
     assert shown["test_seeds"] == [shown["test"]] * 2
     assert len(shown["unseen_quartiles"]) == 3
+    low, high = shown["transfer_interval"]
+    assert low <= shown["transfer"] <= high
 
 
 def test_random_parameters_are_told_by_their_median(
