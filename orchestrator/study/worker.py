@@ -23,7 +23,7 @@ from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.stages import CALIBRATION
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import Cell, cells_of
-from orchestrator.study.folder import read_result, run_folder, write_result
+from orchestrator.study.folder import as_begun, read_result, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
 
 
@@ -92,7 +92,7 @@ def work(arguments: list[str], make: Callable[[LaboratorySpec, bool], Laboratory
     from orchestrator.config.study import load_study
 
     end_with_parent()
-    study = load_study(Path(arguments[0]))
+    study = as_begun(load_study(Path(arguments[0])))
     cell = {cell.id: cell for cell in cells_of(study)}[arguments[1]]
     try:
         run_cell(study, cell, study.folder, make)
