@@ -278,16 +278,24 @@ class Kept:
             for path in self._folder.glob("*.json"):
                 path.unlink()
 
+    def find(self, key: Any) -> dict[str, Any] | None:
+        """What was kept; None if nothing was."""
+        path = self._path(key)
+        return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
+
     def get(self, key: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """What was kept, or what is made now."""
-        path = self._folder / f"{digest(key)[:24]}.json"
-        if path.exists():
-            return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8")))
-        result = make()
+        found = self.find(key)
+        if found is not None:
+            return found
+        path, result = self._path(key), make()
         unfinished = path.with_suffix(".tmp")
         unfinished.write_text(json.dumps(result), encoding="utf-8")
         unfinished.replace(path)
         return result
+
+    def _path(self, key: Any) -> Path:
+        return self._folder / f"{digest(key)[:24]}.json"
 
 
 def _options() -> argparse.Namespace:

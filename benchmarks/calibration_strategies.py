@@ -3,19 +3,25 @@
     python benchmarks/calibration_strategies.py [CAMPAIGN] [--search particles wall_distance]
                                                 [--rows C1=2800 C2=504 C3=1652 C4=108] [--seeds 11 12 13]
                                                 [--known cohesion=0 viscosity=0 lip_drop=0]
-                                                [--random 8] [--workers 1] [--fresh] [--json]
+                                                [--random 8] [--once C1 random] [--workers 1] [--fresh] [--kept]
+                                                [--json]
 
 Each row is a strategy with a budget of single simulated pours, the paper's unless given; `--rows C1=504 C2=504 C3=504
 C4=504` compares them at one price. All search the same parameters, two as in the paper; what is not searched has the
 value given with `--known`, the campaign's fixed one, or Decant's default. θ* is then simulated on each recorded pour:
-mean |measured − simulated| of the normalised spillage on training, test and transfer pours, and the quartiles over all
-pours that were not trained on (test and transfer, all seeds). Seeds change the random choices and the initial
-positions; C1 has no random choices.
+mean |measured − simulated| of the normalised spillage on training, test and transfer pours, each with a 95 % interval,
+and the quartiles over all pours that were not trained on (test and transfer, all seeds). An interval is a bootstrap
+over the pours, each with its mean over the seeds: how much hangs on which pours there are. Seeds change the random
+choices and the initial positions; C1 and θ that nobody searched have no random choices, and what `--once` names is made
+with the first seed only.
 
-'uncalibrated' are Decant's defaults; 'random' the median over θ drawn from the searched box.
+'uncalibrated' has the values that are known, and Decant's defaults of what is searched; 'defaults', where anything is
+told to be known, has nothing but defaults; 'random' is the median over θ drawn from the searched box, on pours that
+were not trained on.
 
 Every calibration is a process of its own, `--workers` of them at a time, and kept in the cache directory: what was
-interrupted goes on where it stopped. `--fresh` forgets what was kept.
+interrupted goes on where it stopped, and `--kept` makes nothing and shows what there is so far. `--fresh` forgets what
+was kept.
 """
 
 from __future__ import annotations
@@ -32,6 +38,7 @@ from typing import Any, cast
 
 from calibration_power import CAMPAIGN, SPLITS, Answers, Kept, known_values, play, recorded, searching
 from machine import describe, run_self, say, show
+from optimisers import interval
 
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign
@@ -42,7 +49,8 @@ from orchestrator.strategies.evaluation import Evaluation, random_parameters
 from sim_engine.liquid import SimulationParameters
 
 PAPER = ("C1=2800", "C2=504", "C3=1652", "C4=108")
-UNCALIBRATED, RANDOM = "uncalibrated", "random"
+DEFAULTS, UNCALIBRATED, RANDOM = "defaults", "uncalibrated", "random"
+NOT_CALIBRATED = (DEFAULTS, UNCALIBRATED, RANDOM)
 TRAINED_ON = "train"
 
 
@@ -51,7 +59,7 @@ class Row:
     """A strategy and what it may spend.
 
     Attributes:
-        name: 'C1' to 'C4', `UNCALIBRATED` or `RANDOM`.
+        name: 'C1' to 'C4', or one of `NOT_CALIBRATED`.
         budget: single simulated pours; of random θ their number.
     """
 
@@ -91,7 +99,9 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
     assert calibration is not None
     answers, begun, label = Answers(plan), time.process_time(), f"{row.name}, seed {seed}"
     found: Mapping[str, Any] = {}
-    if row.name == UNCALIBRATED:
+    if row.name == DEFAULTS:
+        thetas = {"theta": SimulationParameters()}
+    elif row.name == UNCALIBRATED:
         # fixed values are what anybody would take; those that are searched have their defaults
         thetas = {"theta": SimulationParameters.from_values(calibration.fixed_parameters)}
     elif row.name == RANDOM:
@@ -102,21 +112,24 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
         play(strategy, answers, plan.parallel_simulations, label)
         found = strategy.result()
         thetas = {"theta": SimulationParameters.model_validate(found["theta"])}
-    judge = Evaluation(thetas, recorded(calibration), stage_seed(seed, "evaluation"))
+    pours = recorded(calibration)
+    unseen = [scored for scored in pours if scored.pour.split != TRAINED_ON]
+    # the unseen come first, so that all θ meet the same initial positions there
+    trained = [] if row.name == RANDOM else [scored for scored in pours if scored.pour.split == TRAINED_ON]
+    judge = Evaluation(thetas, [*unseen, *trained], stage_seed(seed, "evaluation"))
     play(judge, answers, plan.parallel_simulations, f"{label}, judged")
     answers.close()
-    unseen = [
-        abs(pair["measured"] - pair["simulated"])
-        for pair in cast("Sequence[Mapping[str, Any]]", judge.result()["pairs"])
-        if pair["simulated"] is not None and pair["split"] != TRAINED_ON
-    ]
+    errors: dict[str, list[float | None]] = {split: [] for split in SPLITS}
+    for pair in cast("Sequence[Mapping[str, Any]]", judge.result()["pairs"]):
+        simulated = pair["simulated"]
+        errors[pair["split"]].append(None if simulated is None else abs(pair["measured"] - simulated))
     return {
         "theta": None if row.name == RANDOM else thetas["theta"].model_dump(),
         "discrepancy": {
             split: judge.random_median(split) if row.name == RANDOM else judge.discrepancy("theta", split)
             for split in SPLITS
         },
-        "unseen": unseen,
+        "errors": {} if row.name == RANDOM else errors,
         "simulations": found.get("simulations", 0),
         "lost": found.get("lost", 0),
         "expected": found.get("predicted_discrepancy"),
@@ -125,7 +138,7 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
 
 
 def table_row(row: Row, calibration: CalibrationPlan | None, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the seeds, each seed's beside them, and quartiles over the unseen pours."""
+    """Means over the seeds with intervals over the pours, each seed beside them, and quartiles of the unseen."""
     shown: dict[str, Any] = {"strategy": row.name, "simulations": max(one["simulations"] for one in found)}
     if calibration is not None and row.name in ("C1", "C2", "C3"):
         shown["thetas"] = calibration.thetas or next(iter(calibration.grid.values())) ** len(calibration.grid)
@@ -133,7 +146,16 @@ def table_row(row: Row, calibration: CalibrationPlan | None, found: Sequence[Map
         values = [one["discrepancy"][split] for one in found if one["discrepancy"][split] is not None]
         shown[split] = round(statistics.mean(values), 4) if values else None
         shown[f"{split}_seeds"] = [round(value, 4) for value in values]
-    unseen = sorted(error for one in found for error in one["unseen"])
+        of_pours = over_seeds([one["errors"].get(split, ()) for one in found])
+        if of_pours:
+            shown[f"{split}_interval"] = [round(bound, 4) for bound in interval(of_pours)[1:]]
+    unseen = [
+        error
+        for one in found
+        for split, errors in one["errors"].items()
+        for error in errors
+        if split != TRAINED_ON and error is not None
+    ]
     if len(unseen) > 1:
         shown["unseen_quartiles"] = [round(value, 4) for value in statistics.quantiles(unseen, n=4)]
     shown["expected"] = [round(one["expected"], 4) for one in found if one["expected"] is not None]
@@ -145,13 +167,20 @@ def table_row(row: Row, calibration: CalibrationPlan | None, found: Sequence[Map
     return shown
 
 
+def over_seeds(found: Sequence[Sequence[float | None]]) -> list[float]:
+    """Mean error of each pour over the seeds that have one, from a list of each seed's; empty if there are none."""
+    known = [[error for error in errors if error is not None] for errors in zip(*found, strict=True)]
+    return [statistics.mean(errors) for errors in known if errors]
+
+
 def rows_of(options: argparse.Namespace) -> list[Row]:
     """The rows of the table, the uncalibrated first.
 
     Raises:
         SystemExit: `--rows` names no strategy, or no budget.
     """
-    rows = [Row(UNCALIBRATED), *([Row(RANDOM, options.random)] if options.random > 0 else [])]
+    rows = [Row(DEFAULTS)] if options.known else []
+    rows += [Row(UNCALIBRATED), *([Row(RANDOM, options.random)] if options.random > 0 else [])]
     for text in options.rows:
         name, _, budget = text.partition("=")
         if name not in ("C1", "C2", "C3", "C4") or not budget.isdigit() or int(budget) < 1:
@@ -168,8 +197,10 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--rows", nargs="+", default=PAPER, metavar="STRATEGY=SIMULATIONS")
     parser.add_argument("--seeds", type=int, nargs="+", default=(11, 12, 13))
     parser.add_argument("--random", type=int, default=8, help="random θ to compare with, each seed; 0 for none")
+    parser.add_argument("--once", nargs="*", default=[], metavar="ROW", help="rows made with the first seed only")
     parser.add_argument("--workers", type=int, default=1, help="calibrations at a time")
     parser.add_argument("--fresh", action="store_true", help="forget what was kept")
+    parser.add_argument("--kept", action="store_true", help="make nothing, show what was kept so far")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # this is a process that makes one calibration
     return parser.parse_args()
@@ -206,8 +237,7 @@ def main() -> None:
     assert calibration is not None
     rows = rows_of(options)
     plans = [
-        plan if row.name in (UNCALIBRATED, RANDOM) else replace(plan, calibration=at_price(calibration, row))
-        for row in rows
+        plan if row.name in NOT_CALIBRATED else replace(plan, calibration=at_price(calibration, row)) for row in rows
     ]
     if options.one is not None:
         number, seed = map(int, options.one.split())
@@ -218,19 +248,30 @@ def main() -> None:
     same += [f"--random={options.random}"]
     machine, kept, begun = describe(), Kept("calibration-strategies", fresh=options.fresh), time.monotonic()
 
-    def make(job: tuple[int, int]) -> dict[str, Any]:
+    def make(job: tuple[int, int]) -> dict[str, Any] | None:
         number, seed = job
         row = rows[number]
         key = ["strategies", machine["fingerprint"], fingerprint(plans[number]), row.name, row.budget, seed]
-        return kept.get(key, lambda: run_self(__file__, *same, f"--one={number} {seed}"))
+        if options.kept:
+            return kept.find(key)
+        found = kept.get(key, lambda: run_self(__file__, *same, f"--one={number} {seed}"))
+        say(f"{row.name}, seed {seed}: {found['discrepancy']}, {found['cpu_s']} CPU s")
+        return found
 
-    jobs = [(number, seed) for number in range(len(rows)) for seed in options.seeds]
-    with ThreadPoolExecutor(max(options.workers, 1)) as pool:
-        found = dict(zip(jobs, pool.map(make, jobs), strict=True))
-    say(f"all made, {time.monotonic() - begun:.0f} s")
-    table = [
-        table_row(row, plans[number].calibration, [found[number, seed] for seed in options.seeds])
+    jobs = [
+        (number, seed)
+        for seed in options.seeds
         for number, row in enumerate(rows)
+        if row.name not in options.once or seed == options.seeds[0]
+    ]
+    with ThreadPoolExecutor(max(options.workers, 1)) as pool:
+        made = dict(zip(jobs, pool.map(make, jobs), strict=True))
+    say(f"{sum(one is not None for one in made.values())} of {len(jobs)} made, {time.monotonic() - begun:.0f} s")
+    found = [[one for job, one in made.items() if job[0] == number and one is not None] for number in range(len(rows))]
+    table = [
+        {"seeds": len(of_row), **table_row(row, plans[number].calibration, of_row)}
+        for number, (row, of_row) in enumerate(zip(rows, found, strict=True))
+        if of_row
     ]
     result = {"campaign": options.campaign.stem, "searched": list(options.search), "seeds": list(options.seeds)}
     show({**result, "rows": table, "machine": machine}, options.json)

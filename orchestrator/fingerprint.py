@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from orchestrator.codec import to_json
-from orchestrator.plan import CampaignPlan, ModelName, TrustPlan
+from orchestrator.plan import CampaignPlan, DeploymentPlan, ModelName, TrustPlan
 from sim_engine.liquid import Liquid
 from sim_engine.task import Scene
 from sim_engine.vessel.spec import MeshShape
@@ -28,7 +28,14 @@ _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "han
 
 _YOUNGER: dict[str, dict[str, Any]] = {
     "calibration": {"grid": {}, "thetas": 0},
-    "deployment": {"data": None, "objectives": None, "model": "residual", "trust": None},
+    "deployment": {
+        "data": None,
+        "objectives": None,
+        "model": "residual",
+        "trust": None,
+        "noise": "constant",
+        "refusals": "penalise",
+    },
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
 
@@ -36,21 +43,44 @@ NEW_MODEL: ModelName = "scaled"
 """`deployment.model` of campaigns that name none."""
 
 
-def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
-    """The plan of a run that began before D3 had a model to choose and a policy, if the campaign asks for neither.
+_CAME_TOGETHER: tuple[dict[str, Any], ...] = (
+    {"model": NEW_MODEL, "trust": TrustPlan()},
+    {"noise": "varying", "refusals": "avoid"},
+)
+"""Fields of a deployment that came at the same time, each with what a campaign has that doesn't name it."""
 
-    Such a run goes on as it began: with the paper's model, and with an alarm that only tells.
+
+def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
+    """The plan of a run that began before a deployment had some fields, if the campaign asks for nothing else.
+
+    Such a run goes on as it began: with the paper's model and an alarm that only tells, with the same noise
+    everywhere, and with the worst cost for actions that can't be made.
 
     Args:
         plan: of the campaign, as it is read today.
         begun: the fingerprint that the run began with.
     """
-    before, today = begun.get("deployment") or {}, plan.deployment
-    if today is None or "model" in before or "trust" in before:
+    if plan.deployment is None:
         return plan
-    if (today.model, today.trust) != (NEW_MODEL, TrustPlan()):
-        return plan
-    return replace(plan, deployment=replace(today, model="residual", trust=None))
+    older = deployment_as_begun(plan.deployment, begun.get("deployment") or {})
+    return plan if older is plan.deployment else replace(plan, deployment=older)
+
+
+def deployment_as_begun(today: DeploymentPlan, before: Mapping[str, Any]) -> DeploymentPlan:
+    """The same of a deployment alone; `today` itself where nothing has to change."""
+    changes: dict[str, Any] = {}
+    for fields in _CAME_TOGETHER:
+        older = {name: _YOUNGER["deployment"][name] for name in fields}
+        unasked = all(getattr(today, name) in (fields[name], older[name]) for name in fields)
+        if unasked and not before.keys() & fields.keys():
+            changes |= {name: value for name, value in older.items() if getattr(today, name) != value}
+    return replace(today, **changes) if changes else today
+
+
+def without_newest(deployment: dict[str, Any]) -> dict[str, Any]:
+    """A deployment's JSON without those of the newest fields that change nothing, as it was written before them."""
+    unused = {name: _YOUNGER["deployment"][name] for name in _CAME_TOGETHER[-1]}
+    return {name: value for name, value in deployment.items() if name not in unused or value != unused[name]}
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:

@@ -18,6 +18,7 @@ CalibrationName = Literal["C1", "C2", "C3", "C4"]
 DeploymentName = Literal["D1", "D2", "D3"]
 ModelName = Literal["residual", "pooled", "scaled"]
 PolicyName = Literal["ask", "D2", "widen"]
+RefusalsName = Literal["avoid", "penalise"]
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,8 @@ class DeploymentPlan:
         objectives: what is minimised in place of the loss.
         model: D3: how simulations enter the surrogate: 'residual' is the paper's; see docs/optimiser.md.
         trust: D3: when the simulator is called wrong, and what follows; None: pours are only compared.
+        noise: of observations: the same everywhere, or varying with the action where the data show it.
+        refusals: what an action that can't be made is to the optimiser: a place to avoid, or one with the worst cost.
     """
 
     strategy: DeploymentName
@@ -174,6 +177,8 @@ class DeploymentPlan:
     objectives: Objectives | None = None
     model: ModelName = "residual"
     trust: TrustPlan | None = None
+    noise: Literal["constant", "varying"] = "constant"
+    refusals: RefusalsName = "penalise"
 
     @property
     def loss_name(self) -> str:

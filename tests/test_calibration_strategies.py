@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -86,10 +90,12 @@ def test_a_calibrated_simulator_beats_an_uncalibrated_one_on_pours_that_it_never
     assert found["simulations"] <= budget
     assert set(found["discrepancy"]) == {"train", "test", "transfer"}
     assert found["discrepancy"]["test"] < 0.6 * without["discrepancy"]["test"]
-    assert len(found["unseen"]) == 4 + 16
+    assert {split: len(errors) for split, errors in found["errors"].items()} == {"train": 28, "test": 4, "transfer": 16}
     shown = bench.table_row(row, priced.calibration, [found, found])
     assert shown["test_seeds"] == [shown["test"]] * 2
     assert len(shown["unseen_quartiles"]) == 3
+    low, high = shown["transfer_interval"]
+    assert low <= shown["transfer"] <= high
 
 
 def test_random_parameters_are_told_by_their_median(
@@ -113,3 +119,48 @@ def test_what_can_t_be_compared_is_refused(bench: ModuleType, monkeypatch: pytes
     assert "--known particles: searched as well" in refusal("--known", "particles=700")
     quickstart = BENCHMARKS.parent / "configs" / "campaigns" / "quickstart.yaml"
     assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
+
+
+def test_the_table_is_of_what_was_made_and_what_was_kept_is_not_made_again(
+    bench: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(bench, "Answers", Toy)
+    made: list[dict[str, Any]] = []
+
+    def here(script: str, *arguments: str) -> dict[str, Any]:
+        """What a process of its own would print."""
+        before, printed = sys.argv, io.StringIO()
+        monkeypatch.setattr(sys, "argv", [script, *arguments])
+        with contextlib.redirect_stdout(printed):
+            bench.main()
+        monkeypatch.setattr(sys, "argv", before)
+        made.append(json.loads(printed.getvalue()))
+        return made[-1]
+
+    def table(*more: str) -> list[dict[str, Any]]:
+        arguments = ["--rows", "C4=20", "--random", "2", "--known", "cohesion=0", "--once", "random", *more, "--json"]
+        monkeypatch.setattr(sys, "argv", ["calibration_strategies.py", *arguments])
+        bench.main()
+        rows: list[dict[str, Any]] = json.loads(capsys.readouterr().out.strip().splitlines()[-1])["rows"]
+        return rows
+
+    monkeypatch.setattr(bench, "run_self", here)
+    rows = table("--seeds", "11", "12")
+    assert [(row["strategy"], row["seeds"]) for row in rows] == [
+        ("defaults", 2), ("uncalibrated", 2), ("random", 1), ("C4", 2)
+    ]  # fmt: skip
+    assert len(made) == 7
+    found = [one for one in made if one["simulations"] == 20]
+    for split in ("train", "test", "transfer"):
+        values = [one["discrepancy"][split] for one in found]
+        assert rows[-1][f"{split}_seeds"] == pytest.approx(values, abs=1e-4)
+        assert rows[-1][split] == pytest.approx(sum(values) / 2, abs=1e-4)
+        low, high = rows[-1][f"{split}_interval"]
+        assert low <= rows[-1][split] <= high
+    assert [theta["cohesion"] for theta in rows[-1]["thetas_found"]] == [0.0, 0.0]
+    assert rows[0]["thetas_found"][0]["cohesion"] > 0.0
+
+    monkeypatch.setattr(bench, "run_self", lambda *arguments: pytest.fail("made again"))
+    assert table("--seeds", "11", "12") == rows
+    assert table("--seeds", "11", "12", "13", "--kept") == rows  # of the third seed nothing was made

@@ -267,7 +267,11 @@ def _as_begun(plan: CampaignPlan, directory: Path) -> CampaignPlan:
         return plan
     older = as_begun(plan, begun)
     if older is not plan:
-        say("this run began before 'deployment.model' and 'deployment.trust': it goes on with 'residual' and no policy")
+        before, today = older.deployment, plan.deployment
+        names = ("model", "trust", "noise", "refusals")
+        changed = [name for name in names if getattr(before, name) != getattr(today, name)]
+        told = ", ".join(f"{name} {getattr(before, name) or 'off'}" for name in changed)
+        say(f"this run is older than some settings of its deployment, and goes on as it began: {told}")
     return older
 
 

@@ -62,9 +62,10 @@ def read_study(path: Path) -> StudyPlan:
     from orchestrator.commands.common import check_campaign_can_run
     from orchestrator.config.errors import ConfigError
     from orchestrator.config.study import load_study
+    from orchestrator.study.folder import as_begun
 
     try:
-        plan = load_study(path)
+        plan = as_begun(load_study(path))
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
     deployment = plan.deployments[0].plan if plan.deployments else None

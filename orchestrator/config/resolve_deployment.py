@@ -92,4 +92,6 @@ def resolve_deployment(
         objectives=objectives,
         model=(section.model or NEW_MODEL) if strategy == "D3" else "residual",
         trust=TrustPlan(trust.pours, trust.limit, trust.policy) if strategy == "D3" else None,
+        noise=section.noise,
+        refusals="avoid",
     )

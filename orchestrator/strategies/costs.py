@@ -41,7 +41,7 @@ class Costing:
     def worst_vector(self) -> Vector:
         """The worst that can happen: everything spilled, or nothing poured, whichever is more.
 
-        It stands for actions that can't be made and for pours that failed, so that the optimiser keeps away.
+        It stands for pours that failed, so that the optimiser keeps away.
         """
         if self.objectives is not None:
             return tuple(2.0 * value for value in self.limits)
@@ -63,7 +63,7 @@ class Costing:
         return objectives.worst(self.scene, actions)
 
     def simulated(self, outcome: Outcome, action: Action) -> Vector | None:
-        """Of a simulation: worst for an invalid action, None for one that failed or is not to be used."""
+        """Of a simulation: worst for an action that can't be made, None for one that failed or is not to be used."""
         match outcome:
             case Simulated(result) if result.invalid is None and is_sound(result.fractions):
                 return self._vector(result.fractions, action)

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan
@@ -25,7 +26,7 @@ from orchestrator.requests import (
 from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.compromise import Compromise
 from orchestrator.strategies.costs import Costing
-from orchestrator.strategies.deployment_pours import PourTrial, trust
+from orchestrator.strategies.deployment_pours import PourTrial, former_pours, trust
 from orchestrator.strategies.display import displayed_action, displayed_map
 from orchestrator.strategies.objectives import Vector
 from orchestrator.strategies.seeds import SeedStream
@@ -33,11 +34,11 @@ from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.action import described
 from sim_engine.liquid import SimulationParameters
-from sim_engine.outcome import PourMeasurement
 from sim_engine.task import Scene
 
 MAX_REFUSED = 20
-"""Pours that may be refused (touching vessels) before a strategy gives up."""
+"""Actions that may be refused (touching vessels, out of reach) free of charge: pours before a strategy gives up, and as
+many simulations before others count against the budget."""
 
 MAP_RESOLUTION = 25
 
@@ -45,9 +46,10 @@ MAP_RESOLUTION = 25
 class Deployment(ABC):
     """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
 
-    An invalid action, simulated or poured, gets the worst cost; refused pours don't count against the budget of
-    pours, but only so many are tried. A pour that failed after something had moved counts, and enters the data
-    with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
+    An action that can't be made, because the vessels touch or the arm can't reach, is refused before anything is
+    simulated or moved. It has no cost; the optimiser is told the place, and keeps away from where another refusal is
+    likely. A refusal does not count against a budget, but only so many are free. A pour that failed after something had
+    moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
     """
 
     NAME = ""
@@ -66,7 +68,7 @@ class Deployment(ABC):
         self._trials = Trials()
         self._width_known = False
         self._pours: list[PourTrial] = []
-        self._former = self._existing()
+        self._former = () if self._data is None else former_pours(self._data, scene, plan.actions, self._costing)
         self._queued_pour: Pour | None = None
         self._pouring: Pour | None = None
         self._final: Suggestion | None = None
@@ -103,9 +105,11 @@ class Deployment(ABC):
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            self._trials.settle(
-                request, self._compromise.note(request, self._costing.simulated(outcome, request.action))
-            )
+            if self._avoids and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
+                self._trials.settle(request, None, refused=True)
+            else:
+                vector = self._costing.simulated(outcome, request.action)
+                self._trials.settle(request, self._compromise.note(request, vector))
         elif request == self._pouring:
             self._pouring = None
             self._weigh(self._pours[-1], outcome)
@@ -132,7 +136,7 @@ class Deployment(ABC):
                 trial.status, trial.reason = "failed", f"{kind}: {reason}"
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
-        if trial.status == "refused" or self._plan.on_failed_pour == "penalise":
+        if not self._avoids if trial.status == "refused" else self._plan.on_failed_pour == "penalise":
             trial.cost, trial.vector = self._costing.worst, self._costing.worst_vector
 
     # -- pieces for subclasses -------------------------------------------------------------------------------------
@@ -173,24 +177,18 @@ class Deployment(ABC):
         self._latest_map = suggestion if suggestion.surrogate is not None else self._latest_map
         known = None
         if suggestion.means and not self._compromise.exploring:
-            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion))
+            noise = suggestion.noises[0] if suggestion.noises else None
+            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise))
         self._pour(suggestion, suggestion.points[0], known)
 
-    def _scatter(self, suggestion: Suggestion) -> float | None:
+    def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
         """Standard deviation of one observation around the surrogate [the loss' unit]: from pour to pour, or in
-        simulation from seed to seed, as fitted; None without a surrogate."""
-        return (suggestion.hyperparameters or {}).get("noise")
+        simulation from seed to seed, as fitted; None without a surrogate.
 
-    def _existing(self) -> list[tuple[Point, Vector]]:
-        """Place and cost of the pours of before the campaign in this scene."""
-        pours = () if self._data is None else self._data.pours.get(self._scene.name, ())
-        space, found = self._plan.actions, []
-        for pour in pours:
-            unit = space.encode({name: getattr(pour.action, name) for name in space.names})
-            point = tuple(min(max(float(u), 0.0), 1.0) for u in unit)
-            measured = PourMeasurement(pour.poured + pour.retained, pour.spilled, pour.retained)
-            found.append((point, self._costing.poured(measured, pour.action)))
-        return found
+        Args:
+            noise: what the answer says of the place; None, as in journals of before: what it says of all.
+        """
+        return (suggestion.hyperparameters or {}).get("noise") if noise is None else noise
 
     def _real(self) -> Data:
         """Observations of the real cost, those of before the campaign first."""
@@ -215,8 +213,22 @@ class Deployment(ABC):
         return former + sum(p.status in ("weighed", "failed") for p in self._pours)
 
     @property
+    def _avoids(self) -> bool:
+        return self._plan.refusals == "avoid"
+
+    @property
     def _refused(self) -> int:
         return sum(p.status == "refused" for p in self._pours)
+
+    @property
+    def _spent(self) -> int:
+        """Simulated trials before any pour that count against their budget, as far as the next choice may know."""
+        return len(self._trials) - self._unspent
+
+    @property
+    def _unspent(self) -> int:
+        counting = self._trials.counting(everything=self._trials.idle)
+        return min(sum(t.refused and t.requests[0].purpose != "refine" for t in counting), MAX_REFUSED)
 
     @property
     def _pours_left(self) -> bool:
@@ -262,8 +274,23 @@ class Deployment(ABC):
         else:
             self.decisions.append(Decision(f"{text}  (no surrogate yet)"))
 
-    def _problem(self, data: Data, **changes: object) -> SuggestProblem:
-        return SuggestProblem(self._plan.actions, data, kappa=self._plan.kappa, **changes)  # type: ignore[arg-type]
+    def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
+        """A question about the loss.
+
+        Args:
+            everything: use all refusals of simulations; else those that the next choice may know.
+            changes: fields of the problem.
+        """
+        trials = self._trials.counting(everything=everything)
+        return SuggestProblem(
+            self._plan.actions,
+            data,
+            kappa=self._plan.kappa,
+            infeasible=tuple(trial.point for trial in trials if trial.refused),
+            refused=tuple(p.point for p in self._pours if p.status == "refused") if self._avoids else (),
+            noise=self._plan.noise,
+            **changes,
+        )
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -291,6 +318,7 @@ class Deployment(ABC):
             "loss": self._plan.loss_name,
             "simulations": self._trials.answered,
             "simulations_lost": self._trials.lost,
+            "simulations_refused": sum(trial.refused for trial in self._trials.all),
             "pours": [p.row(self._compromise.names) for p in self._pours if p.status != "pouring"],
             "former_pours": len(self._former),
             "refused_pours": self._refused,
@@ -318,7 +346,7 @@ class Deployment(ABC):
                 "action_si": values,
                 "predicted_loss": self._final.best_mean,
                 "predicted_deviation": self._final.best_deviation,
-                "predicted_scatter": self._scatter(self._final),
+                "predicted_scatter": self._scatter(self._final, self._final.best_noise),
                 "hyperparameters": self._final.hyperparameters,
             }
         return result

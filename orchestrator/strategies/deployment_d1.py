@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan
@@ -46,7 +47,7 @@ class OneShotPlanning(Deployment):
             self._spillages[request] = normalised_spillage(outcome.outcome.fractions)
 
     def _next(self, free_simulations: int) -> None:
-        done, wanted = len(self._trials), max(self._plan.iterations, 1)
+        done, wanted = self._spent, max(self._plan.iterations, 1)
         repeats = max(self._plan.simulations_per_iteration, 1)
         if self._width_known and self._trials.all == []:
             # slots count simulations, a trial takes `repeats` of them
@@ -56,9 +57,13 @@ class OneShotPlanning(Deployment):
             self._simulate(suggestion, "plan", repeats=repeats)
 
         if self._final is not None:
-            if self._pouring is None:  # the one pour has been weighed
+            if self._pouring is not None:
+                return
+            if self._counted == 0 and self._avoids and self._pours_left:  # it was refused
+                self._recommend_again()
+            else:  # the one pour has been weighed
                 self._finish()
-        elif done == 0:
+        elif len(self._trials) == 0:
             count = min(max(self._plan.initial, 1), max(wanted - 1, 1))
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif done < wanted - 1:
@@ -68,13 +73,17 @@ class OneShotPlanning(Deployment):
             if self._trials.idle:
                 self._questions.put(self._model(everything=True, acquisition="posterior_minimum"), "plan", simulate)
         elif self._trials.idle:
-            problem = self._model(everything=True, count=0, map_resolution=MAP_RESOLUTION)
-            self._questions.put(problem, "conclude", self._recommend)
+            self._recommend_again()
 
-    def _model(self, *, everything: bool = False, **changes: object) -> SuggestProblem:
+    def _recommend_again(self) -> None:
+        problem = self._model(everything=True, count=0, map_resolution=MAP_RESOLUTION)
+        self._questions.put(problem, "conclude", self._recommend)
+
+    def _model(self, *, everything: bool = False, **changes: Any) -> SuggestProblem:
         self._compromise.weigh(exploring=not everything)
         data = self._simulated(everything=everything)
-        return self._problem(data, pending=self._trials.pending(everything=everything), **changes)
+        pending = self._trials.pending(everything=everything)
+        return self._problem(data, everything=everything, pending=pending, **changes)
 
     def _recommend(self, suggestion: Suggestion) -> None:
         self._final = suggestion
@@ -83,19 +92,21 @@ class OneShotPlanning(Deployment):
         elif self._plan.pours < 1:
             self._finish()
         else:
-            prediction = Prediction(suggestion.best_mean, suggestion.best_deviation, self._scatter(suggestion))
+            scatter = self._scatter(suggestion, suggestion.best_noise)
+            prediction = Prediction(suggestion.best_mean, suggestion.best_deviation, scatter)
             self._pour(suggestion, suggestion.best_point, prediction)
 
-    def _scatter(self, suggestion: Suggestion) -> float | None:
+    def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
         """Of a single seed: what is observed here are means of m1 of them."""
-        noise = super()._scatter(suggestion)
-        return None if noise is None else noise * math.sqrt(max(self._plan.simulations_per_iteration, 1))
+        of_means = super()._scatter(suggestion, noise)
+        return None if of_means is None else of_means * math.sqrt(max(self._plan.simulations_per_iteration, 1))
 
     def progress(self) -> tuple[int, int]:
         """Simulations and pours done, and in all."""
         repeats = max(self._plan.simulations_per_iteration, 1)
         pours = 1 if self._plan.pours else 0
-        return self._trials.answered + self._counted, max(self._plan.iterations, 1) * repeats + pours
+        answered = self._trials.answered - repeats * self._unspent
+        return answered + self._counted, max(self._plan.iterations, 1) * repeats + pours
 
     def result(self) -> dict[str, object]:
         """As every deployment; with r = spilled / poured over the simulations of the recommended action.

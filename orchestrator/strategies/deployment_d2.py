@@ -22,7 +22,8 @@ class RealOnly(Deployment):
             return
         self._compromise.weigh(exploring=self._pours_left)
         if self._pours_left:
-            known = [*(point for point, _ in self._former), *(p.point for p in self._pours)]
+            made = [p for p in self._pours if not (self._avoids and p.status == "refused")]
+            known = [*(point for point, _ in self._former), *(p.point for p in made)]
             if len(known) < min(self._plan.initial, self._plan.pours):
                 # one Sobol sequence, point by point, each far from those poured
                 tried = Data(tuple(known), tuple(0.0 for _ in known))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from actors.optimizer.core.problem import Data, MeanName, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan, ModelName
@@ -69,7 +70,7 @@ class Hybrid(Deployment):
     def _next(self, free_simulations: int) -> None:
         if self._check is not None and self._pouring is None and (pours := self._check.due(self._pours)):
             self._compare(self._check, pours)
-        elif len(self._trials) < self._plan.prior_simulations and not self._pours:
+        elif self._spent < self._plan.prior_simulations and not self._pours:
             self._next_prior()
         elif self._pouring is not None:
             if self._plan.per_pour is None and free_simulations > 0 and self._followed != "D2":
@@ -115,7 +116,7 @@ class Hybrid(Deployment):
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif self._trials.ready:
             self._compromise.weigh(exploring=True)
-            problem = self._problem(self._simulated(), pending=self._trials.pending())
+            problem = self._problem(self._simulated(), everything=False, pending=self._trials.pending())
             self._questions.put(problem, "prior", simulate)
 
     def _next_pour(self) -> None:
@@ -141,11 +142,11 @@ class Hybrid(Deployment):
         problem = self._hybrid(count=count, pending=(*self._trials.pending(everything=True), self._pours[-1].point))
         self._questions.put(problem, "refine", simulate)
 
-    def _hybrid(self, **changes: object) -> SuggestProblem:
+    def _hybrid(self, **changes: Any) -> SuggestProblem:
         self._compromise.weigh(exploring=changes.get("count") != 0)
         return self._informed(self._real(), self._simulated(everything=True), **changes)
 
-    def _informed(self, poured: Data, simulated: Data, **changes: object) -> SuggestProblem:
+    def _informed(self, poured: Data, simulated: Data, **changes: Any) -> SuggestProblem:
         """A question about the real cost, with what the simulations are still good for."""
         match self._followed:
             case "D2":
@@ -166,7 +167,8 @@ class Hybrid(Deployment):
     def progress(self) -> tuple[int, int]:
         """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
         simulations = self._plan.prior_simulations + self._plan.pours * (self._plan.per_pour or 0)
-        done = min(self._trials.answered, simulations) if self._plan.per_pour is None else self._trials.answered
+        answered = self._trials.answered - self._unspent
+        done = min(answered, simulations) if self._plan.per_pour is None else answered
         if self._followed == "D2":  # those that will not be made any more
             simulations = done
         return done + min(self._counted, self._plan.pours), simulations + self._plan.pours

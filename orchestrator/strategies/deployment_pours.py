@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from actors.optimizer.core.problem import Point
+from orchestrator.plan import ExistingPours
 from orchestrator.requests import Prediction
+from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.objectives import Vector
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
+from sim_engine.space import Space
+from sim_engine.task import Scene
 
 TRUST_POURS = 5
 TRUST_LIMIT = 3.0
@@ -57,6 +61,19 @@ class PourTrial:
             "spilled_g": None if weighed is None else weighed.spilled * 1e3,
             "retained_g": None if weighed is None else weighed.retained * 1e3,
         }
+
+
+def former_pours(
+    data: ExistingPours, scene: Scene, actions: Space, costing: Costing
+) -> tuple[tuple[Point, Vector], ...]:
+    """Place and objectives of the pours of before the campaign in a scene."""
+    found = []
+    for pour in data.pours.get(scene.name, ()):
+        unit = actions.encode({name: getattr(pour.action, name) for name in actions.names})
+        point = tuple(min(max(float(u), 0.0), 1.0) for u in unit)
+        measured = PourMeasurement(pour.poured + pour.retained, pour.spilled, pour.retained)
+        found.append((point, costing.poured(measured, pour.action)))
+    return tuple(found)
 
 
 def trust(weighed: Sequence[PourTrial]) -> dict[str, object]:

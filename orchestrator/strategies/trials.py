@@ -18,12 +18,14 @@ class Trial:
         requests: to be averaged over.
         costs: of each request: a number, None if it came to nothing; missing while its answer is out.
         context: further coordinates of the observation; see `SuggestProblem.context`.
+        refused: some request was, as one that can't be made: it has no cost, and is not lost either.
     """
 
     point: Point
     requests: tuple[Simulate, ...]
     context: Point = ()
     costs: dict[int, float | None] = field(default_factory=dict)
+    refused: bool = False
 
     @property
     def closed(self) -> bool:
@@ -68,8 +70,8 @@ class Trials:
             issued.append(request)
         return issued
 
-    def settle(self, request: Simulate, cost: float | None) -> Trial:
-        """Enter what came of a simulation (None: nothing).
+    def settle(self, request: Simulate, cost: float | None, *, refused: bool = False) -> Trial:
+        """Enter what came of a simulation (None: nothing), or that it was refused.
 
         Raises:
             ValueError: it was not asked for, or has been answered already.
@@ -81,6 +83,7 @@ class Trials:
         if not waiting:
             del self._open[request]
         self.all[trial].costs[index] = cost
+        self.all[trial].refused |= refused
         return self.all[trial]
 
     @property
@@ -124,5 +127,5 @@ class Trials:
 
     @property
     def lost(self) -> int:
-        """Simulations that came to nothing."""
-        return sum(cost is None for trial in self.all for cost in trial.costs.values())
+        """Simulations that came to nothing, though they were not refused."""
+        return sum(cost is None for trial in self.all if not trial.refused for cost in trial.costs.values())

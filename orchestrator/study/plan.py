@@ -8,7 +8,7 @@ from typing import Any
 
 from actors.bench.spec import VirtualBenchSpec
 from orchestrator.codec import to_json
-from orchestrator.fingerprint import fingerprint
+from orchestrator.fingerprint import fingerprint, without_newest
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 
 
@@ -109,7 +109,7 @@ def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
         "base": base,
         "levels": {level.name: to_json(level.bench, VirtualBenchSpec) for level in study.levels},
         "calibrations": {arm.plan.strategy: to_json(arm.plan, CalibrationPlan) for arm in study.calibrations},
-        "deployments": {arm.label: to_json(arm.plan, DeploymentPlan) for arm in study.deployments},
+        "deployments": {arm.label: without_newest(to_json(arm.plan, DeploymentPlan)) for arm in study.deployments},
         "pours": [study.pour_count, study.holdout],
         "compared": study.compared,
     }

@@ -26,7 +26,7 @@ from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.stages import CALIBRATION
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import Cell, cells_of
-from orchestrator.study.folder import read_result, run_folder, write_result
+from orchestrator.study.folder import as_begun, read_result, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
 
 
@@ -105,7 +105,7 @@ def work(path: Path, make: Callable[[LaboratorySpec, bool], Laboratory] = labora
     # Libraries print to stdout, which is for answers alone: from here on they print to the log.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    study = load_study(path)
+    study = as_begun(load_study(path))
     cells = {cell.id: cell for cell in cells_of(study)}
     for name in named_cells():
         problem = None

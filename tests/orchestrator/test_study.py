@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from orchestrator.config.check import touch
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.study import load_study
 from orchestrator.study.cells import cells_of
-from orchestrator.study.folder import RESULT, StudyError, finished_results, is_finished, opened, run_folder
+from orchestrator.study.folder import RESULT, StudyError, as_begun, finished_results, is_finished, opened, run_folder
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.worker import run_cell
 from sim_engine.vessel.build import build_vessel
@@ -264,6 +265,22 @@ def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None
     assert "not a journal" in status.failed["calibration.small.C4.01"]
     assert status.skipped == {"deployment.small.D3.deployment-narrow.01"}, "it needs the θ* that there is none of"
     assert len(status.finished) == len(cells_of(study)) - 2
+
+
+def test_a_study_from_before_goes_on_with_what_its_deployments_began_with(tmp_path: Path) -> None:
+    today = small(tmp_path)
+    assert {(arm.plan.noise, arm.plan.refusals) for arm in today.deployments} == {("varying", "avoid")}
+    arms = tuple(
+        replace(arm, plan=replace(arm.plan, noise="constant", refusals="penalise")) for arm in today.deployments
+    )
+    with opened(replace(today, deployments=arms)) as folder:
+        begun = json.loads((folder / "study.json").read_text(encoding="utf-8"))["deployments"]
+    assert not any({"noise", "refusals"} & set(arm) for arm in begun.values())  # as it was before there were any
+    with pytest.raises(StudyError, match="begun with other settings"), opened(today):
+        pass
+    assert as_begun(today).deployments == arms
+    with opened(as_begun(today)):
+        pass
 
 
 def test_settings_may_not_change_under_a_study_but_repetitions_may_be_added(tmp_path: Path) -> None:

@@ -32,12 +32,13 @@ def check(problem: SuggestProblem) -> None:
     _check_points("simulated", problem.simulated.points, dimension)
     _check_points("pending", problem.pending, dimension)
     _check_points("infeasible", problem.infeasible, dimension)
+    _check_points("refused", problem.refused, dimension)
     _check_points("predict_at", problem.predict_at, dimension)
     for name, data in (("data", problem.data), ("simulated", problem.simulated)):
         for index, cost in enumerate(data.costs):
             if not math.isfinite(cost) or abs(cost) > 1e12:
                 raise ValueError(f"{name}: cost {index} is {cost}; leave failed trials out, or penalise them")
-    observations = len(problem.data) + len(problem.simulated) + len(problem.infeasible)
+    observations = len(problem.data) + len(problem.simulated) + len(problem.infeasible) + len(problem.refused)
     if observations > MAX_OBSERVATIONS:
         raise ValueError(f"{observations} observations and refusals, but at most {MAX_OBSERVATIONS} can be fitted")
     for name, value, limit in (

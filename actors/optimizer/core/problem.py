@@ -110,6 +110,7 @@ class SuggestProblem:
             `space.dimension` coordinates followed by those of the context.
         infeasible: places where a request was refused. They say nothing about the cost; proposals keep away from places
             where another refusal is likely.
+        refused: the same of real requests: what was only simulated does not say that a place can really be had.
         constraints: that every proposal meets.
         noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
         widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
@@ -129,6 +130,7 @@ class SuggestProblem:
     predict_at: tuple[Point, ...] = ()
     context: tuple[Point, ...] = ()
     infeasible: tuple[Point, ...] = ()
+    refused: tuple[Point, ...] = ()
     constraints: tuple[Linear, ...] = ()
     noise: NoiseName = "constant"
     widening: float = 1.0
@@ -172,7 +174,7 @@ class Suggestion:
         means: posterior means there; NaN-free; empty if no surrogate was fitted (too few data, or only drawn).
         deviations: posterior standard deviations of the noise-free cost there.
         best_point: minimiser of the posterior mean over the observed points (the simulated ones while nothing else was
-            observed); None without a surrogate.
+            observed) that were not refused, nor probably are; None without a surrogate.
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
         hyperparameters: fitted values by name (for people and plots); 'noise' and 'signal' in the cost's unit.
@@ -183,6 +185,7 @@ class Suggestion:
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
         feasibilities: probabilities that the proposals are not refused; empty while nothing was.
         posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
+        best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
     """
 
     points: tuple[Point, ...]
@@ -199,3 +202,4 @@ class Suggestion:
     noises: tuple[float, ...] = ()
     feasibilities: tuple[float, ...] = ()
     posterior: Posterior | None = None
+    best_noise: float | None = None

@@ -64,9 +64,7 @@ def _answer(problem: SuggestProblem) -> Suggestion:
     rng = np.random.default_rng(problem.seed)
     asked = _Asked.of(problem)
     model = _fit(problem, asked)
-    feasibility = None
-    if len(asked.refused):
-        feasibility = Feasibility(asked.seen, asked.refused)
+    feasibility = asked.feasibility()
 
     if problem.acquisition == "random":
         points = asked.region.draw(problem.count, rng, even=False)
@@ -78,7 +76,7 @@ def _answer(problem: SuggestProblem) -> Suggestion:
 
     answer: dict[str, object] = {}
     if model is not None:
-        answer = _describe(problem, asked, model, points)
+        answer = _describe(problem, asked, model, points, feasibility)
     if model is not None and problem.posterior is not None:
         answer["posterior"] = _posterior(problem, problem.posterior, asked.region, model, rng)
     if feasibility is not None and len(points):
@@ -99,7 +97,8 @@ class _Asked:
         known: (n, dimension), the same without context.
         simulated: (k, dimension), with their costs (k,).
         busy: (b, dimension).
-        refused: (r, dimension).
+        infeasible: (i, dimension), refused of any kind of request.
+        really_refused: (r, dimension), of real ones.
     """
 
     region: Region
@@ -109,7 +108,8 @@ class _Asked:
     simulated: Array
     simulated_costs: Array
     busy: Array
-    refused: Array
+    infeasible: Array
+    really_refused: Array
 
     @classmethod
     def of(cls, problem: SuggestProblem) -> _Asked:
@@ -129,12 +129,24 @@ class _Asked:
             simulated_costs,
             region.snap(_array(sorted(problem.pending), dimension)),
             region.snap(_array(sorted(problem.infeasible), dimension)),
+            region.snap(_array(sorted(problem.refused), dimension)),
         )
 
     @property
     def seen(self) -> Array:
         """Where the cost was observed: really or in simulation; (n + k, dimension)."""
         return np.concatenate([self.known, self.simulated])
+
+    @property
+    def refused(self) -> Array:
+        """Where anything was refused: (i + r, dimension)."""
+        return np.concatenate([self.infeasible, self.really_refused])
+
+    def feasibility(self) -> Feasibility | None:
+        """How likely requests are not refused; None while none was."""
+        kinds = [(self.seen, self.infeasible), (self.known, self.really_refused)]
+        told = [(fulfilled, refused) for fulfilled, refused in kinds if len(refused)]
+        return Feasibility(*told) if told else None
 
 
 @dataclass(frozen=True)
@@ -233,9 +245,13 @@ def _looks_round(problem: SuggestProblem, asked: _Asked, model: _Model, index: i
     return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
 
 
-def _describe(problem: SuggestProblem, asked: _Asked, model: _Model, points: Array) -> dict[str, object]:
+def _describe(
+    problem: SuggestProblem, asked: _Asked, model: _Model, points: Array, feasibility: Feasibility | None
+) -> dict[str, object]:
     """What the surrogate says about the proposals, the observations and the rest."""
     known = asked.known if len(asked.known) else asked.simulated
+    if feasibility is not None:
+        known = known[feasibility.likely(known)]
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
     at_known, known_deviations = model.surrogate.predict(known)
     best = int(np.argmin(at_known))
@@ -247,6 +263,7 @@ def _describe(problem: SuggestProblem, asked: _Asked, model: _Model, points: Arr
         "best_point": tuple(map(float, known[best])),
         "best_mean": float(at_known[best]),
         "best_deviation": float(known_deviations[best]),
+        "best_noise": None if problem.context else float(process.noise_at(known[best : best + 1])[0]),
         "hyperparameters": {
             "signal": process.signal,
             "noise": process.noise,

@@ -89,26 +89,48 @@ class Feasibility:
     """How likely a request at a place is not refused, from where some were and where others were not.
 
     A GP of the label (1 fulfilled, −1 refused) with prior mean 1: what nobody asked for is taken to be allowed. The
-    probability is that of a positive latent label.
+    probability is that of a positive latent label; of several kinds of request, which may be refused for other reasons,
+    the product.
 
     Source: least-squares classification, Rasmussen & Williams, chapter 6.5; weighing an acquisition by it: Gardner et
         al., Bayesian optimization with inequality constraints, ICML 2014.
     """
 
-    def __init__(self, fulfilled: Array, refused: Array) -> None:
-        """Fit to points (n, dimension) and (k ≥ 1, dimension); what is among both counts as refused."""
-        if len(fulfilled):
-            fulfilled = fulfilled[cdist(fulfilled, refused).min(axis=1) > _SAME]
-        points = np.concatenate([fulfilled, refused])
-        labels = np.where(np.arange(len(points)) < len(fulfilled), 1.0, -1.0)
-        self._process = GaussianProcess(
-            labels, Covariance(points, _LABEL_PRIOR), mean=lambda x: np.ones(len(x)), scale=1.0
-        )
+    def __init__(self, *kinds: tuple[Array, Array]) -> None:
+        """Fit.
+
+        Args:
+            kinds: of each kind of request, where it was fulfilled (n, dimension) and where it was refused
+                (k ≥ 1, dimension); what is among both counts as refused.
+        """
+        self._processes = [_labelled(fulfilled, refused) for fulfilled, refused in kinds]
+        self._refused = np.concatenate([refused for _, refused in kinds])
 
     def log_probability(self, points: Array) -> Array:
         """(m,) at points (m, dimension)."""
-        mean, deviation = self._process.predict(points)
-        return np.asarray(log_ndtr(mean / np.hypot(deviation, self._process.noise)))
+        total = np.zeros(len(points))
+        for process in self._processes:
+            mean, deviation = process.predict(points)
+            total += log_ndtr(mean / np.hypot(deviation, process.noise))
+        return total
+
+    def likely(self, points: Array) -> Mask:
+        """Which points (m, dimension) were not refused and more likely than not are not: (m,).
+
+        If that leaves none, all that were not refused; if that leaves none either, all.
+        """
+        other = cdist(points, self._refused).min(axis=1) > _SAME
+        likely = other & (self.log_probability(points) > -math.log(2.0))
+        return likely if likely.any() else (other if other.any() else np.ones(len(points), dtype=np.bool_))
+
+
+def _labelled(fulfilled: Array, refused: Array) -> GaussianProcess:
+    """GP of the label, from points (n, dimension) and (k, dimension)."""
+    if len(fulfilled):
+        fulfilled = fulfilled[cdist(fulfilled, refused).min(axis=1) > _SAME]
+    points = np.concatenate([fulfilled, refused])
+    labels = np.where(np.arange(len(points)) < len(fulfilled), 1.0, -1.0)
+    return GaussianProcess(labels, Covariance(points, _LABEL_PRIOR), mean=lambda x: np.ones(len(x)), scale=1.0)
 
 
 def _values(axis: Axis, units: Array) -> Array:
