@@ -28,7 +28,14 @@ _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "han
 
 _YOUNGER: dict[str, dict[str, Any]] = {
     "calibration": {"grid": {}, "thetas": 0},
-    "deployment": {"data": None, "objectives": None, "model": "residual", "trust": None},
+    "deployment": {
+        "data": None,
+        "objectives": None,
+        "model": "residual",
+        "trust": None,
+        "risk": None,
+        "tolerance": None,
+    },
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
 

@@ -222,9 +222,13 @@ class Quantity:
         kind = KINDS.get(self.unit, self.unit)
         if self.unit == "1":
             bounds = {"minimum": self.lower, "maximum": self.upper}
-            return {"type": "integer" if self.whole else "number"} | {
+            number: dict[str, Any] = {"type": "integer" if self.whole else "number"} | {
                 key: bound for key, bound in bounds.items() if math.isfinite(bound)
             }
+            if self.display == "1":
+                return number
+            share = {"type": "string", "pattern": r"^\s*(\d[\d_]*\.?\d*|\.\d+)\s*%\s*$", "examples": [self.example]}
+            return {"anyOf": [number, share]}
         form: dict[str, Any] = {
             "type": "string",
             "pattern": r"^\s*[-+]?(\d[\d_]*\.?\d*|\.\d+)([eE][-+]?\d+)?\s*\S+",

@@ -31,7 +31,7 @@ from orchestrator.strategies.objectives import Vector
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
-from sim_engine.action import described
+from sim_engine.action import Action, described
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.task import Scene
@@ -141,13 +141,13 @@ class Deployment(ABC):
         """Queue simulations of the suggested points, from the `first`."""
         for i, point in enumerate(suggestion.points[first:], start=first):
             values = self._plan.actions.decode(point)
-            action = self._scene.action(values)
-            requests = tuple(
-                Simulate(self._scene.name, action, self._parameters, self._seeds.next(), purpose)
-                for _ in range(repeats)
-            )
-            self._trials.add(Trial(point, requests))
+            self._trials.add(Trial(point, self._repeated(self._scene.action(values), purpose, repeats)))
             self._decide(f"simulate ({purpose})", values, suggestion, i)
+
+    def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
+        """Simulations of one action."""
+        name, parameters = self._scene.name, self._parameters
+        return tuple(Simulate(name, action, parameters, self._seeds.next(), purpose) for _ in range(repeats))
 
     def _pour(self, suggestion: Suggestion, point: Point, prediction: Prediction | None) -> None:
         """Queue a pour."""
