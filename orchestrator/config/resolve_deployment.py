@@ -112,11 +112,11 @@ def _resolve_risk(section: DeploymentSection, place: Place, builder: SceneBuilde
             report.add(place.at(key), "is about a loss; it can't be combined with 'objectives'", key=True)
     if risk is None:
         return None
-    if risk.level is not None and risk.measure != "cvar":
-        report.add(place.at("risk", "level"), "belongs to 'measure: cvar'; remove it, or ask for cvar", key=True)
-    errors = PoseError(**risk.pose_error.model_dump())
     at = place.at("risk")
     broken = any(path == at.document.path and loc[: len(at.loc)] == at.loc for path, loc in report.broken)
+    if risk.level is not None and risk.measure != "cvar" and not broken:
+        report.add(at.at("level"), "belongs to 'measure: cvar'; remove it, or ask for cvar", key=True)
+    errors = PoseError(**risk.pose_error.model_dump())
     if errors == EXACT and risk.theta == "best" and not broken:
         report.add(
             at,

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan
-from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated
+from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment import MAP_RESOLUTION, Deployment
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial
@@ -44,6 +44,12 @@ class OneShotPlanning(Deployment):
         self._spillages: dict[Simulate, float | None] = {}
         self._window: SafeWindow | None = None
         self._searched: list[Trial] = []
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """As every deployment; checks of the window, and the pour after them, follow from no answer of the optimiser:
+        they are asked for at once."""
+        requests = super().ask(slots)
+        return requests if requests or self._window is None else super().ask(slots)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """As every deployment; and how much each simulation spilled, whatever the loss is."""
@@ -100,12 +106,7 @@ class OneShotPlanning(Deployment):
             window = SafeWindow(self._plan.actions, suggestion.best_point, self._tolerated(self._plan.tolerance))
             problem = replace(self._model(everything=True, count=0), predict_at=window.places)
 
-            def outlined(outline: Suggestion) -> None:
-                self._window = window
-                window.outline(outline.predictions, () if outline.risk is None else outline.risk.worst)
-                self._check_window(window)
-
-            self._questions.put(problem, "window", outlined)
+            self._questions.put(problem, "window", lambda outline: self._outlined(window, problem, outline))
 
     def _use(self, suggestion: Suggestion) -> None:
         """Pour what is recommended, or leave it at that."""
@@ -132,20 +133,30 @@ class OneShotPlanning(Deployment):
         assert all_spilled is not None
         return share * all_spilled
 
+    def _outlined(self, window: SafeWindow, problem: SuggestProblem, outline: Suggestion) -> None:
+        """The surrogate's answer for the window's places is there: go on with checks."""
+        window.outline(outline.predictions, () if outline.risk is None else outline.risk.worst)
+        self._window = window
+        self._check_window(window)
+
     def _check_window(self, window: SafeWindow) -> None:
         """Judge what was simulated of the window; simulate what is left to check, or conclude."""
         if window.waiting:
             tried = self._trials.all[-len(window.waiting) :]
             for check, trial in zip(tuple(window.waiting), tried, strict=True):
                 window.judge(check, trial.cost)
-        repeats = max(self._plan.simulations_per_iteration, FEWEST_CHECKS)
         for check in window.next_checks():
             action = self._scene.action(self._plan.actions.decode(check.point))
-            self._trials.add(Trial(check.point, self._checking(action, window.worst(check), repeats)))
+            self._trials.add(Trial(check.point, self._checking(action, window.worst(check), self._checks)))
             self.decisions.append(Decision(f"check {check.what}  {described(self._plan.actions.decode(check.point))}"))
         if window.closed:
             assert self._final is not None
             self._use(self._final)
+
+    @property
+    def _checks(self) -> int:
+        """Simulations of one place."""
+        return max(self._plan.simulations_per_iteration, FEWEST_CHECKS)
 
     def _checking(self, action: Action, worst: Sequence[int], repeats: int) -> tuple[Simulate, ...]:
         """Simulations that tell whether an action is inside the window; `worst`: see `RiskAnswer`."""

@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
+from actors.optimizer.core.problem import Data, Point, Risk, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan, RiskPlan
 from orchestrator.requests import Failed, Outcome, Prediction, Request, Simulate
 from orchestrator.strategies.deployment_d1 import OneShotPlanning
 from orchestrator.strategies.risk import Disturbances, Draw
+from orchestrator.strategies.window import SafeWindow
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
@@ -42,7 +43,7 @@ class RobustPlanning(OneShotPlanning):
         self._risk: RiskPlan = plan.risk
         self._disturbances = Disturbances(plan.risk, plan.actions, parameters, self._seeds.next())
         self._sequence = self._disturbances.draws(max(plan.iterations, 1) * max(plan.simulations_per_iteration, 1))
-        self._used = self._checked = 0
+        self._used = 0
         self._draws: dict[Simulate, Draw] = {}
         self._touching: set[Action] = set()
         self._candidates: tuple[Point, ...] = ()
@@ -54,11 +55,28 @@ class RobustPlanning(OneShotPlanning):
         begin, self._used = self._used, self._used + repeats - 1
         return self._under(action, purpose, [self._disturbances.nominal, *self._sequence[begin : self._used]])
 
+    def _outlined(self, window: SafeWindow, problem: SuggestProblem, outline: Suggestion) -> None:
+        """For a mean, what the surrogate expects of just the draws that checks are made with has to be known, too."""
+        if problem.risk is None or problem.risk.level > 0.0:
+            super()._outlined(window, problem, outline)
+            return
+        few = tuple(self._disturbances.disturbance(draw) for draw in self._check_draws)
+
+        def known(expected: Suggestion) -> None:
+            window.allow_for(outline.predictions, expected.predictions)
+            super(RobustPlanning, self)._outlined(window, problem, outline)
+
+        self._questions.put(replace(problem, risk=Risk(few)), "window", known)
+
+    @property
+    def _check_draws(self) -> list[Draw]:
+        return self._disturbances.draws(self._checks, FRESH)
+
     def _checking(self, action: Action, worst: Sequence[int], repeats: int) -> tuple[Simulate, ...]:
-        """For a mean, an even stretch of fresh draws; for CVaR, some of those that the surrogate has for the worst."""
-        begin, self._checked = self._checked, self._checked + repeats
+        """For a mean, the same few draws at every place; for CVaR, some of those that the surrogate has for the worst:
+        the mean over any choice of as large a share of all is no more than CVaR."""
         if not worst:
-            return self._under(action, "window", self._disturbances.draws(self._checked, FRESH)[begin:])
+            return self._under(action, "window", self._check_draws)
         tried = self._disturbances.tried(max(worst) + 1)
         return self._under(action, "window", [tried[worst[i * len(worst) // repeats]] for i in range(repeats)])
 

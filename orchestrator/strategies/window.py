@@ -93,6 +93,7 @@ class SafeWindow:
         self._actions, self._centre, self._tolerance = actions, centre, tolerance
         self._sides: dict[tuple[str, Way], _Side] = {(name, way): _Side() for name in actions.names for way in _WAYS}
         self._worst: dict[Point, tuple[int, ...]] = {}
+        self._rest: dict[Point, float] = {}
         self._losses: dict[Check, float | None] = {}
         self._expected: dict[tuple[str, Way], tuple[float, ...]] = {}
         self._round = 0
@@ -115,6 +116,17 @@ class SafeWindow:
                 continue
             side.edge = next((i for i, value in enumerate(expected) if value > self._tolerance), PLACES)
 
+    def allow_for(self, expected: Sequence[float], of_few: Sequence[float]) -> None:
+        """Checks are made with few disturbances: what the surrogate expects of all, and of these few, at `places`.
+
+        What is judged is simulated + expected − expected of the few: the luck of the few is allowed for, as far as the
+        surrogate knows it, and what it does not know is simulated.
+
+        Source: control variates: Glasserman, Monte Carlo methods in financial engineering, 2003, chapter 4.
+        """
+        rest = (all_of_them - few for all_of_them, few in zip(expected, of_few, strict=True))
+        self._rest = dict(zip(self.places, rest, strict=True))
+
     def worst(self, check: Check) -> tuple[int, ...]:
         """Indices of the disturbances that are the worst there; empty without a tail."""
         return self._worst.get(check.point, ())
@@ -136,7 +148,7 @@ class SafeWindow:
     def judge(self, check: Check, loss: float | None) -> None:
         """What came of a check: mean loss of its simulations; None, nothing that could be used, is no pass."""
         self.waiting.remove(check)
-        self._losses[check] = loss
+        self._losses[check] = None if loss is None else max(loss + self._rest.get(check.point, 0.0), 0.0)
         if check.axis:
             side = self._sides[check.axis, check.way]
             (side.failed if self._fails(check) else side.passed).add(check.place)
