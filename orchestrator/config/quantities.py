@@ -200,9 +200,10 @@ class Quantity:
     def bounds(self) -> str:
         """The bounds in the unit that people write."""
         factor = 1.0
-        unit = "" if self.unit == "1" else f" {self.display}"
+        unit = "" if self.display == "1" else f" {self.display}"
         if unit:
-            factor = float(registry().convert(1.0, registry().parse_units(self.display), self.unit))
+            si = "" if self.unit == "1" else self.unit
+            factor = float(registry().convert(1.0, registry().parse_units(self.display), si))
         if math.isinf(self.upper):
             return f"{self.lower / factor:g}{unit} and more"
         if math.isinf(self.lower):

@@ -83,7 +83,7 @@ def test_a_run_without_a_risk_has_the_fingerprint_that_it_always_had(tmp_path: P
         ({"risk": {**RISK, "theta": "all"}}, "posterior"),
         ({"risk": RISK, "simulations_per_iteration": 1}, "at least 2 are needed"),
         ({"window": {}}, "tolerance"),
-        ({"window": {"tolerance": "2"}}, "outside 0.0001 … 1"),
+        ({"window": {"tolerance": "2"}}, "outside 0.01 … 100 %"),
         ({"strategy": "D2", "pours": 5, "risk": RISK}, "belongs to D1, not to D2"),
         ({"strategy": "D3", "pours": 5, "window": {"tolerance": "2 %"}}, "belongs to D1, not to D3"),
         ({"risk": RISK, "objectives": [{"name": "spillage"}]}, "can't be combined with 'objectives'"),
