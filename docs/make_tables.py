@@ -40,6 +40,8 @@ SECTIONS: dict[str, type[Section]] = {
     "transfer": campaign.TransferSection,
     "deployment": campaign.DeploymentSection,
     "trust": campaign.TrustSection,
+    "risk": campaign.RiskSection,
+    "window": campaign.WindowSection,
     "data": campaign.DataSection,
     "loss": campaign.LossSection,
     "objective": campaign.ObjectiveSection,
@@ -79,6 +81,8 @@ OF_SECTIONS = {
     "LossSection": "[loss](#losses)",
     "ObjectiveSection": "[objective](#objectives)",
     "TrustSection": "[trust](#trust)",
+    "RiskSection": "[risk](#risk-and-the-safe-window)",
+    "WindowSection": "[window](#risk-and-the-safe-window)",
     "DataSection": "[data](#existing-data)",
     "ProfileSection": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
@@ -214,7 +218,7 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     quantity = next((m for m in metadata if isinstance(m, Quantity)), None)
     if quantity is not None:
         words = "".join(f" or `{word}`" for word in quantity.words)
-        bounds = f"number, {quantity.bounds()}" if quantity.unit == "1" else quantity.bounds()
+        bounds = f"number, {quantity.bounds()}" if quantity.display == "1" else quantity.bounds()
         if quantity.positive:
             bounds = f"above 0, up to {bounds.removesuffix(' and less').removeprefix('0 … ')}"
         return bounds + words

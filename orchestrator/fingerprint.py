@@ -35,6 +35,8 @@ _YOUNGER: dict[str, dict[str, Any]] = {
         "trust": None,
         "noise": "constant",
         "refusals": "penalise",
+        "risk": None,
+        "tolerance": None,
     },
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""

@@ -88,7 +88,14 @@ class Lanes:
             started: called when it is handed to the pool.
         """
         rate = self._record_rate if record else 0.0
-        task = PourTask(self._scene(request.scene), request.action, request.parameters, request.seed, record_rate=rate)
+        task = PourTask(
+            self._scene(request.scene),
+            request.action,
+            request.parameters,
+            request.seed,
+            record_rate=rate,
+            pose_error=request.pose_error,
+        )
         started()
         try:
             async with asyncio.timeout(self.deadlines.simulate):

@@ -12,7 +12,7 @@ from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, Loss
 from sim_engine.space import Space
-from sim_engine.task import Scene
+from sim_engine.task import PoseError, Scene
 
 CalibrationName = Literal["C1", "C2", "C3", "C4"]
 DeploymentName = Literal["D1", "D2", "D3"]
@@ -137,6 +137,30 @@ class TrustPlan:
 
 
 @dataclass(frozen=True)
+class RiskPlan:
+    """D1: what is minimised where actions are not executed exactly, and θ is not known exactly.
+
+    Attributes:
+        measure: of the losses: their mean, or CVaR, the mean of the worst share 1 − level.
+        level: β of CVaR.
+        pose_error: standard deviations, normal and independent of each other; 0 for what is exact.
+        theta: 'best': θ* alone; 'posterior': draws of what else fits the weighed pours.
+        thetas: those draws, equally likely, where no calibration of the same campaign makes them.
+    """
+
+    measure: Literal["expected", "cvar"] = "expected"
+    level: float = 0.9
+    pose_error: PoseError = field(default_factory=lambda: PoseError(speed_factor=0.0))
+    theta: Literal["best", "posterior"] = "best"
+    thetas: tuple[SimulationParameters, ...] = ()
+
+    @property
+    def tail(self) -> float:
+        """β, and 0 for the mean, which is CVaR at level 0."""
+        return self.level if self.measure == "cvar" else 0.0
+
+
+@dataclass(frozen=True)
 class DeploymentPlan:
     """D1, D2 or D3: how to pour into vessels that calibration never saw.
 
@@ -158,6 +182,9 @@ class DeploymentPlan:
         trust: D3: when the simulator is called wrong, and what follows; None: pours are only compared.
         noise: of observations: the same everywhere, or varying with the action where the data show it.
         refusals: what an action that can't be made is to the optimiser: a place to avoid, or one with the worst cost.
+        risk: D1: in place of the mean loss of exact execution.
+        tolerance: D1: loss up to which one may miss the action, as a share of that of spilling all; None: no safe
+            window is looked for.
     """
 
     strategy: DeploymentName
@@ -179,6 +206,8 @@ class DeploymentPlan:
     trust: TrustPlan | None = None
     noise: Literal["constant", "varying"] = "constant"
     refusals: RefusalsName = "penalise"
+    risk: RiskPlan | None = None
+    tolerance: float | None = None
 
     @property
     def loss_name(self) -> str:

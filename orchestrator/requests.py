@@ -8,6 +8,7 @@ from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.task import PoseError
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Simulate:
 
     Attributes:
         purpose: one word for journal and monitor: 'calibrate', 'prior', 'refine', 'evaluate' …
+        pose_error: with which it is executed; None: as intended.
     """
 
     scene: str
@@ -38,6 +40,7 @@ class Simulate:
     parameters: SimulationParameters
     seed: int
     purpose: str = "simulate"
+    pose_error: PoseError | None = None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,12 +20,14 @@ from orchestrator.strategies.calibration_c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.deployment import Deployment
 from orchestrator.strategies.deployment_d1 import OneShotPlanning
+from orchestrator.strategies.deployment_d1_risk import RobustPlanning
 from orchestrator.strategies.deployment_d2 import RealOnly
 from orchestrator.strategies.deployment_d3 import Hybrid
 from orchestrator.strategies.design import DesignedPours, MeasuredPour
 from orchestrator.strategies.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.strategies.risk import Disturbances
 from orchestrator.strategies.scorecard import Scorecard
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
@@ -41,6 +43,9 @@ _CALIBRATIONS: dict[str, type[Calibration]] = {
     "C4": ContinuousBayesianCalibration,
 }
 _DEPLOYMENTS: dict[str, type[Deployment]] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
+
+POSTERIOR_DRAWS = 64
+"""θ of a posterior that a deployment under risk draws from."""
 
 Results = Mapping[str, Mapping[str, Any]]
 """Results of the stages before, by name, as they are in the journal."""
@@ -129,7 +134,9 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            return _DEPLOYMENTS[deployment.strategy](deployment, scene, _theta(plan, results), seed)
+            informed = with_posterior(deployment, results)
+            strategy = RobustPlanning if informed.risk is not None else _DEPLOYMENTS[informed.strategy]
+            return strategy(informed, scene, _theta(plan, results), seed)
 
         return build
 
@@ -158,14 +165,37 @@ def prediction_stages(
         def build(results: Results, seed: int) -> Strategy:
             values = results[DEPLOYMENT + name].get("action_si")
             action = None if values is None else scene.action(dict(values))
-            costing = Costing.of(deployment, scene, _theta(plan, results))
-            return RepeatedSimulation(costing, action, seeds, seed, thetas)
+            theta, risk = _theta(plan, results), with_posterior(deployment, results).risk
+            costing = Costing.of(deployment, scene, theta)
+            if risk is None:
+                return RepeatedSimulation(costing, action, seeds, seed, thetas)
+            draws = Disturbances(risk, deployment.actions, theta, seed).draws(seeds)
+            drawn = [draw.parameters for draw in draws] if risk.theta == "posterior" else thetas
+            return RepeatedSimulation(costing, action, seeds, seed, drawn, [draw.error for draw in draws])
 
         return build
 
     return [
         StageDefinition(PREDICTION + name, build_for(name, scene)) for name, scene in _by_receiver(deployment).items()
     ]
+
+
+def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
+    """The deployment with the draws of θ that its risk asks for, from the calibration before it.
+
+    Raises:
+        RunError: it has none.
+    """
+    risk = deployment.risk
+    if risk is None or risk.theta == "best" or risk.thetas:
+        return deployment
+    found = results.get(CALIBRATION, {})
+    rows = (found.get("posterior") or {}).get("thetas", ())
+    if not rows:
+        raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
+    kept = rows[:: max(len(rows) // POSTERIOR_DRAWS, 1)]
+    thetas = tuple(SimulationParameters.model_validate({**found["theta"], **row}) for row in kept)
+    return replace(deployment, risk=replace(risk, thetas=thetas))
 
 
 def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:

@@ -51,9 +51,29 @@ def run(path: Path, options: RunOptions) -> None:
     """The whole campaign."""
     plan = read_campaign(path, options.laboratory)
     check_campaign_can_run(plan)
+    _check_posterior(plan)
     finished = _run(plan, "run", path, options)
     if options.as_json:
         print_json({"run": finished.result.directory.name, **finished.summary})
+
+
+def _check_posterior(plan: CampaignPlan) -> None:
+    """Draws of θ that deployment is to bear are made by its own calibration.
+
+    Raises:
+        RefusalError: it makes none (exit code 2).
+    """
+    risk = None if plan.deployment is None else plan.deployment.risk
+    if risk is None or risk.theta == "best":
+        return
+    if plan.calibration is None or plan.calibration.strategy != "C4":
+        has = "has no calibration" if plan.calibration is None else f"calibrates with {plan.calibration.strategy}"
+        raise RefusalError(
+            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which only C4 makes, and this "
+            f"campaign {has}; calibrate with C4, write 'theta: best', or use decant plan --parameters with the "
+            "theta.json of a calibration",
+            BAD_INPUT,
+        )
 
 
 def calibrate(path: Path, options: RunOptions) -> None:
@@ -145,6 +165,8 @@ def plan_pour(
                 "predicted_deviation": result["predicted_deviation"],
                 "prediction": repeated,
                 "loss": plan.deployment.loss_name,
+                "risk": result.get("risk"),
+                "window": result.get("window"),
                 "not_covered": finished.summary["receivers"][result["scene"]]["not_covered"],
             }
         )
@@ -179,16 +201,25 @@ def planning_plan(
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
     from orchestrator.config.errors import ConfigError
-    from orchestrator.config.load import load_parameters, load_vessel
+    from orchestrator.config.load import load_parameters, load_posterior, load_vessel
+    from orchestrator.stages import POSTERIOR_DRAWS
 
-    theta = plan.parameters
+    deployment, theta = plan.deployment, plan.parameters
+    risk = None if deployment is None else deployment.risk
+    if risk is not None and risk.theta == "posterior" and parameters is None:
+        raise RefusalError(
+            f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration "
+            "by C4",
+            BAD_INPUT,
+        )
     try:
         if parameters is not None:
             theta = load_parameters(parameters, plan.parameters)
+            if risk is not None and risk.theta == "posterior":
+                risk = dataclasses.replace(risk, thetas=load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters))
         vessel = load_vessel(receiver) if receiver is not None else None
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
-    deployment = plan.deployment
     if deployment is None:
         raise RefusalError(
             f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)",
@@ -202,6 +233,7 @@ def planning_plan(
         strategy="D1",
         scenes=scenes,
         pours=0,
+        risk=risk,
         iterations=iterations if iterations is not None else deployment.iterations,
     )
     return dataclasses.replace(

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from orchestrator.config.laboratory import LaboratoryFile
+from orchestrator.config.laboratory import LaboratoryFile, PoseNoiseSection
 from orchestrator.config.motion import Actions as ActionsModel
 from orchestrator.config.motion import Motion as MotionModel
 from orchestrator.config.motion import Parameters as ParametersModel
@@ -179,6 +179,31 @@ class TrustSection(Section):
     """D2: its simulations are forgotten; widen: they are believed less; ask: the campaign pauses with a question."""
 
 
+class RiskSection(Section):
+    """D1: plan for a robot that misses, and for not knowing θ, in place of one pour that goes exactly as planned."""
+
+    measure: Literal["expected", "cvar"] = "expected"
+    """expected: mean loss over the errors; cvar: mean over the worst share 1 − level of them."""
+
+    level: Annotated[float, Quantity("1", "0.9", 0.01, 0.99)] | None = None
+    """cvar: between 0, the mean of all, and 1, the very worst; 0.9 unless given."""
+
+    pose_error: PoseNoiseSection = PoseNoiseSection()
+    """Standard deviations of the errors, normal and independent."""
+
+    theta: Literal["best", "posterior"] = "best"
+    """best: θ* alone; posterior: draws of what else fits the weighed pours, from C4 or from `--parameters`."""
+
+
+class WindowSection(Section):
+    """D1: how far one may miss the planned action, in each dimension, before too much is spilled."""
+
+    required: ClassVar[dict[str, str]] = {"tolerance": "2 %"}
+
+    tolerance: Annotated[float, Quantity("1", "2 %", 1e-4, 1.0)] | None = None
+    """Largest loss, as a share of what spilling the whole load would cost."""
+
+
 class DeploymentSection(Section):
     """How to pour into vessels that calibration never saw."""
 
@@ -221,7 +246,7 @@ class DeploymentSection(Section):
     """D1: iterations of the optimiser; 15 unless given."""
 
     simulations_per_iteration: PositiveCount | None = None
-    """D1: simulations averaged in each; 2 unless given."""
+    """D1: simulations averaged in each; 2 unless given, 4 with 'risk'."""
 
     prior_simulations: Count | None = None
     """D3: simulations before the first pour; 37 unless given."""
@@ -240,6 +265,12 @@ class DeploymentSection(Section):
 
     noise: Literal["constant", "varying"] = "varying"
     """Scatter of a pour: the same everywhere, or varying with the action where at least 20 observations show it."""
+
+    risk: RiskSection | None = None
+    """D1: errors of execution, and of θ, that the action has to bear."""
+
+    window: WindowSection | None = None
+    """D1: look for the safe window around the action, and check it by simulations."""
 
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""

@@ -292,8 +292,8 @@ def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
     liquid = b.liquid.model_dump()
     bench: dict[str, object] = {
         "liquid": {n: value_as_file(v, info[n].unit, info[n].unit, whole=info[n].integer) for n, v in liquid.items()},
-        "pose_error": _pose_as_file(b.pose_error),
-        "pose_noise": _pose_as_file(b.pose_noise),
+        "pose_error": pose_as_file(b.pose_error),
+        "pose_noise": pose_as_file(b.pose_noise),
         "time_scale": b.time_scale,
     }
     if spec.arm is None:
@@ -319,7 +319,8 @@ def _wires_as_file(arm: UrArmSpec | None, spec: LaboratorySpec) -> dict[str, obj
     }
 
 
-def _pose_as_file(pose: PoseError) -> dict[str, object]:
+def pose_as_file(pose: PoseError) -> dict[str, object]:
+    """Errors of execution, or their standard deviations, as files have them."""
     return {
         "x": format_quantity(pose.x, "m", "mm"),
         "y": format_quantity(pose.y, "m", "mm"),

@@ -200,9 +200,10 @@ class Quantity:
     def bounds(self) -> str:
         """The bounds in the unit that people write."""
         factor = 1.0
-        unit = "" if self.unit == "1" else f" {self.display}"
+        unit = "" if self.display == "1" else f" {self.display}"
         if unit:
-            factor = float(registry().convert(1.0, registry().parse_units(self.display), self.unit))
+            si = "" if self.unit == "1" else self.unit
+            factor = float(registry().convert(1.0, registry().parse_units(self.display), si))
         if math.isinf(self.upper):
             return f"{self.lower / factor:g}{unit} and more"
         if math.isinf(self.lower):
@@ -222,9 +223,13 @@ class Quantity:
         kind = KINDS.get(self.unit, self.unit)
         if self.unit == "1":
             bounds = {"minimum": self.lower, "maximum": self.upper}
-            return {"type": "integer" if self.whole else "number"} | {
+            number: dict[str, Any] = {"type": "integer" if self.whole else "number"} | {
                 key: bound for key, bound in bounds.items() if math.isfinite(bound)
             }
+            if self.display == "1":
+                return number
+            share = {"type": "string", "pattern": r"^\s*(\d[\d_]*\.?\d*|\.\d+)\s*%\s*$", "examples": [self.example]}
+            return {"anyOf": [number, share]}
         form: dict[str, Any] = {
             "type": "string",
             "pattern": r"^\s*[-+]?(\d[\d_]*\.?\d*|\.\d+)([eE][-+]?\d+)?\s*\S+",

@@ -9,8 +9,12 @@ from orchestrator.config.resolve_objectives import resolve_objectives
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place
 from orchestrator.fingerprint import NEW_MODEL
-from orchestrator.plan import DeploymentPlan, TrustPlan
+from orchestrator.plan import DeploymentPlan, RiskPlan, TrustPlan
 from sim_engine.losses import Loss
+from sim_engine.task import PoseError
+
+EXACT = PoseError(speed_factor=0.0)
+"""Standard deviations of errors that are none."""
 
 BELONGS_TO = {
     "iterations": ("D1",),
@@ -19,6 +23,8 @@ BELONGS_TO = {
     "per_pour": ("D3",),
     "model": ("D3",),
     "trust": ("D3",),
+    "risk": ("D1",),
+    "window": ("D1",),
     "mean": ("D2",),
     "data": ("D2", "D3"),
 }
@@ -68,6 +74,7 @@ def resolve_deployment(
     complete = tuple(scene for scene in scenes if scene is not None)
     if len(complete) < len(receivers) or actions is None or strategy is None or pours is None:
         return None
+    risk = _resolve_risk(section, place, builder)
     objectives = resolve_objectives(section, place, complete[0], actions, report)
     data = None
     if section.data is not None and strategy in BELONGS_TO["data"]:
@@ -81,7 +88,7 @@ def resolve_deployment(
         loss=Loss(loss.name, 1.0 if loss.retained_weight is None else loss.retained_weight),
         pours=pours,
         iterations=section.iterations or 15,
-        simulations_per_iteration=section.simulations_per_iteration or 2,
+        simulations_per_iteration=section.simulations_per_iteration or (2 if risk is None else 4),
         prior_simulations=37 if section.prior_simulations is None else section.prior_simulations,
         per_pour=(None if per_pour == "free" else int(per_pour)) if strategy == "D3" else 0,
         mean=section.mean or "constant",
@@ -94,4 +101,33 @@ def resolve_deployment(
         trust=TrustPlan(trust.pours, trust.limit, trust.policy) if strategy == "D3" else None,
         noise=section.noise,
         refusals="avoid",
+        risk=risk,
+        tolerance=None if section.window is None else section.window.tolerance,
     )
+
+
+def _resolve_risk(section: DeploymentSection, place: Place, builder: SceneBuilder) -> RiskPlan | None:
+    """What a deployment under risk has to bear; without meaning beside objectives."""
+    report, risk = builder.report, section.risk
+    for key in ("risk", "window"):
+        if section.value(key) is not None and section.objectives is not None:
+            report.add(place.at(key), "is about a loss; it can't be combined with 'objectives'", key=True)
+    if risk is None:
+        return None
+    at = place.at("risk")
+    broken = any(path == at.document.path and loc[: len(at.loc)] == at.loc for path, loc in report.broken)
+    if risk.level is not None and risk.measure != "cvar" and not broken:
+        report.add(at.at("level"), "belongs to 'measure: cvar'; remove it, or ask for cvar", key=True)
+    errors = PoseError(**risk.pose_error.model_dump())
+    if errors == EXACT and risk.theta == "best" and not broken:
+        report.add(
+            at,
+            "names nothing that could go wrong; add 'pose_error: {x: 3 mm, speed_factor: 0.02}', or 'theta: posterior'",
+            key=True,
+        )
+    if section.simulations_per_iteration == 1:
+        report.add(
+            place.at("simulations_per_iteration"),
+            "one simulation of each action is made as planned, so that with 'risk' at least 2 are needed",
+        )
+    return RiskPlan(risk.measure, 0.9 if risk.level is None else risk.level, errors, risk.theta)

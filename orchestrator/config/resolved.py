@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.config.laboratory import laboratory_as_file
+from orchestrator.config.laboratory import laboratory_as_file, pose_as_file
 from orchestrator.config.motion import fixed_as_file, space_as_file, value_as_file
 from orchestrator.config.vessel import liquid_as_file, vessel_as_file
 from orchestrator.journal import JOURNAL_NAME
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, ExistingPours
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, ExistingPours, RiskPlan
 from orchestrator.strategies.objectives import Objectives
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
@@ -136,6 +136,10 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
     match plan.strategy:
         case "D1":
             table |= {"iterations": plan.iterations, "simulations_per_iteration": plan.simulations_per_iteration}
+            if plan.risk is not None:
+                table["risk"] = _risk(plan.risk)
+            if plan.tolerance is not None:
+                table["window"] = {"tolerance": plan.tolerance}
         case "D2":
             table["mean"] = plan.mean
         case "D3":
@@ -145,6 +149,11 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
             if plan.trust is not None:
                 table["trust"] = {"pours": plan.trust.pours, "limit": plan.trust.limit, "policy": plan.trust.policy}
     return table
+
+
+def _risk(risk: RiskPlan) -> dict[str, object]:
+    level = {"level": risk.level} if risk.measure == "cvar" else {}
+    return {"measure": risk.measure, **level, "pose_error": pose_as_file(risk.pose_error), "theta": risk.theta}
 
 
 def _data(data: ExistingPours, plan: DeploymentPlan) -> dict[str, object]:

@@ -24,6 +24,7 @@ from orchestrator.report.results import (
 from orchestrator.report.style import safe_name
 from orchestrator.report.trust import draw_trust
 from orchestrator.report.units import deployment_unit
+from orchestrator.report.window import draw_window
 
 _log = logging.getLogger(__name__)
 
@@ -76,6 +77,11 @@ def draw_figures(
                 name = receiver_name(plan, scene)
                 jobs[f"loss map {name}"] = lambda p=picture, n=name: draw_surrogate(  # type: ignore[misc]
                     directory / f"loss-map-{safe_name(n)}.png", p
+                )
+            if result.get("window"):
+                picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
+                jobs[f"safe window {name}"] = lambda r=result, p=picture, n=name: draw_window(  # type: ignore[misc]
+                    directory / f"window-{safe_name(n)}.png", r, p, unit=unit, receiver=n
                 )
             if (trust := result.get("trust") or {}).get("pours"):
                 name = receiver_name(plan, scene)

@@ -21,6 +21,7 @@ from orchestrator.report.results import (
     predictions_of,
     weighed,
 )
+from orchestrator.report.risk import risk_line, window_line
 from orchestrator.report.trust import trust_line
 from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
 from sim_engine.spread import Spread
@@ -144,7 +145,7 @@ def _receiver(result: Result) -> dict[str, Any]:
         "untrustworthy_simulation": bool(result.get("trust", {}).get("alarm", False)),
         "trust": result.get("trust"),
         "gave_up": result.get("gave_up"),
-        **({"front": result["front"]} if "front" in result else {}),
+        **{name: result[name] for name in ("front", "risk", "window") if name in result},
     }
 
 
@@ -178,7 +179,7 @@ def summary_table(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableT
         known = [row for row in summary["receivers"].values() if _has_numbers(row[key] for key in _LOSSES)]
         if known:
             parts.append(_receiver_table(known, deployment_unit(plan.deployment)))
-        parts += _remarks(summary["receivers"].values())
+        parts += _remarks(summary["receivers"].values(), deployment_unit(plan.deployment))
     files = [*summary["figures"].items(), *([("recording", summary["recording"])] if summary["recording"] else [])]
     if files:
         width = max(len(name) for name, _ in files)
@@ -280,7 +281,7 @@ def _best_expected(row: Mapping[str, Any], unit: LossUnit) -> str:
     return unit.text(row["predicted_loss"], row["predicted_deviation"]) + unit.scatter(row["predicted_scatter"])
 
 
-def _remarks(rows: Iterable[Mapping[str, Any]]) -> list[RenderableType]:
+def _remarks(rows: Iterable[Mapping[str, Any]], unit: LossUnit) -> list[RenderableType]:
     from rich.text import Text
 
     remarks: list[RenderableType] = []
@@ -295,6 +296,10 @@ def _remarks(rows: Iterable[Mapping[str, Any]]) -> list[RenderableType]:
         elif not _has_numbers(row[key] for key in _LOSSES):
             remarks.append(Text(f"  {receiver}: nothing was learnt; see the journal for what failed", style="yellow"))
         remarks += [Text(f"  {receiver}, nothing beats: {_compromise(one)}") for one in row.get("front", ())]
+        if row.get("risk"):
+            remarks.append(Text(f"  {receiver}, {risk_line(row['risk'], unit)}"))
+        if row.get("window"):
+            remarks.append(Text(f"  {receiver}, {window_line(row['window'], unit)}"))
         if row["prediction"]:
             remarks.append(Text(f"  {receiver}, best action: {_prediction(row['prediction'])}"))
         for one in row["not_covered"]:

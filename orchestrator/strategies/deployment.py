@@ -32,7 +32,7 @@ from orchestrator.strategies.objectives import Vector
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
-from sim_engine.action import described
+from sim_engine.action import Action, described
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
@@ -105,7 +105,8 @@ class Deployment(ABC):
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            if self._avoids and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
+            avoided = self._avoids and request.pose_error is None  # under an error, touching is what may happen
+            if avoided and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
                 self._trials.settle(request, None, refused=True)
             else:
                 vector = self._costing.simulated(outcome, request.action)
@@ -145,13 +146,13 @@ class Deployment(ABC):
         """Queue simulations of the suggested points, from the `first`."""
         for i, point in enumerate(suggestion.points[first:], start=first):
             values = self._plan.actions.decode(point)
-            action = self._scene.action(values)
-            requests = tuple(
-                Simulate(self._scene.name, action, self._parameters, self._seeds.next(), purpose)
-                for _ in range(repeats)
-            )
-            self._trials.add(Trial(point, requests))
+            self._trials.add(Trial(point, self._repeated(self._scene.action(values), purpose, repeats)))
             self._decide(f"simulate ({purpose})", values, suggestion, i)
+
+    def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
+        """Simulations of one action."""
+        name, parameters = self._scene.name, self._parameters
+        return tuple(Simulate(name, action, parameters, self._seeds.next(), purpose) for _ in range(repeats))
 
     def _pour(self, suggestion: Suggestion, point: Point, prediction: Prediction | None) -> None:
         """Queue a pour."""
@@ -228,7 +229,7 @@ class Deployment(ABC):
     @property
     def _unspent(self) -> int:
         counting = self._trials.counting(everything=self._trials.idle)
-        return min(sum(t.refused and t.requests[0].purpose != "refine" for t in counting), MAX_REFUSED)
+        return min(sum(t.refused and t.requests[0].purpose not in ("refine", "window") for t in counting), MAX_REFUSED)
 
     @property
     def _pours_left(self) -> bool:

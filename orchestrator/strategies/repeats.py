@@ -12,6 +12,7 @@ from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourOutcome
 from sim_engine.spread import Spread, spreads
+from sim_engine.task import PoseError
 
 
 class RepeatedSimulation:
@@ -28,6 +29,7 @@ class RepeatedSimulation:
         count: int,
         seed: int,
         thetas: Sequence[SimulationParameters] = (),
+        errors: Sequence[PoseError | None] = (),
     ) -> None:
         """Plan.
 
@@ -36,6 +38,8 @@ class RepeatedSimulation:
             action: None: nothing was found that could be repeated, and nothing is asked for.
             count: of seeds.
             thetas: that the seeds take turns with, in place of the one θ: draws of a posterior.
+            errors: that they take turns with, too. Cups that touch because of one are the worst loss, not a lost
+                simulation.
         """
         scene, parameters = costing.scene, costing.parameters
         seeds = SeedStream(seed, f"prediction {scene.name}")
@@ -48,13 +52,16 @@ class RepeatedSimulation:
         self.decisions: list[Decision] = []
         if action is not None:
             seeds_of_all = [seeds.next() for _ in range(count)]
-            turns = thetas or (parameters,)
+            turns, missed = thetas or (parameters,), errors or (None,)
             self._unissued = [
-                Simulate(scene.name, action, turns[i % len(turns)], s, "predict") for i, s in enumerate(seeds_of_all)
+                Simulate(scene.name, action, turns[i % len(turns)], s, "predict", missed[i % len(missed)])
+                for i, s in enumerate(seeds_of_all)
             ]
-            among = f" and {len(thetas)} θ of the posterior" if thetas else ""
+            among = f" and {len(set(thetas))} θ of the posterior" if thetas else ""
+            among += f" under {len(errors)} draws of the pose error" if any(errors) else ""
             self.decisions.append(Decision(f"simulate the planned action with {count} fresh seeds{among}"))
-        self._thetas = len(thetas)
+        self._thetas = len(set(thetas))
+        self._touching = 0
 
     @property
     def finished(self) -> bool:
@@ -81,6 +88,9 @@ class RepeatedSimulation:
         if isinstance(outcome, Simulated) and cost is not None:
             self._outcomes.append(outcome.outcome)
             self._losses.append(costing.total(cost))
+        elif cost is not None and request.pose_error is not None:
+            self._touching += 1
+            self._losses.append(costing.total(cost))
         else:
             self._lost += 1
 
@@ -90,7 +100,10 @@ class RepeatedSimulation:
         return answered, answered + len(self._open) + len(self._unissued)
 
     def result(self) -> dict[str, object]:
-        """Mean and standard deviation over the seeds: of every fraction, of r = spilled / poured, and of the loss."""
+        """Mean and standard deviation over the seeds: of every fraction, of r = spilled / poured, and of the loss.
+
+        The loss counts cups that touched because of an error; the fractions, of which nothing is known then, do not.
+        """
         over_seeds = spreads(self._outcomes)
         loss = Spread.of(self._losses)
         if loss is not None:
@@ -100,5 +113,6 @@ class RepeatedSimulation:
             "simulations": self.progress()[0],
             "simulations_lost": self._lost,
             "thetas": self._thetas,
+            "touching": self._touching,
             "over_seeds": {name: spread.as_json() for name, spread in over_seeds.items()},
         }

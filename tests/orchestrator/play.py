@@ -29,7 +29,7 @@ from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.space import Axis, Space
-from sim_engine.task import Scene
+from sim_engine.task import PoseError, Scene
 from sim_engine.vessel.spec import cylinder
 
 Spill = Callable[[Action, SimulationParameters, np.random.Generator], float]
@@ -67,6 +67,17 @@ def calibration_plan(**changes: Any) -> CalibrationPlan:
 def deployment_plan(**changes: Any) -> DeploymentPlan:
     plan = DeploymentPlan(strategy="D3", scenes=(SCENE,), actions=ACTIONS, loss=Loss(), pours=8, prior_simulations=20)
     return replace(plan, **changes)
+
+
+def executed(action: Action, error: PoseError | None) -> Action:
+    """What comes of an action where nothing but distance, side and speed can be off."""
+    if error is None:
+        return action
+    return action.with_values(
+        x_offset=action.x_offset + error.x,
+        y_offset=action.y_offset - error.y,
+        angular_velocity=action.angular_velocity * error.speed_factor,
+    )
 
 
 def unit(action: Action, space: Space = ACTIONS) -> np.ndarray:
@@ -160,8 +171,9 @@ class Play:
             return Suggested(replace(propose(request.problem), seconds=0.0))
         parameters = request.parameters if isinstance(request, Simulate) else THETA
         spill = self.simulated if isinstance(request, Simulate) else self.real
+        error = request.pose_error if isinstance(request, Simulate) else None
         try:
-            spilled = spill(request.action, parameters, np.random.default_rng(request.seed))
+            spilled = spill(executed(request.action, error), parameters, np.random.default_rng(request.seed))
         except ValueError as error:
             return Failed("invalid_action", str(error))
         if math.isnan(spilled):

@@ -41,3 +41,18 @@ def _valley(action: Action, x0: float, v0: float, rng: np.random.Generator) -> f
     depth = ((x - x0 - 0.15 * (v - v0)) / 0.16) ** 2 + ((v - v0) / 0.35) ** 2
     spill = 1.0 - np.exp(-0.5 * depth)
     return float(np.clip(spill * (1.0 + 0.05 * rng.standard_normal()) + 0.01 * rng.standard_normal(), 0.0, 1.0))
+
+
+def two_valleys(action: Action, _: SimulationParameters, rng: np.random.Generator) -> float:
+    """A narrow valley without any spillage, beside a broad one that always spills a little."""
+    return float(np.clip(quiet_valleys(action) + 0.003 * rng.standard_normal(), 0.0, 1.0))
+
+
+def quiet_valleys(action: Action) -> float:
+    """The same without its scatter."""
+    x = (action.x_offset - 0.08) / 0.07
+    v = (action.angular_velocity / DEG - 15) / 105
+    sideways = (action.y_offset / 0.02) ** 2
+    narrow = 1.0 - np.exp(-0.5 * (((x - 0.25) / 0.09) ** 2 + ((v - 0.5) / 0.8) ** 2 + sideways))
+    broad = 1.0 - 0.95 * np.exp(-0.5 * (((x - 0.7) / 0.2) ** 2 + ((v - 0.5) / 0.8) ** 2 + sideways))
+    return float(min(narrow, broad))

@@ -12,6 +12,7 @@ MAX_OBSERVATIONS = 2_000
 MAX_COUNT = 256
 MAX_RESOLUTION = 200
 MAX_PREDICTIONS = 100_000
+MAX_DISTURBANCES = 512
 
 
 def check(problem: SuggestProblem) -> None:
@@ -27,7 +28,8 @@ def check(problem: SuggestProblem) -> None:
     if problem.context and problem.mean != "constant":
         raise ValueError(f"a context needs mean='constant', not {problem.mean!r}")
     _check_points("context", problem.context, contexts.pop() if contexts else 0)
-    contextual = dimension + (len(problem.context[0]) if problem.context else 0)
+    _check_risk(problem)
+    contextual = dimension + problem.beside
     _check_points("data", problem.data.points, contextual)
     _check_points("simulated", problem.simulated.points, dimension)
     _check_points("pending", problem.pending, dimension)
@@ -54,6 +56,26 @@ def check(problem: SuggestProblem) -> None:
         raise ValueError(f"widening = {problem.widening} is outside 0.01 … 100")
     _check_posterior(problem)
     _check_constraints(problem)
+
+
+def _check_risk(problem: SuggestProblem) -> None:
+    risk = problem.risk
+    if risk is None:
+        return
+    if problem.context or problem.mean != "constant":
+        raise ValueError(f"a risk needs mean='constant' and no context, not {problem.mean!r}")
+    if not 1 <= len(risk.disturbances) <= MAX_DISTURBANCES:
+        raise ValueError(f"risk: {len(risk.disturbances)} disturbances are outside 1 … {MAX_DISTURBANCES}")
+    if not 0.0 <= risk.level < 1.0:
+        raise ValueError(f"risk: level = {risk.level} is outside [0, 1)")
+    if len(problem.data) > 1 and not problem.predict_at:
+        raise ValueError("risk: predict_at must name the requests that the best is one of")
+    for index, one in enumerate(risk.disturbances):
+        sizes = len(one.scales), len(one.shifts), len(one.context)
+        if sizes != (problem.space.dimension, problem.space.dimension, problem.beside):
+            raise ValueError(f"risk: disturbance {index} has {sizes} numbers, which fit neither space nor the others")
+        if not all(math.isfinite(value) for value in (*one.scales, *one.shifts, *one.context)):
+            raise ValueError(f"risk: disturbance {index} is not finite")
 
 
 def _check_posterior(problem: SuggestProblem) -> None:

@@ -83,9 +83,14 @@ def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, equation 4.17.
     """
-    correlation: Array = Matern(length_scale=lengths, nu=2.5)(first, second)
+    correlation = matern_correlation(first, second, lengths)
     s = np.sqrt(5.0) * cdist(first / lengths, second / lengths)
     return correlation, (5.0 / 3.0) * (1.0 + s) * np.exp(-s)
+
+
+def matern_correlation(first: Array, second: Array, lengths: Array) -> Array:
+    """The correlation of `matern` alone, for half its price."""
+    return np.asarray(Matern(length_scale=lengths, nu=2.5)(first, second))
 
 
 class Covariance:
@@ -219,14 +224,14 @@ class Covariance:
     def cross(self, theta: Array, points: Array) -> Array:
         """Of the noise-free real cost at points (m, d) with the observations: (m, n)."""
         rho = self.value(theta, "rho")
-        correlation = matern(points, self.points, self.lengths(theta))[0]
+        correlation = matern_correlation(points, self.points, self.lengths(theta))
         K = self.value(theta, "signal") ** 2 * rho * correlation * np.where(self._mask, rho, 1.0)
         K += self._remainder(theta, points, self.points) * self._loads
         return K if self._known is None else K + self._known.covariance(points, self.points) / self._unit**2
 
     def between(self, theta: Array, first: Array, second: Array) -> Array:
         """Of the noise-free real cost at points (m, d) and (k, d): (m, k)."""
-        correlation = matern(first, second, self.lengths(theta))[0]
+        correlation = matern_correlation(first, second, self.lengths(theta))
         K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * correlation
         K += self._remainder(theta, first, second)
         return K if self._known is None else K + self._known.covariance(first, second) / self._unit**2
@@ -244,7 +249,7 @@ class Covariance:
         if not self._scaled:
             return offset
         lengths = np.full(first.shape[1], self.value(theta, "delta_length"))
-        return offset + self.value(theta, "delta_signal") ** 2 * matern(first, second, lengths)[0]
+        return offset + self.value(theta, "delta_signal") ** 2 * matern_correlation(first, second, lengths)
 
 
 def _by_length(points: Array, G: Array) -> Array:

@@ -85,6 +85,48 @@ class Posterior:
 
 
 @dataclass(frozen=True)
+class Disturbance:
+    """One way in which requests are executed: x becomes scales · x + shifts, beside coordinates that no request has.
+
+    Attributes:
+        scales, shifts: one number for each axis of the space.
+        context: errors of execution that are no change of an axis.
+    """
+
+    scales: Point
+    shifts: Point
+    context: Point = ()
+
+
+@dataclass(frozen=True)
+class Risk:
+    """What is minimised over disturbances: the mean, or the CVaR, which is the mean of the worst share 1 − level.
+
+    Attributes:
+        disturbances: equally likely.
+        level: β of CVaR, 0 ≤ β < 1; 0: the mean of all.
+    """
+
+    disturbances: tuple[Disturbance, ...]
+    level: float = 0.0
+
+
+@dataclass(frozen=True)
+class RiskAnswer:
+    """What the surrogate says over the disturbances, at each of `SuggestProblem.predict_at`.
+
+    Attributes:
+        expected: means over the disturbances.
+        spreads: standard deviations over them.
+        worst: indices of the worst disturbances, the worst first; empty tuples for a mean.
+    """
+
+    expected: tuple[float, ...]
+    spreads: tuple[float, ...]
+    worst: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
 class SuggestProblem:
     """Everything that a proposal depends on; the optimiser actor keeps no state that matters.
 
@@ -115,6 +157,9 @@ class SuggestProblem:
         noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
         widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
         posterior: with a context: weighed pours, for draws of the searched parameters given them.
+        risk: if given, the observations are of requests as they were executed, disturbances included: points of `data`
+            have `space.dimension` coordinates (which may leave the cube) followed by the disturbances' context. What is
+            minimised, predicted and mapped is the measure over the disturbances of a request.
     """
 
     space: Space
@@ -135,6 +180,14 @@ class SuggestProblem:
     noise: NoiseName = "constant"
     widening: float = 1.0
     posterior: PosteriorQuestion | None = None
+    risk: Risk | None = None
+
+    @property
+    def beside(self) -> int:
+        """Coordinates of an observation that are none of the space's."""
+        if self.risk is not None and self.risk.disturbances:
+            return len(self.risk.disturbances[0].context)
+        return len(self.context[0]) if self.context else 0
 
 
 @dataclass(frozen=True)
@@ -174,7 +227,8 @@ class Suggestion:
         means: posterior means there; NaN-free; empty if no surrogate was fitted (too few data, or only drawn).
         deviations: posterior standard deviations of the noise-free cost there.
         best_point: minimiser of the posterior mean over the observed points (the simulated ones while nothing else was
-            observed) that were not refused, nor probably are; None without a surrogate.
+            observed) that were not refused, nor probably are; with a risk: over `predict_at`, for requests are not what
+            was observed; None without a surrogate.
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
         hyperparameters: fitted values by name (for people and plots); 'noise' and 'signal' in the cost's unit.
@@ -186,6 +240,7 @@ class Suggestion:
         feasibilities: probabilities that the proposals are not refused; empty while nothing was.
         posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
+        risk: with a risk: what else is known at `SuggestProblem.predict_at`.
     """
 
     points: tuple[Point, ...]
@@ -203,3 +258,4 @@ class Suggestion:
     feasibilities: tuple[float, ...] = ()
     posterior: Posterior | None = None
     best_noise: float | None = None
+    risk: RiskAnswer | None = None

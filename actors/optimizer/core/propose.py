@@ -23,6 +23,7 @@ from actors.optimizer.core.problem import (
     SurrogateMap,
 )
 from actors.optimizer.core.region import Feasibility, Region
+from actors.optimizer.core.risk import RiskProcess
 from actors.optimizer.core.surrogate import (
     AbsoluteProcess,
     GaussianProcess,
@@ -35,6 +36,9 @@ from actors.optimizer.core.surrogate import (
 
 Array = NDArray[np.float64]
 
+
+WORST = 8
+"""Disturbances that an answer names as the worst of a request."""
 
 FILL_EVERY = 3
 STRUCTURE = 2.0
@@ -115,7 +119,7 @@ class _Asked:
     def of(cls, problem: SuggestProblem) -> _Asked:
         """Read a problem."""
         dimension = problem.space.dimension
-        contextual = dimension + (len(problem.context[0]) if problem.context else 0)
+        contextual = dimension + problem.beside
         region = Region(problem.space, problem.constraints)
         points, costs = _sorted(problem.data, contextual)
         simulated, simulated_costs = _sorted(problem.simulated, dimension)
@@ -191,8 +195,10 @@ def _fit(problem: SuggestProblem, asked: _Asked) -> _Model | None:
         return None
     build = zero_mean_process if problem.mean == "zero" else constant_mean_process
     process = build(points, costs, varying=varying)
+    dimension = problem.space.dimension
+    if problem.risk is not None:
+        return _Model(RiskProcess.of(process, problem.risk), process, process.lengths[:dimension])
     if problem.context:
-        dimension = problem.space.dimension
         context = _array(problem.context, points.shape[1] - dimension)
         return _Model(AbsoluteProcess(process, context), process, process.lengths[:dimension])
     return _Model(process, process, process.lengths)
@@ -210,6 +216,8 @@ def _search(
     surrogate = model.surrogate
     if problem.count:
         seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled") else asked.known
+        if problem.risk is not None:
+            seen = np.clip(seen, 0.0, 1.0)  # what was executed may lie beside the box
         means = surrogate.predict(seen)[0]
         around = [seen[i] for i in np.argsort(means, kind="stable")[:4]]
         candidates = acquisition.search_candidates(asked.region, problem.space.dimension, around, rng)
@@ -231,10 +239,11 @@ def _looks_round(problem: SuggestProblem, asked: _Asked, model: _Model, index: i
 
     On a plateau the luckiest pours look like a slope, and following them, mostly along the faces of the cube, would
     take the whole budget. The same holds where every pour came to more than half of all simulations did, and pours
-    alone show no structure: what simulation promised isn't there. The paper's models, and contexts, are left alone.
+    alone show no structure: what simulation promised isn't there. The paper's models, contexts and risks are left
+    alone.
     """
     number = len(asked.known) + len(asked.busy) + index
-    if problem.acquisition != "lcb" or problem.context or number % FILL_EVERY != FILL_EVERY - 1:
+    if problem.acquisition != "lcb" or problem.context or problem.risk or number % FILL_EVERY != FILL_EVERY - 1:
         return False
     if problem.mean == "constant":
         return model.process.evidence < STRUCTURE
@@ -250,7 +259,9 @@ def _describe(
 ) -> dict[str, object]:
     """What the surrogate says about the proposals, the observations and the rest."""
     known = asked.known if len(asked.known) else asked.simulated
-    if feasibility is not None:
+    if problem.risk is not None:
+        known = asked.region.snap(_array(problem.predict_at, problem.space.dimension))
+    elif feasibility is not None:
         known = known[feasibility.likely(known)]
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
     at_known, known_deviations = model.surrogate.predict(known)
@@ -259,11 +270,11 @@ def _describe(
     description: dict[str, object] = {
         "means": tuple(map(float, means)),
         "deviations": tuple(map(float, deviations)),
-        "noises": () if problem.context else tuple(map(float, process.noise_at(points))),
+        "noises": () if problem.beside or problem.risk else tuple(map(float, process.noise_at(points))),
         "best_point": tuple(map(float, known[best])),
         "best_mean": float(at_known[best]),
         "best_deviation": float(known_deviations[best]),
-        "best_noise": None if problem.context else float(process.noise_at(known[best : best + 1])[0]),
+        "best_noise": None if problem.beside or problem.risk else float(process.noise_at(known[best : best + 1])[0]),
         "hyperparameters": {
             "signal": process.signal,
             "noise": process.noise,
@@ -277,6 +288,8 @@ def _describe(
         )
         description["predictions"] = tuple(map(float, predictions))
         description["prediction_deviations"] = tuple(map(float, spreads))
+        if isinstance(model.surrogate, RiskProcess):
+            description["risk"] = model.surrogate.answer(known, WORST)
     if problem.map_resolution and problem.space.dimension >= 2:
         sought = problem.acquisition == "posterior_minimum" and len(points) > 0
         description["surrogate"] = _map(problem, asked.region, model, points[0] if sought else known[best])
@@ -300,8 +313,7 @@ def _posterior(
 
 
 def _axis_names(problem: SuggestProblem) -> list[str]:
-    contexts = len(problem.context[0]) if problem.context else 0
-    return [*problem.space.names, *(f"context{i + 1}" for i in range(contexts))]
+    return [*problem.space.names, *(f"context{i + 1}" for i in range(problem.beside))]
 
 
 def _map(problem: SuggestProblem, region: Region, model: _Model, at: Array) -> SurrogateMap:

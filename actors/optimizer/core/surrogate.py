@@ -118,9 +118,21 @@ class GaussianProcess:
     def projected(self, points: Array) -> tuple[Array, Array]:
         """What posterior moments at points (m, d) are made of: means (m,), and V (n, m); the posterior covariance
         is `prior_covariance` − Vᵀ V, in the cost's unit (squared)."""
-        K = self._covariance.cross(self._fitted.theta, points)
-        V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
-        return self.mean(points) + self.scale * (K @ self._fitted.alpha), self.scale * V
+        K = self.cross(points)
+        return self.expected(points, K), self.explained(K)
+
+    def cross(self, points: Array) -> Array:
+        """Prior covariances of the cost at points (m, d) with the observations: (m, n), in units of `scale`²."""
+        return self._covariance.cross(self._fitted.theta, points)
+
+    def expected(self, points: Array, cross: Array) -> Array:
+        """Posterior means (m,) at points (m, d) from their `cross` (m, n)."""
+        return np.asarray(self.mean(points) + self.scale * (cross @ self._fitted.alpha))
+
+    def explained(self, cross: Array) -> Array:
+        """V (n, m) of rows of `cross`, or of weighted sums of them (m, n): VᵀV is the covariance that the observations
+        explain, in the cost's unit squared."""
+        return np.asarray(self.scale * solve_triangular(self._fitted.L, cross.T, lower=True, check_finite=False))
 
     def prior_covariance(self, points: Array) -> Array:
         """Of the noise-free cost between points (m, d): (m, m), in its unit squared."""

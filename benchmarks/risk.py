@@ -1,0 +1,178 @@
+"""What planning for errors of execution buys: plain D1 beside D1 under risk, judged under errors that neither has seen.
+
+Real simulations, few particles, one process:
+
+    python benchmarks/risk.py [--plans 3] [--evaluations 40] [--iterations 12] [--per-iteration 4] [--particles 500]
+                              [--receiver configs/vessels/narrow.yaml] [--json]
+
+Each way plans `--plans` times with the same number of simulations; each planned action is then simulated
+`--evaluations` times, every time with a fresh seed and fresh errors, the same for all ways. Intervals are 95 %,
+by resampling the plans, and the evaluations of each.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import describe, pin, say, show
+from numpy.typing import NDArray
+
+from actors.optimizer.core.propose import propose
+from orchestrator.config.load import load_campaign, load_vessel
+from orchestrator.plan import DeploymentPlan, RiskPlan
+from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
+from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.deployment_d1 import OneShotPlanning
+from orchestrator.strategies.deployment_d1_risk import RobustPlanning
+from sim_engine.action import DEG, described
+from sim_engine.liquid import SimulationParameters
+from sim_engine.pour import InvalidSceneError, PourSimulator
+from sim_engine.task import PoseError, PourTask, Scene
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[1]
+ERRORS = PoseError(x=3e-3, y=3e-3, tilt=0.5 * DEG, speed_factor=0.02)
+WAYS: dict[str, RiskPlan | None] = {
+    "D1 as planned": None,
+    "D1, expected": RiskPlan("expected", pose_error=ERRORS),
+    "D1, CVaR 90 %": RiskPlan("cvar", 0.9, ERRORS),
+}
+RESAMPLED = 4000
+
+
+class Bench:
+    """One scene, answered by the simulator of this process."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._simulator = scene, PourSimulator()
+        self.simulations = self.touched = 0
+        self.seconds = 0.0
+
+    def answer(self, request: Request) -> Outcome:
+        """What comes of a question or a simulation."""
+        if isinstance(request, Suggest):
+            suggestion = propose(request.problem)
+            self.seconds += suggestion.seconds
+            return Suggested(suggestion)
+        assert isinstance(request, Simulate)
+        task = PourTask(self._scene, request.action, request.parameters, request.seed, pose_error=request.pose_error)
+        self.simulations += 1
+        try:
+            outcome = self._simulator.simulate(task).outcome
+        except InvalidSceneError as error:
+            self.touched += 1
+            return Failed("invalid_action", str(error))
+        self.seconds += outcome.cpu_s
+        if outcome.invalid is not None:
+            return Failed("simulation", outcome.invalid)
+        return Simulated(outcome)
+
+    def plan(self, strategy: OneShotPlanning) -> dict[str, Any]:
+        """Play a strategy to its end; its result."""
+        waiting: list[Request] = []
+        while not strategy.finished:
+            waiting += strategy.ask(Slots(1 - sum(isinstance(one, Simulate) for one in waiting), 0))
+            request = waiting.pop(0)
+            strategy.tell(request, self.answer(request))
+        return strategy.result()
+
+
+def fresh_errors(count: int, seed: int) -> list[tuple[int, PoseError]]:
+    """Seeds and errors of the evaluations."""
+    rng = np.random.default_rng([seed, 77])
+    found = []
+    for _ in range(count):
+        x, y, tilt, speed = rng.standard_normal(4)
+        error = PoseError(
+            float(ERRORS.x * x), float(ERRORS.y * y), float(ERRORS.tilt * tilt), float(1 + ERRORS.speed_factor * speed)
+        )
+        found.append((int(rng.integers(2**31)), error))
+    return found
+
+
+def evaluated(
+    bench: Bench, costing: Costing, values: dict[str, float], errors: Sequence[tuple[int, PoseError]]
+) -> Floats:
+    """Losses of an action under errors, (count,); a simulation that failed is left out."""
+    action, losses = costing.scene.action(dict(values)), []
+    for seed, error in errors:
+        outcome = bench.answer(Simulate(costing.scene.name, action, costing.parameters, seed, "judge", error))
+        vector = costing.simulated(outcome, action)
+        if vector is not None:
+            losses.append(costing.total(vector))
+    return np.array(losses)
+
+
+def resampled(losses: Sequence[Floats], quantile: float | None, rng: np.random.Generator) -> Floats:
+    """Mean or quantile of plans and evaluations drawn again, (RESAMPLED,)."""
+    found = []
+    for _ in range(RESAMPLED):
+        plans = rng.integers(0, len(losses), len(losses))
+        drawn = np.concatenate([rng.choice(losses[i], len(losses[i])) for i in plans])
+        found.append(drawn.mean() if quantile is None else np.quantile(drawn, quantile))
+    return np.array(found)
+
+
+def row_of(way: str, losses: Sequence[Floats]) -> dict[str, Any]:
+    """Mean, 90 % quantile and CVaR of all evaluations, in per cent, with intervals."""
+    row: dict[str, Any] = {"way": way}
+    every = np.concatenate(losses)
+    for name, quantile in (("mean", None), ("q90", 0.9)):
+        value = every.mean() if quantile is None else np.quantile(every, quantile)
+        low, high = np.quantile(resampled(losses, quantile, np.random.default_rng(1)), [0.025, 0.975])
+        row[name] = round(100 * float(value), 2)
+        row[f"{name}_low"], row[f"{name}_high"] = round(100 * float(low), 2), round(100 * float(high), 2)
+    row["evaluations"] = len(every)
+    return row
+
+
+def deployment(receiver: Path, particles: int) -> tuple[DeploymentPlan, Scene, SimulationParameters]:
+    """The quickstart's deployment, into another receiver if one is given, as a D1 without pours."""
+    plan = load_campaign(ROOT / "configs/campaigns/quickstart.yaml")
+    assert plan.deployment is not None
+    vessel = load_vessel(receiver)
+    scene = replace(plan.deployment.scenes[0], receiver=vessel, name=vessel.name)
+    theta = plan.parameters.model_copy(update={"particles": particles})
+    return replace(plan.deployment, strategy="D1", scenes=(scene,), pours=0), scene, theta
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plans", type=int, default=3)
+    parser.add_argument("--evaluations", type=int, default=40)
+    parser.add_argument("--iterations", type=int, default=12)
+    parser.add_argument("--per-iteration", type=int, default=4)
+    parser.add_argument("--particles", type=int, default=500)
+    parser.add_argument("--receiver", type=Path, default=ROOT / "configs/vessels/narrow.yaml")
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    pin(None)
+    base, scene, theta = deployment(asked.receiver, asked.particles)
+    base = replace(base, iterations=asked.iterations, simulations_per_iteration=asked.per_iteration)
+    bench, costing = Bench(scene), Costing.of(base, scene, theta)
+    rows, actions, every = [], [], {}
+    for way, risk in WAYS.items():
+        plan = replace(base, risk=risk)
+        losses = []
+        for seed in range(asked.plans):
+            strategy = OneShotPlanning if risk is None else RobustPlanning
+            result = bench.plan(strategy(plan, scene, theta, seed))
+            losses.append(evaluated(bench, costing, result["action_si"], fresh_errors(asked.evaluations, seed)))
+            said = f"promised {100 * result['predicted_loss']:.2f} %, came to {100 * losses[-1].mean():.2f} %"
+            actions.append({"way": way, "seed": seed, "action": result["action"], "promised": result["predicted_loss"]})
+            say(f"{way}, plan {seed + 1}: {described(result['action_si'])}; {said}")
+        rows.append(row_of(way, losses))
+        every[way] = [list(map(float, one)) for one in losses]
+    totals = {"simulations": bench.simulations, "touched": bench.touched, "cpu_s": round(bench.seconds)}
+    show({"rows": rows, "actions": actions, "losses": every, **totals, "machine": describe()}, asked.json)
+
+
+if __name__ == "__main__":
+    main()

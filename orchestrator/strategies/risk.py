@@ -1,0 +1,171 @@
+"""Errors of execution and θ that an action has to bear: their draws, and how a surrogate sees them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from actors.optimizer.core.problem import Disturbance, Point, Risk
+from orchestrator.plan import RiskPlan
+from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis, Space
+from sim_engine.task import PoseError
+
+ERRORS = ("x", "y", "tilt", "speed_factor")
+
+FARTHEST = 3.5
+"""Standard deviations beyond which no error is drawn: less than one in two thousand."""
+
+SLOWEST, FASTEST = 0.5, 1.5
+"""Bounds of a drawn speed factor, those of the virtual bench."""
+
+WIDTH = 8.0
+"""Standard deviations on the unit interval, for what the surrogate sees beside the action. The optimiser's prior for
+lengthscales, 0.35, is then 2.8 of them: an error of one changes the spillage smoothly."""
+
+FEWEST, MOST, IN_TAIL = 32, 256, 6
+"""Draws over which the surrogate's measure is formed: at least, at most, and so many in the tail of CVaR."""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One way in which a pour may go otherwise than planned.
+
+    Attributes:
+        error: of execution; None: as planned.
+        z: standardised errors, those of `Disturbances.errors`.
+    """
+
+    error: PoseError | None
+    parameters: SimulationParameters
+    z: Point
+
+
+class Disturbances:
+    """Draws of errors and θ: quasi-random, normal by the inverse of its distribution.
+
+    An error that only moves a searched dimension (x: x_offset, y: y_offset, speed: angular_velocity) is to the
+    surrogate just that, an action a little beside the one that was asked for: what is executed is what is observed.
+    So these errors cost no dimension, and every simulation tells about its neighbours. Other errors (tilt, or a
+    dimension that is not searched), and θ, are coordinates beside the action.
+
+    Source: quasi-random normal draws: Glasserman, Monte Carlo methods in financial engineering, 2003, chapter 5.
+    """
+
+    def __init__(self, plan: RiskPlan, actions: Space, best: SimulationParameters, seed: int) -> None:
+        """Draw.
+
+        Args:
+            best: θ*.
+            seed: of the draws.
+        """
+        self._plan, self._actions, self._best, self._seed = plan, actions, best, seed
+        self._thetas = plan.thetas if plan.theta == "posterior" else ()
+        self.errors = tuple(name for name in ERRORS if getattr(plan.pose_error, name) > 0.0)
+        folded = {name: _folded(name, actions) for name in self.errors}
+        self._moves = {name: axis for name, axis in folded.items() if axis is not None}
+
+    @property
+    def nominal(self) -> Draw:
+        """As planned, with θ*."""
+        return Draw(None, self._best, (0.0,) * len(self.errors))
+
+    def draws(self, count: int, stream: int = 0) -> list[Draw]:
+        """The first draws of a sequence, of which any stretch covers errors and θ evenly.
+
+        Args:
+            count: at least 1.
+            stream: which sequence; those of different streams have nothing to do with each other.
+        """
+        dimension = len(self.errors) + bool(self._thetas)
+        if dimension == 0:
+            return [self.nominal] * count
+        sampler = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng([self._seed, stream]))
+        uniform = sampler.random_base2(max(math.ceil(math.log2(count)), 0))[:count]
+        return [self._draw(row) for row in uniform]
+
+    def _draw(self, row: Sequence[float]) -> Draw:
+        z = tuple(float(np.clip(ndtri(u), -FARTHEST, FARTHEST)) for u in row[: len(self.errors)])
+        drawn = {name: getattr(self._plan.pose_error, name) * value for name, value in zip(self.errors, z, strict=True)}
+        drawn["speed_factor"] = min(max(1.0 + drawn.get("speed_factor", 0.0), SLOWEST), FASTEST)
+        parameters = self._best
+        if self._thetas:
+            parameters = self._thetas[min(int(row[-1] * len(self._thetas)), len(self._thetas) - 1)]
+        return Draw(PoseError(**drawn) if self.errors else None, parameters, z)
+
+    # -- as the surrogate sees them --------------------------------------------------------------------------------
+
+    @cached_property
+    def risk(self) -> Risk:
+        """What a question minimises: the same disturbances whichever the action is."""
+        wanted = IN_TAIL / (1.0 - self._plan.tail)
+        count = min(max(2 ** math.ceil(math.log2(wanted)), FEWEST), MOST)
+        return Risk(tuple(self.disturbance(draw) for draw in self.tried(count)), self._plan.tail)
+
+    def tried(self, count: int) -> list[Draw]:
+        """The draws that `risk` is made of, in its order."""
+        return self.draws(count, stream=1)
+
+    def disturbance(self, draw: Draw) -> Disturbance:
+        """How a draw changes an action in its unit cube."""
+        scales, shifts = [1.0] * self._actions.dimension, [0.0] * self._actions.dimension
+        error = draw.error or PoseError()
+        for name, index in self._moves.items():
+            scales[index], shifts[index] = _moved(self._actions.axes[index], name, error)
+        beside = [0.5 + z / WIDTH for name, z in zip(self.errors, draw.z, strict=True) if name not in self._moves]
+        return Disturbance(tuple(scales), tuple(shifts), (*beside, *self._coordinates(draw.parameters)))
+
+    def executed(self, point: Point, draw: Draw) -> Point:
+        """Where the surrogate sees a simulation of an action (in its unit cube) under a draw."""
+        one = self.disturbance(draw)
+        moved = [s * u + t for u, s, t in zip(point, one.scales, one.shifts, strict=True)]
+        return (*moved, *one.context)
+
+    def _coordinates(self, parameters: SimulationParameters) -> Point:
+        return tuple(
+            0.5 + (_number(parameters, name) - centre) / (WIDTH * spread) for name, centre, spread in self._varying
+        )
+
+    @cached_property
+    def _varying(self) -> tuple[tuple[str, float, float], ...]:
+        """Parameters that differ between the draws, with centre and spread."""
+        found = []
+        for name in type(self._best).model_fields:
+            values = [_number(theta, name) for theta in self._thetas]
+            if len(set(values)) > 1:
+                found.append((name, float(np.mean(values)), float(np.std(values))))
+        return tuple(found)
+
+
+def _number(parameters: SimulationParameters, name: str) -> float:
+    """For the surrogate; a number of particles by its logarithm, for it spans decades."""
+    value = float(getattr(parameters, name))
+    return math.log(value) if name == "particles" else value
+
+
+def _folded(error: str, actions: Space) -> int | None:
+    """Index of the searched axis that an error only moves; None: there is none."""
+    name = {"x": "x_offset", "y": "y_offset", "speed_factor": "angular_velocity"}.get(error)
+    if name not in actions.names:
+        return None
+    index = actions.names.index(name)
+    placed = error == "speed_factor" or actions.axes[index].scale == "linear"
+    return index if placed else None
+
+
+def _moved(axis: Axis, error: str, drawn: PoseError) -> tuple[float, float]:
+    """Scale and shift of an axis' unit interval under an error."""
+    width = axis.upper - axis.lower
+    if error == "x":
+        return 1.0, drawn.x / width
+    if error == "y":  # the receiver moves, so the pourer is off the other way
+        return 1.0, -drawn.y / width
+    if axis.scale == "log":
+        return 1.0, math.log(drawn.speed_factor) / math.log(axis.upper / axis.lower)
+    return drawn.speed_factor, (drawn.speed_factor - 1.0) * axis.lower / width
