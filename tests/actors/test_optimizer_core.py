@@ -235,3 +235,19 @@ def test_a_suggestion_at_a_hundred_points_takes_far_less_than_a_simulation():
     costs = bowl(points) + 0.1 * np.random.default_rng(8).standard_normal(100)
     problem = SuggestProblem(PLANE, data_of(points, costs))
     assert min(propose(problem).seconds for _ in range(3)) < 0.25  # 0.03 s where nothing else runs
+
+
+def test_once_costs_show_structure_less_is_given_for_the_unknown():
+    points = tuple(map(tuple, np.random.default_rng(4).random((10, 2)).tolist()))
+    cover = tuple(map(tuple, np.random.default_rng(5).random((2000, 2)).tolist()))
+
+    def excess(costs, kappa):
+        """By how much the proposal misses the least m − κ s of a cover."""
+        answer = propose(SuggestProblem(PLANE, Data(points, tuple(costs)), kappa=2.0, seed=1, predict_at=cover))
+        bound = np.array(answer.predictions) - kappa * np.array(answer.prediction_deviations)
+        return (answer.means[0] - kappa * answer.deviations[0] - bound.min()) / np.std(costs)
+
+    bowl = [(x - 0.3) ** 2 + (y - 0.6) ** 2 for x, y in points]
+    noise = np.random.default_rng(1).random(10).tolist()
+    assert excess(bowl, 1.0) < 0.01 < excess(bowl, 2.0)
+    assert excess(noise, 2.0) < 0.01 < excess(noise, 1.0)
