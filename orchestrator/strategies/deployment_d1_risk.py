@@ -19,6 +19,9 @@ from sim_engine.task import Scene
 FRESH = 2
 """Stream of draws for checks of the window; the surrogate's own, and those that are simulated, are others."""
 
+FEWEST_DRAWS = 4
+"""With which an action that is to lie inside the safe window is simulated, unless m1 is more."""
+
 
 class RobustPlanning(OneShotPlanning):
     """D1 under disturbances: minimise the mean or the CVaR of the loss over errors of execution and θ.
@@ -67,6 +70,10 @@ class RobustPlanning(OneShotPlanning):
             super(RobustPlanning, self)._outlined(window, problem, outline)
 
         self._questions.put(replace(problem, risk=Risk(few)), "window", known)
+
+    @property
+    def _checks(self) -> int:
+        return max(self._plan.simulations_per_iteration, FEWEST_DRAWS)
 
     @property
     def _check_draws(self) -> list[Draw]:
