@@ -2,7 +2,7 @@
 
 Toy losses, cheap and known exactly, at the same number of simulations:
 
-    python benchmarks/risk_measures.py [--seeds 5] [--simulations 48] [--toys cup cliff] [--json]
+    python benchmarks/risk_measures.py [--seeds 5] [--simulations 48] [--toys cup cliff valleys] [--json]
 
 `joint` is `orchestrator.strategies.deployment_d1_risk`; `raw` forms the mean or CVaR of the m1 losses of each action,
 under the same m1 draws for all of them, and regresses that over actions; `plain` is D1, which knows of no errors.
@@ -57,7 +57,15 @@ def cliff(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
     return np.clip(np.where(d < 0.0, 0.9, far) + np.abs(tilt) + 4.0 * np.abs(y), 0.0, 1.0)
 
 
-TOYS: dict[str, Callable[[Floats, Floats, Floats, Floats], Floats]] = {"cup": cup, "cliff": cliff}
+def valleys(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
+    """A narrow valley that spills nothing, and a broad one that always spills a little."""
+    speed = ((v - 0.5) / 0.8) ** 2
+    narrow = 1.0 - np.exp(-0.5 * (((x - 0.25) / 0.06) ** 2 + speed))
+    broad = 1.0 - 0.95 * np.exp(-0.5 * (((x - 0.7) / 0.2) ** 2 + speed))
+    return np.clip(np.minimum(narrow, broad) + np.abs(tilt) + 4.0 * np.abs(y), 0.0, 1.0)
+
+
+TOYS: dict[str, Callable[[Floats, Floats, Floats, Floats], Floats]] = {"cup": cup, "cliff": cliff, "valleys": valleys}
 
 
 class RawMeasure(RobustPlanning):
@@ -73,8 +81,8 @@ class RawMeasure(RobustPlanning):
             data = data.added(trial.point, conditional_value_at_risk(losses, self._risk.tail))
         return data
 
-    def _problem(self, data: Data, **changes: object) -> SuggestProblem:
-        return OneShotPlanning._problem(self, data, **changes)
+    def _model(self, *, everything: bool = False, **changes: object) -> SuggestProblem:
+        return OneShotPlanning._model(self, everything=everything, **changes)
 
 
 WAYS: dict[str, tuple[type[OneShotPlanning], int]] = {

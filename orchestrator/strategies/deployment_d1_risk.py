@@ -49,7 +49,7 @@ class RobustPlanning(OneShotPlanning):
         self._used = 0
         self._draws: dict[Simulate, Draw] = {}
         self._touching: set[Action] = set()
-        self._candidates: tuple[Point, ...] = ()
+        self._nothing_allowed = False
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -104,20 +104,21 @@ class RobustPlanning(OneShotPlanning):
                     data = data.added(self._disturbances.executed(trial.point, self._draws[request]), cost)
         return data
 
-    def _problem(self, data: Data, **changes: object) -> SuggestProblem:
-        problem = super()._problem(data, **changes)
-        if len(data) == 0:
+    def _model(self, *, everything: bool = False, **changes: object) -> SuggestProblem:
+        problem = super()._model(everything=everything, **changes)
+        if len(problem.data) == 0:
             return problem
-        return replace(problem, risk=self._disturbances.risk, predict_at=self._allowed() or data.points[:1])
+        places = self._allowed(everything=everything) or (problem.data.points[0][: self._plan.actions.dimension],)
+        return replace(problem, risk=self._disturbances.risk, predict_at=places)
 
-    def _allowed(self) -> tuple[Point, ...]:
+    def _allowed(self, *, everything: bool) -> tuple[Point, ...]:
         """Tried actions that may be recommended: something came of them, and their cups don't touch as planned."""
-        tried = [t for t in self._trials.all if any(cost is not None for cost in t.costs.values())]
+        tried = [t for t in self._trials.counting(everything=everything) if t.cost is not None]
         return tuple(dict.fromkeys(t.point for t in tried if t.requests[0].action not in self._touching))
 
     def _recommend(self, suggestion: Suggestion) -> None:
-        self._candidates = self._allowed()
-        if not self._candidates:
+        if not self._allowed(everything=True):
+            self._nothing_allowed = True
             suggestion = replace(suggestion, best_point=None)
         super()._recommend(suggestion)
 
@@ -148,13 +149,13 @@ class RobustPlanning(OneShotPlanning):
         """Mean and standard deviation over the disturbances, of what is recommended."""
         if suggestion.risk is None or suggestion.best_point is None:
             return None
-        index = self._candidates.index(suggestion.best_point)
+        index = min(range(len(suggestion.predictions)), key=suggestion.predictions.__getitem__)
         return suggestion.risk.expected[index], suggestion.risk.spreads[index]
 
     def result(self) -> dict[str, object]:
         """As D1; with the measure, and mean and spread over the disturbances."""
         result = super().result()
-        if self._final is not None and not self._candidates:
+        if self._nothing_allowed:
             result["gave_up"] = "at every action that was tried the cups touch as planned, or every simulation failed"
         if self._final is not None and (known := self._answer(self._final)) is not None:
             result["risk"] = {
