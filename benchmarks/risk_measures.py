@@ -2,7 +2,7 @@
 
 Toy losses, cheap and known exactly, at the same number of simulations:
 
-    python benchmarks/risk_measures.py [--seeds 6] [--iterations 12] [--per-iteration 4] [--toys cup cliff] [--json]
+    python benchmarks/risk_measures.py [--seeds 5] [--simulations 48] [--toys cup cliff valleys] [--json]
 
 `joint` is `orchestrator.strategies.deployment_d1_risk`; `raw` forms the mean or CVaR of the m1 losses of each action,
 under the same m1 draws for all of them, and regresses that over actions; `plain` is D1, which knows of no errors.
@@ -57,7 +57,15 @@ def cliff(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
     return np.clip(np.where(d < 0.0, 0.9, far) + np.abs(tilt) + 4.0 * np.abs(y), 0.0, 1.0)
 
 
-TOYS: dict[str, Callable[[Floats, Floats, Floats, Floats], Floats]] = {"cup": cup, "cliff": cliff}
+def valleys(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
+    """A narrow valley that spills nothing, and a broad one that always spills a little."""
+    speed = ((v - 0.5) / 0.8) ** 2
+    narrow = 1.0 - np.exp(-0.5 * (((x - 0.25) / 0.06) ** 2 + speed))
+    broad = 1.0 - 0.95 * np.exp(-0.5 * (((x - 0.7) / 0.2) ** 2 + speed))
+    return np.clip(np.minimum(narrow, broad) + np.abs(tilt) + 4.0 * np.abs(y), 0.0, 1.0)
+
+
+TOYS: dict[str, Callable[[Floats, Floats, Floats, Floats], Floats]] = {"cup": cup, "cliff": cliff, "valleys": valleys}
 
 
 class RawMeasure(RobustPlanning):
@@ -73,11 +81,17 @@ class RawMeasure(RobustPlanning):
             data = data.added(trial.point, conditional_value_at_risk(losses, self._risk.tail))
         return data
 
-    def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
-        return OneShotPlanning._problem(self, data, everything=everything, **changes)
+    def _model(self, *, everything: bool = False, **changes: Any) -> SuggestProblem:
+        return OneShotPlanning._model(self, everything=everything, **changes)
 
 
-WAYS: dict[str, type[OneShotPlanning]] = {"joint": RobustPlanning, "raw": RawMeasure, "plain": OneShotPlanning}
+WAYS: dict[str, tuple[type[OneShotPlanning], int]] = {
+    "joint, 2 each": (RobustPlanning, 2),
+    "joint, 4 each": (RobustPlanning, 4),
+    "raw, 4 each": (RawMeasure, 4),
+    "plain, 2 each": (OneShotPlanning, 2),
+}
+"""Strategy, and simulations of each action."""
 
 
 def answer(request: Request, toy: Callable[..., Floats]) -> Outcome:
@@ -118,9 +132,8 @@ def truth(toy: Callable[..., Floats], level: float, places: Floats) -> Floats:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=6)
-    parser.add_argument("--iterations", type=int, default=12)
-    parser.add_argument("--per-iteration", type=int, default=4)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--simulations", type=int, default=48)
     parser.add_argument("--toys", nargs="+", choices=list(TOYS), default=list(TOYS))
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
@@ -131,17 +144,17 @@ def main() -> None:
         for level in (0.0, 0.9):
             least = float(truth(TOYS[name], level, grid).min())
             risk = RiskPlan("cvar" if level else "expected", level or 0.9, ERRORS)
-            plan = DeploymentPlan(
-                "D1",
-                (SCENE,),
-                SPACE,
-                Loss(),
-                pours=0,
-                iterations=asked.iterations,
-                simulations_per_iteration=asked.per_iteration,
-                risk=risk,
-            )
-            for way, strategy in WAYS.items():
+            for way, (strategy, each) in WAYS.items():
+                plan = DeploymentPlan(
+                    "D1",
+                    (SCENE,),
+                    SPACE,
+                    Loss(),
+                    pours=0,
+                    iterations=asked.simulations // each,
+                    simulations_per_iteration=each,
+                    risk=risk,
+                )
                 chosen = [
                     SPACE.encode(play(strategy(plan, SCENE, SimulationParameters(), seed), TOYS[name])["action_si"])
                     for seed in range(asked.seeds)

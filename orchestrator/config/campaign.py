@@ -243,10 +243,10 @@ class DeploymentSection(Section):
     """Real pours per receiver; D1: 1 unless given, 0 only plans."""
 
     iterations: PositiveCount | None = None
-    """D1: iterations of the optimiser; 15 unless given."""
+    """D1: iterations of the optimiser; 15 unless given, 30 with 'risk'."""
 
     simulations_per_iteration: PositiveCount | None = None
-    """D1: simulations averaged in each; 2 unless given, 4 with 'risk'."""
+    """D1: simulations averaged in each, under 'risk' one as planned and the others under errors; 2 unless given."""
 
     prior_simulations: Count | None = None
     """D3: simulations before the first pour; 37 unless given."""

@@ -21,6 +21,9 @@ from sim_engine.task import Scene
 FRESH = 2
 """Stream of draws for checks of the window; the surrogate's own, and those that are simulated, are others."""
 
+FEWEST_DRAWS = 4
+"""With which an action that is to lie inside the safe window is simulated, unless m1 is more."""
+
 
 class RobustPlanning(OneShotPlanning):
     """D1 under disturbances: minimise the mean or the CVaR of the loss over errors of execution and θ.
@@ -49,7 +52,7 @@ class RobustPlanning(OneShotPlanning):
         self._used = 0
         self._draws: dict[Simulate, Draw] = {}
         self._touching: set[Action] = set()
-        self._candidates: tuple[Point, ...] = ()
+        self._nothing_allowed = False
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -70,6 +73,10 @@ class RobustPlanning(OneShotPlanning):
             super(RobustPlanning, self)._outlined(window, problem, outline)
 
         self._questions.put(replace(problem, risk=Risk(few)), "window", known)
+
+    @property
+    def _checks(self) -> int:
+        return max(self._plan.simulations_per_iteration, FEWEST_DRAWS)
 
     @property
     def _check_draws(self) -> list[Draw]:
@@ -100,22 +107,21 @@ class RobustPlanning(OneShotPlanning):
                     data = data.added(self._disturbances.executed(trial.point, self._draws[request]), cost)
         return data
 
-    def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
-        problem = super()._problem(data, everything=everything, **changes)
-        if len(data) == 0:
+    def _model(self, *, everything: bool = False, **changes: Any) -> SuggestProblem:
+        problem = super()._model(everything=everything, **changes)
+        if len(problem.data) == 0:
             return problem
-        return replace(
-            problem, risk=self._disturbances.risk, predict_at=self._allowed() or (self._trials.all[0].point,)
-        )
+        places = self._allowed(everything=everything) or (problem.data.points[0][: self._plan.actions.dimension],)
+        return replace(problem, risk=self._disturbances.risk, predict_at=places)
 
-    def _allowed(self) -> tuple[Point, ...]:
+    def _allowed(self, *, everything: bool) -> tuple[Point, ...]:
         """Tried actions that may be recommended: something came of them, and their cups don't touch as planned."""
-        tried = [t for t in self._trials.all if any(cost is not None for cost in t.costs.values())]
+        tried = [t for t in self._trials.counting(everything=everything) if t.cost is not None]
         return tuple(dict.fromkeys(t.point for t in tried if t.requests[0].action not in self._touching))
 
     def _recommend(self, suggestion: Suggestion) -> None:
-        self._candidates = self._allowed()
-        if not self._candidates:
+        if not self._allowed(everything=True):
+            self._nothing_allowed = True
             suggestion = replace(suggestion, best_point=None)
         super()._recommend(suggestion)
 
@@ -146,13 +152,13 @@ class RobustPlanning(OneShotPlanning):
         """Mean and standard deviation over the disturbances, of what is recommended."""
         if suggestion.risk is None or suggestion.best_point is None:
             return None
-        index = self._candidates.index(suggestion.best_point)
+        index = min(range(len(suggestion.predictions)), key=suggestion.predictions.__getitem__)
         return suggestion.risk.expected[index], suggestion.risk.spreads[index]
 
     def result(self) -> dict[str, object]:
         """As D1; with the measure, and mean and spread over the disturbances."""
         result = super().result()
-        if self._final is not None and not self._candidates:
+        if self._nothing_allowed:
             result["gave_up"] = "at every action that was tried the cups touch as planned, or every simulation failed"
         if self._final is not None and (known := self._answer(self._final)) is not None:
             result["risk"] = {

@@ -95,7 +95,9 @@ def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
     first = play()
     assert first.pours
     assert play().asked == first.asked
-    assert play("last").simulations == first.simulations
+    late = play("last")
+    assert (late.simulations, late.pours) == (first.simulations, first.pours)
+    assert [r for r in late.asked if isinstance(r, Suggest)] == [r for r in first.asked if isinstance(r, Suggest)]
     assert replay(risky(3, iterations=6, pours=1, tolerance=0.3), first) == first.asked
     written = [json.loads(json.dumps(encode_request(request))) for request in first.asked]
     assert [decode_request(one) for one in written] == first.asked
@@ -145,8 +147,9 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
     assert plain.best_values["x_offset"] < strategy.best_values["x_offset"]
 
 
-def test_where_every_action_touches_nothing_is_recommended() -> None:
-    strategy = risky(iterations=4, pours=1, tolerance=0.1)
+@pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG)])
+def test_where_every_action_touches_nothing_is_recommended(errors: PoseError) -> None:
+    strategy = risky(iterations=4, pours=1, tolerance=0.1, risk=RiskPlan("expected", pose_error=errors))
     played = Play(touching_below(1.0))(strategy)
     assert not played.pours
     assert strategy.best_values is None

@@ -55,7 +55,7 @@ def test_a_risk_is_read_as_it_was_meant_and_can_be_read_again(tmp_path: Path) ->
     assert (risk.measure, risk.level, risk.tail, risk.theta) == ("cvar", 0.9, 0.9, "posterior")
     assert risk.pose_error == PoseError(3e-3, 3e-3, pytest.approx(0.5 * DEG), 0.02)  # type: ignore[arg-type]
     assert plan.deployment.tolerance == pytest.approx(0.02)
-    assert plan.deployment.simulations_per_iteration == 4
+    assert (plan.deployment.iterations, plan.deployment.simulations_per_iteration) == (30, 2)
     again = tmp_path / "again.yaml"
     again.write_text(json.dumps(plan.resolved), encoding="utf-8")
     loaded = load_campaign(again)
@@ -67,7 +67,7 @@ def test_a_run_without_a_risk_has_the_fingerprint_that_it_always_had(tmp_path: P
     assert not {"risk", "tolerance"} & set(fingerprint(plain)["deployment"])
     assert fingerprint(risky)["deployment"]["risk"]["measure"] == "cvar"
     assert plain.deployment is not None
-    assert plain.deployment.simulations_per_iteration == 2
+    assert (plain.deployment.iterations, plain.deployment.simulations_per_iteration) == (15, 2)
     other = replace(plain.deployment, tolerance=0.02)
     assert fingerprint(replace(plain, deployment=other)) != fingerprint(plain)
 
