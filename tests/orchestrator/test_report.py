@@ -35,7 +35,13 @@ from tests.orchestrator.reported import is_picture, shown
 
 def test_run_gets_every_figure_that_its_results_allow(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
     drawn = draw_figures(tmp_path / "figures", watched.campaign(), results)
-    assert set(drawn) == {"discrepancy map", "test discrepancy", "spillage against pours", "loss map narrow"}
+    assert set(drawn) == {
+        "discrepancy map",
+        "test discrepancy",
+        "posterior",
+        "spillage against pours",
+        "loss map narrow",
+    }
     assert all(is_picture(path) for path in drawn.values())
 
 
@@ -51,7 +57,7 @@ def test_a_figure_that_fails_does_not_take_the_others_with_it(
     (tmp_path / "spillage.png").mkdir()
     drawn = draw_figures(tmp_path, watched.campaign(), results)
     assert "spillage against pours" not in drawn
-    assert len(drawn) == 3
+    assert len(drawn) == 4
     assert "figure 'spillage against pours' was not drawn" in caplog.text
 
 
