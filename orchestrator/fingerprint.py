@@ -47,7 +47,7 @@ NEW_MODEL: ModelName = "scaled"
 
 _CAME_TOGETHER: tuple[dict[str, Any], ...] = (
     {"model": NEW_MODEL, "trust": TrustPlan()},
-    {"noise": "varying", "refusals": "avoid"},
+    {"noise": "constant", "refusals": "avoid"},
 )
 """Fields of a deployment that came at the same time, each with what a campaign has that doesn't name it."""
 
@@ -55,8 +55,8 @@ _CAME_TOGETHER: tuple[dict[str, Any], ...] = (
 def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
     """The plan of a run that began before a deployment had some fields, if the campaign asks for nothing else.
 
-    Such a run goes on as it began: with the paper's model and an alarm that only tells, with the same noise
-    everywhere, and with the worst cost for actions that can't be made.
+    Such a run goes on as it began: with the paper's model and an alarm that only tells, and with the worst cost for
+    actions that can't be made.
 
     Args:
         plan: of the campaign, as it is read today.

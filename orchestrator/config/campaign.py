@@ -263,7 +263,7 @@ class DeploymentSection(Section):
     trust: TrustSection | None = None
     """D3: when the first pours say that the simulator is wrong, and what follows."""
 
-    noise: Literal["constant", "varying"] = "varying"
+    noise: Literal["constant", "varying"] = "constant"
     """Scatter of a pour: the same everywhere, or varying with the action where at least 20 observations show it."""
 
     risk: RiskSection | None = None

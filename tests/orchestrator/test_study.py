@@ -269,10 +269,8 @@ def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None
 
 def test_a_study_from_before_goes_on_with_what_its_deployments_began_with(tmp_path: Path) -> None:
     today = small(tmp_path)
-    assert {(arm.plan.noise, arm.plan.refusals) for arm in today.deployments} == {("varying", "avoid")}
-    arms = tuple(
-        replace(arm, plan=replace(arm.plan, noise="constant", refusals="penalise")) for arm in today.deployments
-    )
+    assert {(arm.plan.noise, arm.plan.refusals) for arm in today.deployments} == {("constant", "avoid")}
+    arms = tuple(replace(arm, plan=replace(arm.plan, refusals="penalise")) for arm in today.deployments)
     with opened(replace(today, deployments=arms)) as folder:
         begun = json.loads((folder / "study.json").read_text(encoding="utf-8"))["deployments"]
     assert not any({"noise", "refusals"} & set(arm) for arm in begun.values())  # as it was before there were any
