@@ -21,6 +21,7 @@ from orchestrator.strategies.risk import Disturbances
 from sim_engine.action import DEG
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
+from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
 from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, executed, replay
 from tests.orchestrator.toys import quiet_valleys, two_valleys
@@ -183,14 +184,25 @@ def test_errors_and_thetas_are_drawn_as_they_were_said_to_be() -> None:
 
 def test_an_error_is_to_the_surrogate_the_action_that_was_executed() -> None:
     plan = RiskPlan("expected", pose_error=PoseError(x=5e-3, y=1e-3, speed_factor=0.1))
+    values = {"angular_velocity": 60 * DEG, "x_offset": 0.11, "y_offset": 0.01}
+    sideways = Space((*ACTIONS.axes, Axis("y_offset", -0.02, 0.02)))
+    logarithmic = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG, "log"), *sideways.axes[1:]))
+    for space in (sideways, logarithmic):
+        disturbances = Disturbances(plan, space, THETA, 0)
+        for draw in disturbances.draws(8):
+            action = executed(SCENE.action(values), draw.error)
+            expected = space.encode({name: getattr(action, name) for name in space.names})
+            assert disturbances.executed(tuple(space.encode(values)), draw) == pytest.approx(expected)
+
+
+def test_an_error_of_what_is_not_searched_is_a_coordinate_beside_the_action() -> None:
+    plan = RiskPlan("expected", pose_error=PoseError(y=1e-3, tilt=1 * DEG, speed_factor=0.0))
     disturbances = Disturbances(plan, ACTIONS, THETA, 0)
-    values = {"angular_velocity": 60 * DEG, "x_offset": 0.11}
     for draw in disturbances.draws(8):
-        *seen, beside = disturbances.executed(tuple(ACTIONS.encode(values)), draw)
-        action = executed(SCENE.action(values), draw.error)
-        assert seen == pytest.approx(ACTIONS.encode({name: getattr(action, name) for name in ACTIONS.names}))
         assert draw.error is not None
-        assert beside == pytest.approx(0.5 + draw.error.y / 1e-3 / 8.0)
+        *seen, y, tilt = disturbances.executed((0.3, 0.4), draw)
+        assert seen == [0.3, 0.4]
+        assert (y, tilt) == pytest.approx((0.5 + draw.error.y / 1e-3 / 8.0, 0.5 + draw.error.tilt / DEG / 8.0))
 
 
 def test_thetas_of_the_calibration_before_are_borne_and_a_campaign_without_says_so() -> None:
