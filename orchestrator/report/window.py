@@ -69,10 +69,12 @@ def _map_panel(axes: Axes, picture: SurrogatePicture, window: Mapping[str, Any],
         for name, ends in window["axes"].items():
             low, high = (ends[way] / style.display_factor(name) for way in ("low", "high"))
             if name == across.name:
-                axes.plot([low, high], [y, y], color=style.BEST, linewidth=3.0, solid_capstyle="butt")
+                axes.plot([low, high], [y, y], color=style.BEST, linewidth=3.0, solid_capstyle="butt", clip_on=False)
             elif name == up.name:
-                axes.plot([x, x], [low, high], color=style.BEST, linewidth=3.0, solid_capstyle="butt")
-        axes.scatter([x], [y], marker="*", s=230, color=style.BEST, edgecolors="white", linewidths=1.2, zorder=5)
+                axes.plot([x, x], [low, high], color=style.BEST, linewidth=3.0, solid_capstyle="butt", clip_on=False)
+        axes.scatter(
+            [x], [y], marker="*", s=230, color=style.BEST, edgecolors="white", linewidths=1.2, zorder=5, clip_on=False
+        )
     style.dress(axes, title=f"{unit.label}, contour at the tolerance", x=style.label(across.name), grid=None)
     axes.set_ylabel(style.label(up.name), fontsize=9.5, color=style.INK)
 
