@@ -83,9 +83,13 @@ def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, equation 4.17.
     """
-    correlation: Array = Matern(length_scale=lengths, nu=2.5)(first, second)
     s = np.sqrt(5.0) * cdist(first / lengths, second / lengths)
-    return correlation, (5.0 / 3.0) * (1.0 + s) * np.exp(-s)
+    return correlated(first, second, lengths), (5.0 / 3.0) * (1.0 + s) * np.exp(-s)
+
+
+def correlated(first: Array, second: Array, lengths: Array) -> Array:
+    """Matérn 5/2 correlation alone: (m, k) between points (m, d) and (k, d)."""
+    return np.asarray(Matern(length_scale=lengths, nu=2.5)(first, second))
 
 
 class Covariance:
@@ -219,17 +223,31 @@ class Covariance:
     def cross(self, theta: Array, points: Array) -> Array:
         """Of the noise-free real cost at points (m, d) with the observations: (m, n)."""
         rho = self.value(theta, "rho")
-        correlation = matern(points, self.points, self.lengths(theta))[0]
+        correlation = correlated(points, self.points, self.lengths(theta))
         K = self.value(theta, "signal") ** 2 * rho * correlation * np.where(self._mask, rho, 1.0)
         K += self._remainder(theta, points, self.points) * self._loads
         return K if self._known is None else K + self._known.covariance(points, self.points) / self._unit**2
 
     def between(self, theta: Array, first: Array, second: Array) -> Array:
         """Of the noise-free real cost at points (m, d) and (k, d): (m, k)."""
-        correlation = matern(first, second, self.lengths(theta))[0]
+        correlation = correlated(first, second, self.lengths(theta))
         K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * correlation
         K += self._remainder(theta, first, second)
         return K if self._known is None else K + self._known.covariance(first, second) / self._unit**2
+
+    def cross_simulated(self, theta: Array, points: Array) -> Array:
+        """Of the noise-free simulated cost at points (m, d) with the observations: (m, n)."""
+        if self._known is not None:
+            return self._known.covariance(points, self.points) / self._unit**2
+        K = self.value(theta, "signal") ** 2 * correlated(points, self.points, self.lengths(theta))
+        return K * np.where(self._mask, self.value(theta, "rho"), 1.0)
+
+    def between_simulated(self, theta: Array, first: Array, second: Array, *, real: bool) -> Array:
+        """Of the noise-free simulated cost at points (m, d) and the simulated, or the real, one at (k, d): (m, k)."""
+        if self._known is not None:
+            return self._known.covariance(first, second) / self._unit**2
+        rho = self.value(theta, "rho") if real else 1.0
+        return self.value(theta, "signal") ** 2 * rho * correlated(first, second, self.lengths(theta))
 
     def variance(self, theta: Array, points: Array) -> Array:
         """Of the noise-free real cost at points (m, d): (m,)."""
@@ -244,7 +262,7 @@ class Covariance:
         if not self._scaled:
             return offset
         lengths = np.full(first.shape[1], self.value(theta, "delta_length"))
-        return offset + self.value(theta, "delta_signal") ** 2 * matern(first, second, lengths)[0]
+        return offset + self.value(theta, "delta_signal") ** 2 * correlated(first, second, lengths)
 
 
 def _by_length(points: Array, G: Array) -> Array:

@@ -11,7 +11,7 @@ Point = tuple[float, ...]
 """A point of the unit cube."""
 
 MeanName = Literal["constant", "zero", "simulated", "pooled", "scaled"]
-AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol"]
+AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol", "knowledge"]
 NoiseName = Literal["constant", "varying"]
 
 
@@ -85,6 +85,20 @@ class Posterior:
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How much a fit may cost. Without one it starts afresh and takes the time it needs.
+
+    Attributes:
+        start: hyperparameters to begin with, of each process in the order of fitting: `Suggestion.fitted` of an
+            earlier answer. A process without an entry is fitted afresh.
+        iterations: of the search for better ones, for processes that have a start; 0 takes them as they are.
+    """
+
+    start: tuple[tuple[float, ...], ...] = ()
+    iterations: int = 0
+
+
+@dataclass(frozen=True)
 class SuggestProblem:
     """Everything that a proposal depends on; the optimiser actor keeps no state that matters.
 
@@ -99,7 +113,8 @@ class SuggestProblem:
             and an offset of their own), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once).
         simulated: cheap observations of the same cost, for the last three.
         acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
-            answer the penalised 'lcb'); 'random' and 'sobol' only draw.
+            answer the penalised 'lcb'); 'random' and 'sobol' only draw. 'knowledge' looks for *simulations*: where one
+            more of them would lower the least expected real cost most (a mean that knows simulations is needed).
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has at least two dimensions, the answer carries the surrogate on a square
             grid over the two axes that matter most.
@@ -114,6 +129,8 @@ class SuggestProblem:
         noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
         widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
         posterior: with a context: weighed pours, for draws of the searched parameters given them.
+        pouring: 'knowledge': places of real observations whose outcome is out; `pending` are simulations then.
+        effort: limits the fit, and has the answer carry what was fitted.
     """
 
     space: Space
@@ -133,6 +150,8 @@ class SuggestProblem:
     noise: NoiseName = "constant"
     widening: float = 1.0
     posterior: PosteriorQuestion | None = None
+    pouring: tuple[Point, ...] = ()
+    effort: Effort | None = None
 
 
 @dataclass(frozen=True)
@@ -183,6 +202,10 @@ class Suggestion:
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
         feasibilities: probabilities that the proposals are not refused; empty while nothing was.
         posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
+        values: 'knowledge': by how much a simulation at each point is expected to lower the least expected real cost,
+            those before it given; in the cost's unit, not negative.
+        pour_value: 'knowledge': the same of the one real observation that would lower it most.
+        fitted: with `SuggestProblem.effort`: hyperparameters of each process, to start the next fit with.
     """
 
     points: tuple[Point, ...]
@@ -199,3 +222,6 @@ class Suggestion:
     noises: tuple[float, ...] = ()
     feasibilities: tuple[float, ...] = ()
     posterior: Posterior | None = None
+    values: tuple[float, ...] = ()
+    pour_value: float | None = None
+    fitted: tuple[tuple[float, ...], ...] = ()
