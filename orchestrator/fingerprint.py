@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from orchestrator.codec import to_json
-from orchestrator.plan import CampaignPlan, ModelName, TrustPlan
+from orchestrator.plan import CampaignPlan, ModelName, PricesPlan, TrustPlan
 from sim_engine.liquid import Liquid
 from sim_engine.task import Scene
 from sim_engine.vessel.spec import MeshShape
@@ -28,7 +28,7 @@ _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "han
 
 _YOUNGER: dict[str, dict[str, Any]] = {
     "calibration": {"grid": {}, "thetas": 0},
-    "deployment": {"data": None, "objectives": None, "model": "residual", "trust": None},
+    "deployment": {"data": None, "objectives": None, "model": "residual", "trust": None, "prices": None},
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
 
@@ -37,16 +37,21 @@ NEW_MODEL: ModelName = "scaled"
 
 
 def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
-    """The plan of a run that began before D3 had a model to choose and a policy, if the campaign asks for neither.
+    """The plan of a run that began before D3 had a model to choose, a policy and prices, if the campaign asks for none.
 
-    Such a run goes on as it began: with the paper's model, and with an alarm that only tells.
+    Such a run goes on as it began: with the paper's model, with an alarm that only tells, and without prices.
 
     Args:
         plan: of the campaign, as it is read today.
         begun: the fingerprint that the run began with.
     """
     before, today = begun.get("deployment") or {}, plan.deployment
-    if today is None or "model" in before or "trust" in before:
+    if today is None:
+        return plan
+    if "prices" not in before and today.prices == PricesPlan():
+        today = replace(today, prices=None)
+        plan = replace(plan, deployment=today)
+    if "model" in before or "trust" in before:
         return plan
     if (today.model, today.trust) != (NEW_MODEL, TrustPlan()):
         return plan

@@ -136,6 +136,21 @@ class TrustPlan:
 
 
 @dataclass(frozen=True)
+class PricesPlan:
+    """D3 with `per_pour` None: what things cost, by which simulations are chosen and ended.
+
+    Attributes:
+        pour: wall time of a pour, refilling and wiping included [s].
+        simulation: CPU time of a simulation until outcomes tell [s].
+        worth: share of the worst loss; where all simulations that fit beside a pour promise less, the pool rests.
+    """
+
+    pour: float = 90.0
+    simulation: float = 2.0
+    worth: float = 0.005
+
+
+@dataclass(frozen=True)
 class DeploymentPlan:
     """D1, D2 or D3: how to pour into vessels that calibration never saw.
 
@@ -155,6 +170,7 @@ class DeploymentPlan:
         objectives: what is minimised in place of the loss.
         model: D3: how simulations enter the surrogate: 'residual' is the paper's; see docs/optimiser.md.
         trust: D3: when the simulator is called wrong, and what follows; None: pours are only compared.
+        prices: D3 with `per_pour` None: simulations by what they are worth; None: as they come, as in older runs.
     """
 
     strategy: DeploymentName
@@ -174,6 +190,7 @@ class DeploymentPlan:
     objectives: Objectives | None = None
     model: ModelName = "residual"
     trust: TrustPlan | None = None
+    prices: PricesPlan | None = None
 
     @property
     def loss_name(self) -> str:

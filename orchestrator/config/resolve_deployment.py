@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from actors.spec import LaboratorySpec
-from orchestrator.config.campaign import DeploymentSection, TrustSection
+from orchestrator.config.campaign import DeploymentSection, PricesSection, TrustSection
 from orchestrator.config.resolve_data import resolve_data
 from orchestrator.config.resolve_objectives import resolve_objectives
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place
 from orchestrator.fingerprint import NEW_MODEL
-from orchestrator.plan import DeploymentPlan, TrustPlan
+from orchestrator.plan import DeploymentPlan, PricesPlan, TrustPlan
 from sim_engine.losses import Loss
 
 BELONGS_TO = {
@@ -19,6 +19,7 @@ BELONGS_TO = {
     "per_pour": ("D3",),
     "model": ("D3",),
     "trust": ("D3",),
+    "prices": ("D3",),
     "mean": ("D2",),
     "data": ("D2", "D3"),
 }
@@ -74,6 +75,14 @@ def resolve_deployment(
         data = resolve_data(section.data, place.at("data"), complete, actions, laboratory, report)
     trust = section.trust or TrustSection()
     per_pour = section.per_pour if section.per_pour is not None else 2
+    free = strategy == "D3" and per_pour == "free"
+    if section.prices is not None and strategy == "D3" and not free:
+        report.add(
+            place.at("prices"),
+            f"decides nothing with 'per_pour: {per_pour}'; write 'per_pour: free', or remove it",
+            key=True,
+        )
+    prices = section.prices or PricesSection()
     return DeploymentPlan(
         strategy=strategy,
         scenes=complete,
@@ -92,4 +101,5 @@ def resolve_deployment(
         objectives=objectives,
         model=(section.model or NEW_MODEL) if strategy == "D3" else "residual",
         trust=TrustPlan(trust.pours, trust.limit, trust.policy) if strategy == "D3" else None,
+        prices=PricesPlan(prices.pour, prices.simulation, prices.worth) if free else None,
     )

@@ -114,7 +114,7 @@ class SuggestProblem:
         simulated: cheap observations of the same cost, for the last three.
         acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
             answer the penalised 'lcb'); 'random' and 'sobol' only draw. 'knowledge' looks for *simulations*: where one
-            more of them would lower the least expected real cost most (a mean that knows simulations is needed).
+            more of them would teach most about which action is best (a mean that knows simulations is needed).
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has at least two dimensions, the answer carries the surrogate on a square
             grid over the two axes that matter most.
@@ -202,9 +202,8 @@ class Suggestion:
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
         feasibilities: probabilities that the proposals are not refused; empty while nothing was.
         posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
-        values: 'knowledge': by how much a simulation at each point is expected to lower the least expected real cost,
-            those before it given; in the cost's unit, not negative.
-        pour_value: 'knowledge': the same of the one real observation that would lower it most.
+        values: 'knowledge': what a simulation at each point is worth, those before it given; in the cost's unit, ≥ 0.
+        pour_value: 'knowledge': the same of the one real observation that is worth most.
         fitted: with `SuggestProblem.effort`: hyperparameters of each process, to start the next fit with.
     """
 

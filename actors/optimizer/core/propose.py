@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
 from actors.optimizer.core import acquisition
@@ -261,9 +262,22 @@ def _looks_round(problem: SuggestProblem, asked: _Asked, model: _Model, index: i
         return model.process.evidence < STRUCTURE
     if problem.mean not in ("pooled", "scaled") or len(asked.known) < 2 or len(asked.simulated) < 2:
         return False
-    if asked.costs.min() <= np.median(asked.simulated_costs):
+    if asked.costs.min() <= _promised(problem, asked):
         return False
     return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
+
+
+def _promised(problem: SuggestProblem, asked: _Asked) -> float:
+    """What pours should at least come to, by the simulations.
+
+    That is their median. Where they are made by what they are worth (`effort`), most of them lie in the valley: there
+    each counts for the part of the region that it is nearest to, and it is half-way from the least to the median.
+    """
+    if problem.effort is None:
+        return float(np.median(asked.simulated_costs))
+    everywhere = asked.region.draw(256, np.random.default_rng(0), even=True)
+    typical = np.median(asked.simulated_costs[cdist(everywhere, asked.simulated).argmin(axis=1)])
+    return 0.5 * float(asked.simulated_costs.min() + typical)
 
 
 def _describe(problem: SuggestProblem, asked: _Asked, model: _Model, points: Array) -> dict[str, object]:
