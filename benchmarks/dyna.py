@@ -22,6 +22,7 @@ import asyncio
 import random
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from typing import Any
 import numpy as np
 from hybrid_models import SCATTER, WORLDS
 from machine import describe, pin, say, show
-from optimiser_problems import BY_NAME, Problem, World
+from optimiser_problems import BY_NAME, Floats, Problem, World
 from skipping_clock import SkippingLoop, run
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
@@ -62,6 +63,10 @@ SCENE = Scene(
     fixed={"height": 0.03},
 )
 AFTER = (1, 3, 5, 10, 15)
+SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
+    **WORLDS,
+    "shifted by 0.04": lambda world, u, sign: world.true(u + 0.04 * sign),
+}
 TRUST = TrustPlan()
 
 
@@ -88,7 +93,7 @@ class Bench:
 
     def __init__(self, problem: Problem, world: str, seed: int, space: Space, asked: argparse.Namespace) -> None:
         self._world, self._space, self._asked = World(problem, seed), space, asked
-        self._simulated = WORLDS[world]
+        self._simulated = SIMULATORS[world]
         self._sign = np.random.default_rng([seed, 999]).choice([-1.0, 1.0], problem.dimension)
         self._free = asyncio.Semaphore(asked.slots)
         self.size = asked.slots
@@ -182,7 +187,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         "before first": bench.before_first,
         "simulations": bench.simulations,
         "busy": bench.occupancy.fraction if bench.simulations else None,
-        "resting": 1.0 - bench.occupancy.useful / (asked.slots * asked.pour * len(bench.poured)),
+        "useful": bench.occupancy.useful / bench.occupancy.total if bench.simulations else None,
         "longest wait, ms": 1e3 * max(bench.occupancy.waits, default=0.0),
         "mean wait, ms": 1e3 * float(np.mean(bench.occupancy.waits)),
         "longest answer, ms": 1e3 * max(bench.answers),
@@ -229,7 +234,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = ["D2", "fixed", "plain", "priced", "longer"]
-    parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=["right", "shifted by 0.08"])
+    parser.add_argument("--worlds", nargs="+", choices=list(SIMULATORS), default=["right", "shifted by 0.08"])
     parser.add_argument("--problem", choices=["spill2", "narrow2", "spill4"], default="spill2")
     parser.add_argument("--arms", nargs="+", choices=names, default=["D2", "fixed", "priced"])
     parser.add_argument("--seeds", type=int, default=30)

@@ -23,20 +23,21 @@ class Occupancy:
 
     Attributes:
         slots: simulations that can run at a time.
-        busy, useful: slot seconds: spent on simulations within the useful time, and all of it.
+        busy, useful, total: slot seconds: spent on simulations while the pool was useful; of that time; of all time.
         waits: of the arm, from a pour's outcome to the beginning of the next one.
     """
 
     slots: int
     busy: float = 0.0
     useful: float = 0.0
+    total: float = 0.0
     waits: list[float] = field(default_factory=list)
 
     _now: float | None = None
     _running: int = 0
     _resting: bool = False
     _poured_at: float | None = None
-    _last_pour: tuple[float, float] | None = None
+    _last_pour: tuple[float, float, float] | None = None
 
     def simulation_started(self, time: float) -> None:
         """A simulation was handed to the pool."""
@@ -64,7 +65,7 @@ class Occupancy:
         """It was weighed."""
         self._pass(time)
         self._poured_at = time
-        self._last_pour = (self.busy, self.useful)
+        self._last_pour = (self.busy, self.useful, self.total)
 
     def interrupted(self) -> None:
         """The run was paused or killed: nothing runs, and what comes next counts from then on."""
@@ -73,7 +74,7 @@ class Occupancy:
     def finish(self) -> None:
         """The stage is over. What came after its last pour was done for no pour."""
         if self._last_pour is not None:
-            self.busy, self.useful = self._last_pour
+            self.busy, self.useful, self.total = self._last_pour
 
     @property
     def fraction(self) -> float | None:
@@ -81,9 +82,11 @@ class Occupancy:
         return self.busy / self.useful if self.useful > 0.0 else None
 
     def _pass(self, time: float) -> None:
-        if self._now is not None and not (self._resting and self._running < self.slots):
-            self.busy += min(self._running, self.slots) * (time - self._now)
-            self.useful += self.slots * (time - self._now)
+        seconds = 0.0 if self._now is None else time - self._now
+        self.total += self.slots * seconds
+        if not (self._resting and self._running < self.slots):
+            self.busy += min(self._running, self.slots) * seconds
+            self.useful += self.slots * seconds
         self._now = time
 
 
@@ -120,10 +123,12 @@ def occupancies(entries: Iterable[Entry], slots: int) -> dict[str, Occupancy]:
 
 
 def as_summary(found: Occupancy) -> dict[str, Any]:
-    """JSON-ready: the busy share of the pool, and the arm's longest wait and their mean [s]."""
+    """JSON-ready: the busy share of the pool while it had useful work, the share of the time in which it had, and the
+    arm's longest wait and the mean of all [s]."""
     waits = found.waits
     return {
         "pool_busy": found.fraction,
+        "pool_useful": found.useful / found.total if found.total > 0.0 else None,
         "arm_longest_wait_s": max(waits, default=None),
         "arm_mean_wait_s": sum(waits) / len(waits) if waits else None,
     }

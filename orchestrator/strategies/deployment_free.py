@@ -82,6 +82,7 @@ class FreeHybrid(Hybrid):
             self._heard(self._check)
             if self._followed == "D2":
                 self._trials.withdraw()
+                self._rest("its simulations are forgotten", 0.0, 0.0)
 
     # -- what to ask next ------------------------------------------------------------------------------------------
 
