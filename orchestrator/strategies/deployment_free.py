@@ -53,7 +53,7 @@ class FreeHybrid(Hybrid):
         self._out: set[str] = set()
         self._awaited: int | None = None
         self._rested_at: int | None = None
-        self._resting = False
+        self._told_of_rest = -1
         self._map_due = False
         self._fitted: dict[tuple[str, bool], tuple[tuple[float, ...], ...]] = {}
         self._around: Point | None = None
@@ -166,7 +166,6 @@ class FreeHybrid(Hybrid):
             elif self._trials.lost_in_a_row >= LOST_IN_A_ROW:
                 self._rest(f"the last {LOST_IN_A_ROW} simulations came to nothing", one, pour)
             elif self._followed != "D2":
-                self._resting = False
                 self._simulate(suggestion, "refine")
 
         mapped, self._map_due = self._map_due, False
@@ -174,10 +173,11 @@ class FreeHybrid(Hybrid):
 
     def _rest(self, why: str, one: float, pour: float) -> None:
         self._rested_at = self._trials.answered
-        if not self._resting:
+        asked = len(self._trials) - self._trials.waiting
+        if asked != self._told_of_rest:  # once, unless something was simulated since
             values = {"pool_rests": 1.0, "simulation_value": one, "pour_value": pour}
             self.decisions.append(Decision(f"the pool rests: {why}", values))
-        self._resting = True
+        self._told_of_rest = asked
 
     def _next_pour(self) -> None:
         """The next pour alone: what runs beside it is asked for once the arm is under way."""
