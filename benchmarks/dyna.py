@@ -1,7 +1,8 @@
 """What simulating beside pours buys, how busy it keeps the pool, and whether the arm ever waits for a decision.
 
     python benchmarks/dyna.py [--worlds right half ...] [--problem spill2] [--arms fixed priced ...] [--seeds 30]
-                              [--first 0] [--simulation 1.5] [--slots 2] [--pour 90] [--pours 15] [--prior 37] [--json]
+                              [--first 0] [--simulation 1.5] [--slots 2] [--pour 90] [--pours 15] [--prior 37]
+                              [--no-trust] [--json]
 
 Toy worlds (`optimiser_problems.py`, and simulators that know them more or less as in `hybrid_models.py`) behind the
 real strategy, scheduler, journal and optimiser, in one process, on a clock that leaves waiting out
@@ -13,6 +14,7 @@ real strategy, scheduler, journal and optimiser, in one process, on a clock that
     plain   D3 with 37 simulations, and beside pours as many as there is time for, by lower confidence bounds
     priced  D3 with `per_pour: free`: simulations by what they are worth, before the first pour at most 37
     longer  the same, with at most 200 before the first pour
+    tireless  as priced, but the pool never rests
 """
 
 from __future__ import annotations
@@ -75,7 +77,7 @@ def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
     free = DeploymentPlan(
         "D3", (SCENE,), space, Loss(), pours=asked.pours, prior_simulations=asked.prior, per_pour=None, model="scaled"
     )
-    free = replace(free, trust=TRUST)
+    free = replace(free, trust=None if asked.no_trust else TRUST)
     prices = PricesPlan(pour=asked.pour)
     return {
         "D2": replace(free, strategy="D2", per_pour=0, model="residual", trust=None),
@@ -83,6 +85,7 @@ def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
         "plain": free,
         "priced": replace(free, prices=prices),
         "longer": replace(free, prices=prices, prior_simulations=200),
+        "tireless": replace(free, prices=replace(prices, worth=0.0)),
     }
 
 
@@ -233,7 +236,7 @@ def rows_of(asked: argparse.Namespace) -> list[dict[str, Any]]:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = ["D2", "fixed", "plain", "priced", "longer"]
+    names = ["D2", "fixed", "plain", "priced", "longer", "tireless"]
     parser.add_argument("--worlds", nargs="+", choices=list(SIMULATORS), default=["right", "shifted by 0.08"])
     parser.add_argument("--problem", choices=["spill2", "narrow2", "spill4"], default="spill2")
     parser.add_argument("--arms", nargs="+", choices=names, default=["D2", "fixed", "priced"])
@@ -244,6 +247,7 @@ def main() -> None:
     parser.add_argument("--pour", type=float, default=90.0)
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--prior", type=int, default=37)
+    parser.add_argument("--no-trust", action="store_true", help="never fall back on pours alone")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     pin(None)

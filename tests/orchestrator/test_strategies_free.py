@@ -78,15 +78,16 @@ def test_the_first_pour_comes_when_it_is_worth_more_per_second_than_a_simulation
 
 
 def test_the_pool_rests_when_simulations_promise_nothing_and_goes_on_when_something_is_new() -> None:
-    tireless, lazy = free(prices=PricesPlan(worth=0.0)), free(prices=PricesPlan(worth=1.0))
+    tireless = free(prices=PricesPlan(worth=0.0), pours=2, prior_simulations=10)
+    lazy = free(prices=PricesPlan(worth=1.0), pours=2, prior_simulations=10)
     many, few = played(tireless)[0], played(lazy)[0]
-    assert len(many.simulations) > 80
-    assert len(few.simulations) < 40
+    assert len(many.simulations) > 45
+    assert len(few.simulations) < 25
     assert not any(RESTS in decision.values for decision in tireless.decisions)
     rests = [decision for decision in lazy.decisions if RESTS in decision.values]
     assert rests
     assert "only pours tell: a simulation promises" in rests[0].text
-    assert len(few.pours) == len(many.pours) == 3
+    assert len(few.pours) == len(many.pours) == 2
 
 
 def test_the_price_of_a_simulation_is_what_outcomes_say() -> None:
