@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from orchestrator.codec import to_json
-from orchestrator.plan import CampaignPlan, DeploymentPlan, ModelName, TrustPlan
+from orchestrator.plan import CampaignPlan, DeploymentPlan, ModelName, PricesPlan, TrustPlan
 from sim_engine.liquid import Liquid
 from sim_engine.task import Scene
 from sim_engine.vessel.spec import MeshShape
@@ -37,6 +37,7 @@ _YOUNGER: dict[str, dict[str, Any]] = {
         "refusals": "penalise",
         "risk": None,
         "tolerance": None,
+        "prices": None,
     },
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
@@ -47,16 +48,20 @@ NEW_MODEL: ModelName = "scaled"
 
 _CAME_TOGETHER: tuple[dict[str, Any], ...] = (
     {"model": NEW_MODEL, "trust": TrustPlan()},
+    {"prices": PricesPlan()},
     {"noise": "constant", "refusals": "avoid"},
 )
 """Fields of a deployment that came at the same time, each with what a campaign has that doesn't name it."""
+
+_NEWEST = ("noise", "refusals", "risk", "tolerance", "prices")
+"""Fields of a deployment that came after the first studies."""
 
 
 def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
     """The plan of a run that began before a deployment had some fields, if the campaign asks for nothing else.
 
-    Such a run goes on as it began: with the paper's model and an alarm that only tells, and with the worst cost for
-    actions that can't be made.
+    Such a run goes on as it began: with the paper's model and an alarm that only tells, without prices, and with
+    the worst cost for actions that can't be made.
 
     Args:
         plan: of the campaign, as it is read today.
@@ -81,7 +86,7 @@ def deployment_as_begun(today: DeploymentPlan, before: Mapping[str, Any]) -> Dep
 
 def without_newest(deployment: dict[str, Any]) -> dict[str, Any]:
     """A deployment's JSON without those of the newest fields that change nothing, as it was written before them."""
-    unused = {name: _YOUNGER["deployment"][name] for name in _CAME_TOGETHER[-1]}
+    unused = {name: _YOUNGER["deployment"][name] for name in _NEWEST}
     return {name: value for name, value in deployment.items() if name not in unused or value != unused[name]}
 
 

@@ -161,6 +161,21 @@ class RiskPlan:
 
 
 @dataclass(frozen=True)
+class PricesPlan:
+    """D3 with `per_pour` None: what things cost, by which simulations are chosen and ended.
+
+    Attributes:
+        pour: wall time of a pour, refilling and wiping included [s].
+        simulation: CPU time of a simulation until outcomes tell [s].
+        worth: share of the worst loss; where all simulations that fit beside a pour promise less, the pool rests.
+    """
+
+    pour: float = 90.0
+    simulation: float = 2.0
+    worth: float = 0.005
+
+
+@dataclass(frozen=True)
 class DeploymentPlan:
     """D1, D2 or D3: how to pour into vessels that calibration never saw.
 
@@ -185,6 +200,7 @@ class DeploymentPlan:
         risk: D1: in place of the mean loss of exact execution.
         tolerance: D1: loss up to which one may miss the action, as a share of that of spilling all; None: no safe
             window is looked for.
+        prices: D3 with `per_pour` None: simulations by what they are worth; None: as they come, as in older runs.
     """
 
     strategy: DeploymentName
@@ -208,6 +224,7 @@ class DeploymentPlan:
     refusals: RefusalsName = "penalise"
     risk: RiskPlan | None = None
     tolerance: float | None = None
+    prices: PricesPlan | None = None
 
     @property
     def loss_name(self) -> str:

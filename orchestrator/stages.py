@@ -23,6 +23,7 @@ from orchestrator.strategies.deployment_d1 import OneShotPlanning
 from orchestrator.strategies.deployment_d1_risk import RobustPlanning
 from orchestrator.strategies.deployment_d2 import RealOnly
 from orchestrator.strategies.deployment_d3 import Hybrid
+from orchestrator.strategies.deployment_free import FreeHybrid
 from orchestrator.strategies.design import DesignedPours, MeasuredPour
 from orchestrator.strategies.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.protocol import Strategy
@@ -131,12 +132,13 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
     """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated)."""
     # Only where simulations go on for as long as a pour takes does the clock decide what is asked for.
     free = deployment.strategy == "D3" and deployment.per_pour is None
+    strategy = FreeHybrid if free and deployment.prices is not None else _DEPLOYMENTS[deployment.strategy]
+    if deployment.risk is not None:
+        strategy = RobustPlanning
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            informed = with_posterior(deployment, results)
-            strategy = RobustPlanning if informed.risk is not None else _DEPLOYMENTS[informed.strategy]
-            return strategy(informed, scene, _theta(plan, results), seed)
+            return strategy(with_posterior(deployment, results), scene, _theta(plan, results), seed)
 
         return build
 

@@ -290,11 +290,22 @@ def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finishe
             "pours": result.pours,
             "cpu_s": result.cpu_s,
             "seconds": result.seconds,
+            "occupancy": _occupancy(plan, result.directory),
         },
     )
     write_summary(result.directory, summary)
     print_summary(plan, summary)
     return Finished(result, summary, figures, recording)
+
+
+def _occupancy(plan: CampaignPlan, directory: Path) -> dict[str, dict[str, Any]]:
+    """How busy the pool was beside the arm, by stage."""
+    from orchestrator.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.occupancy import as_summary, occupancies
+
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        found = occupancies(journal.entries(), plan.parallel_simulations)
+    return {stage: as_summary(one) for stage, one in found.items()}
 
 
 async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], again: str) -> CampaignResult:

@@ -204,6 +204,19 @@ class WindowSection(Section):
     """Largest loss, as a share of what spilling the whole load would cost."""
 
 
+class PricesSection(Section):
+    """D3 with `per_pour: free`: what things cost, by which simulations are chosen and ended."""
+
+    pour: Annotated[float, Quantity("s", "90 s", 0.0, 86400.0, positive=True)] = 90.0
+    """Time that a pour takes, refilling and wiping included."""
+
+    simulation: Annotated[float, Quantity("s", "2 s", 0.0, 3600.0, positive=True)] = 2.0
+    """CPU time of a simulation, until their outcomes tell."""
+
+    worth: Annotated[float, Quantity("1", "0.005", 0.0, 1.0)] = 0.005
+    """Share of the worst loss: where all simulations that fit beside a pour promise less together, the pool rests."""
+
+
 class DeploymentSection(Section):
     """How to pour into vessels that calibration never saw."""
 
@@ -249,10 +262,13 @@ class DeploymentSection(Section):
     """D1: simulations averaged in each, under 'risk' one as planned and the others under errors; 2 unless given."""
 
     prior_simulations: Count | None = None
-    """D3: simulations before the first pour; 37 unless given."""
+    """D3: simulations before the first pour, 37 unless given; with 'per_pour: free' at most so many."""
 
     per_pour: CountOrFree | None = None
-    """D3: simulations told between two pours, 2 unless given; 'free': as many as the wall clock allows."""
+    """D3: simulations told between two pours, 2 unless given; 'free': for as long as they are worth it."""
+
+    prices: PricesSection | None = None
+    """D3 with 'per_pour: free': what a pour and a simulation cost."""
 
     mean: Literal["constant", "zero"] | None = None
     """D2: prior mean of the surrogate; the paper's is 'zero'."""

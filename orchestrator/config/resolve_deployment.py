@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from actors.spec import LaboratorySpec
-from orchestrator.config.campaign import DeploymentSection, TrustSection
+from orchestrator.config.campaign import DeploymentSection, PricesSection, TrustSection
 from orchestrator.config.resolve_data import resolve_data
 from orchestrator.config.resolve_objectives import resolve_objectives
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place
 from orchestrator.fingerprint import NEW_MODEL
-from orchestrator.plan import DeploymentPlan, RiskPlan, TrustPlan
+from orchestrator.plan import DeploymentPlan, PricesPlan, RiskPlan, TrustPlan
 from sim_engine.losses import Loss
 from sim_engine.task import PoseError
 
@@ -25,6 +25,7 @@ BELONGS_TO = {
     "trust": ("D3",),
     "risk": ("D1",),
     "window": ("D1",),
+    "prices": ("D3",),
     "mean": ("D2",),
     "data": ("D2", "D3"),
 }
@@ -81,6 +82,14 @@ def resolve_deployment(
         data = resolve_data(section.data, place.at("data"), complete, actions, laboratory, report)
     trust = section.trust or TrustSection()
     per_pour = section.per_pour if section.per_pour is not None else 2
+    free = strategy == "D3" and per_pour == "free"
+    if section.prices is not None and strategy == "D3" and not free:
+        report.add(
+            place.at("prices"),
+            f"decides nothing with 'per_pour: {per_pour}'; write 'per_pour: free', or remove it",
+            key=True,
+        )
+    prices = section.prices or PricesSection()
     return DeploymentPlan(
         strategy=strategy,
         scenes=complete,
@@ -103,6 +112,7 @@ def resolve_deployment(
         refusals="avoid",
         risk=risk,
         tolerance=None if section.window is None else section.window.tolerance,
+        prices=PricesPlan(prices.pour, prices.simulation, prices.worth) if free else None,
     )
 
 

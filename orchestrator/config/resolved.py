@@ -148,6 +148,9 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
             table["model"] = plan.model
             if plan.trust is not None:
                 table["trust"] = {"pours": plan.trust.pours, "limit": plan.trust.limit, "policy": plan.trust.policy}
+            if plan.prices is not None:
+                pour, simulation = (f"{value!r} s" for value in (plan.prices.pour, plan.prices.simulation))
+                table["prices"] = {"pour": pour, "simulation": simulation, "worth": plan.prices.worth}
     return table
 
 

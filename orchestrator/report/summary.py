@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_names
+from orchestrator.report.occupancy import occupancy_lines
 from orchestrator.report.results import (
     SPLITS,
     Result,
@@ -61,7 +62,7 @@ def summarise(
         baselines: 'mean_predictor' and 'regression' by split.
         not_covered: what is not simulated in the action spaces, by scene.
         best_not_covered: and of the recommended actions.
-        totals: further facts of the run (state, simulations, pours, cpu_s, …), taken over as they are.
+        totals: further facts of the run (state, simulations, pours, cpu_s, occupancy, …), taken over as they are.
 
     Returns:
         'theta' with 'predicted_discrepancy'; 'discrepancy' by split and predictor (fractions of what was poured);
@@ -180,6 +181,7 @@ def summary_table(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableT
         if known:
             parts.append(_receiver_table(known, deployment_unit(plan.deployment)))
         parts += _remarks(summary["receivers"].values(), deployment_unit(plan.deployment))
+        parts += occupancy_lines(summary.get("occupancy") or {})
     files = [*summary["figures"].items(), *([("recording", summary["recording"])] if summary["recording"] else [])]
     if files:
         width = max(len(name) for name, _ in files)

@@ -95,7 +95,7 @@ class Deployment(ABC):
         pours: list[Pour] = []
         if self._queued_pour is not None and slots.pours > 0:
             pours, self._pouring, self._queued_pour = [self._queued_pour], self._queued_pour, None
-        if not self._finished and not self._questions.out and not self._trials.queued and self._queued_pour is None:
+        if not self._finished and self._may_think and self._queued_pour is None:
             self._next(slots.simulations - len(simulations))
         # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
         return [*self._questions.issue(), *pours, *simulations]
@@ -117,9 +117,14 @@ class Deployment(ABC):
         else:
             raise ValueError(f"this pour was not asked for: {request}")
 
+    @property
+    def _may_think(self) -> bool:
+        """Nothing is queued and no question is out, so that it can be said what comes next."""
+        return not self._questions.out and not self._trials.queued
+
     @abstractmethod
     def _next(self, free_simulations: int) -> None:
-        """Put the next question, or finish. Nothing is queued and no question is out when this is called."""
+        """Put the next question, or finish. Called where `_may_think` and no pour is queued."""
 
     def _weigh(self, trial: PourTrial, outcome: Outcome) -> None:
         match outcome:

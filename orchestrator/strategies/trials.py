@@ -97,6 +97,17 @@ class Trials:
         return bool(self._unissued)
 
     @property
+    def waiting(self) -> int:
+        """How many simulations wait to be asked for."""
+        return len(self._unissued)
+
+    def withdraw(self) -> None:
+        """Forget the trials of which nothing has been asked for yet."""
+        while self.all and len(self.all[-1].requests) == sum(t == len(self.all) - 1 for t, _ in self._unissued):
+            for _ in self.all.pop().requests:
+                self._unissued.pop()
+
+    @property
     def ready(self) -> bool:
         """Everything that the choice of the next trial depends on has been answered."""
         return not self._unissued and all(trial.closed for trial in self.all[: self._horizon])
@@ -124,6 +135,17 @@ class Trials:
     def answered(self) -> int:
         """Simulations answered."""
         return sum(len(trial.costs) for trial in self.all)
+
+    @property
+    def lost_in_a_row(self) -> int:
+        """How many of the latest trials that were answered came to nothing, one after the other."""
+        count = 0
+        for trial in reversed(self.all):
+            if trial.closed:
+                if trial.cost is not None:
+                    break
+                count += 1
+        return count
 
     @property
     def lost(self) -> int:

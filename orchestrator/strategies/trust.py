@@ -65,9 +65,17 @@ class TrustCheck:
     def due(self, pours: Sequence[PourTrial]) -> list[PourTrial]:
         """The pours to be compared now; empty: nothing new, or it has been decided."""
         weighed = [p for p in pours if p.status == "weighed" and p.cost is not None][: self._plan.pours]
-        if self.alarm or len(weighed) < min(FEWEST_POURS, self._plan.pours) or len(weighed) <= self._compared:
+        return self._new(weighed)
+
+    def foreseen(self, pours: Sequence[PourTrial]) -> list[PourTrial]:
+        """The pours to be compared once the one that is under way has been weighed (now, if none is)."""
+        weighed = [p for p in pours if p.status == "pouring" or (p.status == "weighed" and p.cost is not None)]
+        return self._new(weighed[: self._plan.pours])
+
+    def _new(self, pours: list[PourTrial]) -> list[PourTrial]:
+        if self.alarm or len(pours) < min(FEWEST_POURS, self._plan.pours) or len(pours) <= self._compared:
             return []
-        return weighed
+        return pours
 
     def compare(self, pours: Sequence[PourTrial], simulated: Suggestion) -> None:
         """Enter what a surrogate of the simulations says at the pours (its `predictions`, in their order)."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.core.problem import Data, Linear, SuggestProblem
+from actors.optimizer.core.problem import Data, Effort, Linear, SuggestProblem
 from actors.optimizer.core.propose import propose
 from sim_engine.space import Axis, Space
 
@@ -47,15 +47,20 @@ def questions(draw):
         axis = space.axes[0]
         middle = axis.decode(0.7)
         constraints = (Linear(((axis.name, 1.0),), middle),)
+    mean = draw(st.sampled_from(MEANS))
+    acquisitions = ["lcb", "posterior_minimum", "random", "sobol"]
+    acquisitions += ["knowledge"] if mean in ("simulated", "pooled", "scaled") else []
     return SuggestProblem(
         space,
         data(12),
         pending=tuple(draw(st.lists(point, max_size=3))),
         count=draw(st.integers(0, 3)),
         seed=draw(st.integers(0, 2**31)),
-        mean=draw(st.sampled_from(MEANS)),
+        mean=mean,
         simulated=data(8),
-        acquisition=draw(st.sampled_from(["lcb", "posterior_minimum", "random", "sobol"])),
+        acquisition=draw(st.sampled_from(acquisitions)),
+        pouring=tuple(draw(st.lists(point, max_size=2))),
+        effort=draw(st.sampled_from([None, Effort()])),
         infeasible=tuple(draw(st.lists(point, max_size=3))),
         constraints=constraints,
         noise=draw(st.sampled_from(["constant", "varying"])),
@@ -78,6 +83,9 @@ def test_proposals_are_finite_and_keep_to_bounds_whole_numbers_and_constraints(q
     assert all(map(math.isfinite, (*answer.means, *answer.deviations, *answer.noises, *answer.feasibilities)))
     assert all(s > 0.0 for s in (*answer.deviations, *answer.noises))
     assert all(0.0 <= p <= 1.0 for p in answer.feasibilities)
+    worth = (*answer.values, *(() if answer.pour_value is None else (answer.pour_value,)))
+    most = max(map(abs, (*question.data.costs, *question.simulated.costs, 1.0)))
+    assert all(0.0 <= value <= 20.0 * most for value in worth)
 
 
 @settings(max_examples=40, deadline=None)

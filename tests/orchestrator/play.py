@@ -12,6 +12,7 @@ import numpy as np
 from actors.optimizer.core.propose import propose
 from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from orchestrator.requests import (
+    Ask,
     Failed,
     Outcome,
     Pour,
@@ -157,7 +158,7 @@ class Play:
 
     def _next(self, waiting: list[Request]) -> Request:
         """Questions first; a pour takes longer than the simulations beside it."""
-        rank = {Suggest: 0, Simulate: 1, Pour: 2}
+        rank: dict[type, int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
         if self.beside is not None and any(isinstance(r, Pour) for r in waiting):
             self._since_pour += 1
             if self._since_pour > self.beside:

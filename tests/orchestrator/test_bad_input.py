@@ -163,6 +163,12 @@ BAD_CAMPAIGNS = {
         "strategy: D3\n  iterations: 9",
         "deployment.iterations: belongs to D1, not to D3",
     ),
+    "prices that decide nothing": (
+        DEPLOYED,
+        "strategy: D3",
+        "strategy: D3\n  per_pour: 2\n  prices: {pour: 60 s}",
+        "deployment.prices: decides nothing with 'per_pour: 2'; write 'per_pour: free', or remove it",
+    ),
     "learning without pours": (
         DEPLOYED,
         "  pours: 15\n",

@@ -14,6 +14,7 @@ from actors.spec import RaySpec
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
 from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import PricesPlan
 from sim_engine.action import DEG
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -176,6 +177,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           pours: 6
           prior_simulations: 11
           per_pour: free
+          prices: {{pour: 75 s, simulation: 4 s, worth: 0.01}}
           kappa: 3
           initial: 4
           on_failed_pour: ignore
@@ -231,6 +233,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert deployment.scenes[0].fixed["return_velocity"] == pytest.approx(30 * DEG)
     assert (deployment.loss.name, deployment.loss.retained_weight) == ("spilled_and_retained", 0.5)
     assert (deployment.pours, deployment.prior_simulations, deployment.per_pour) == (6, 11, None)
+    assert deployment.prices == PricesPlan(pour=75.0, simulation=4.0, worth=0.01)
     assert (deployment.kappa, deployment.initial, deployment.on_failed_pour) == (3.0, 4, "ignore")
     (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
     again = load_campaign(tmp_path / "again.json")
@@ -245,6 +248,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         ("strategy: D2\n  pours: 9\n  mean: zero", ("D2", 9, 15, 2, 0)),
         ("strategy: D3\n  pours: 9\n  per_pour: 0", ("D3", 9, 15, 2, 0)),
         ("strategy: D3\n  pours: 9", ("D3", 9, 15, 2, 2)),
+        ("strategy: D3\n  pours: 9\n  per_pour: free", ("D3", 9, 15, 2, None)),
     ],
 )
 def test_strategies_have_their_own_budgets(keys: str, expected: tuple[object, ...], tmp_path: Path) -> None:
@@ -256,6 +260,7 @@ def test_strategies_have_their_own_budgets(keys: str, expected: tuple[object, ..
     assert plan is not None
     budgets = (plan.strategy, plan.pours, plan.iterations, plan.simulations_per_iteration, plan.per_pour)
     assert budgets == expected
+    assert plan.prices == (PricesPlan() if plan.per_pour is None else None)
     assert plan.mean == ("zero" if "zero" in keys else "constant")
 
 

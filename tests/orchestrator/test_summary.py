@@ -95,6 +95,21 @@ def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
     assert any("narrow" in line and "D3" in line and action in line for line in lines)
 
 
+def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results: dict[str, dict[str, Any]]) -> None:
+    plan = watched.campaign()
+    busy = {
+        "pool_busy": 0.974,
+        "pool_useful": 0.41,
+        "arm_longest_wait_s": 0.061,
+        "arm_mean_wait_s": 0.03,
+    }
+    summary = summarise(plan, results, totals={"occupancy": {"deployment:narrow": busy}})
+    assert summary["occupancy"]["deployment:narrow"] == busy
+    text = " ".join(shown(summary_table(plan, summary)).split())
+    assert "narrow: pool 97 % busy while there was work (41 % of the time)" in text
+    assert "the arm waited 0.061 s at most" in text
+
+
 def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:
     plan = watched.campaign()
     summary = summarise(plan, {})

@@ -36,6 +36,7 @@ def check(problem: SuggestProblem) -> None:
     _check_points("infeasible", problem.infeasible, dimension)
     _check_points("refused", problem.refused, dimension)
     _check_points("predict_at", problem.predict_at, dimension)
+    _check_points("pouring", problem.pouring, dimension)
     for name, data in (("data", problem.data), ("simulated", problem.simulated)):
         for index, cost in enumerate(data.costs):
             if not math.isfinite(cost) or abs(cost) > 1e12:
@@ -54,6 +55,9 @@ def check(problem: SuggestProblem) -> None:
         raise ValueError(f"kappa = {problem.kappa} is outside 0 … 100")
     if not (math.isfinite(problem.widening) and 0.01 <= problem.widening <= 100.0):
         raise ValueError(f"widening = {problem.widening} is outside 0.01 … 100")
+    if problem.acquisition == "knowledge" and problem.mean not in ("simulated", "pooled", "scaled"):
+        raise ValueError(f"acquisition='knowledge' is over simulations, and mean={problem.mean!r} knows none")
+    _check_effort(problem)
     _check_posterior(problem)
     _check_constraints(problem)
 
@@ -76,6 +80,18 @@ def _check_risk(problem: SuggestProblem) -> None:
             raise ValueError(f"risk: disturbance {index} has {sizes} numbers, which fit neither space nor the others")
         if not all(math.isfinite(value) for value in (*one.scales, *one.shifts, *one.context)):
             raise ValueError(f"risk: disturbance {index} is not finite")
+
+
+def _check_effort(problem: SuggestProblem) -> None:
+    effort = problem.effort
+    if effort is None:
+        return
+    if problem.noise == "varying" and effort.start:
+        raise ValueError("effort: a start is for noise='constant' only")
+    if not 0 <= effort.iterations <= 1000:
+        raise ValueError(f"effort: iterations = {effort.iterations} is outside 0 … 1000")
+    if not all(math.isfinite(value) for start in effort.start for value in start):
+        raise ValueError("effort: the start must be finite")
 
 
 def _check_posterior(problem: SuggestProblem) -> None:

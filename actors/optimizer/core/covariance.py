@@ -83,9 +83,8 @@ def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, equation 4.17.
     """
-    correlation = matern_correlation(first, second, lengths)
     s = np.sqrt(5.0) * cdist(first / lengths, second / lengths)
-    return correlation, (5.0 / 3.0) * (1.0 + s) * np.exp(-s)
+    return matern_correlation(first, second, lengths), (5.0 / 3.0) * (1.0 + s) * np.exp(-s)
 
 
 def matern_correlation(first: Array, second: Array, lengths: Array) -> Array:
@@ -235,6 +234,20 @@ class Covariance:
         K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * correlation
         K += self._remainder(theta, first, second)
         return K if self._known is None else K + self._known.covariance(first, second) / self._unit**2
+
+    def cross_simulated(self, theta: Array, points: Array) -> Array:
+        """Of the noise-free simulated cost at points (m, d) with the observations: (m, n)."""
+        if self._known is not None:
+            return self._known.covariance(points, self.points) / self._unit**2
+        K = self.value(theta, "signal") ** 2 * matern_correlation(points, self.points, self.lengths(theta))
+        return K * np.where(self._mask, self.value(theta, "rho"), 1.0)
+
+    def between_simulated(self, theta: Array, first: Array, second: Array, *, real: bool) -> Array:
+        """Of the noise-free simulated cost at points (m, d) and the simulated, or the real, one at (k, d): (m, k)."""
+        if self._known is not None:
+            return self._known.covariance(first, second) / self._unit**2
+        rho = self.value(theta, "rho") if real else 1.0
+        return self.value(theta, "signal") ** 2 * rho * matern_correlation(first, second, self.lengths(theta))
 
     def variance(self, theta: Array, points: Array) -> Array:
         """Of the noise-free real cost at points (m, d): (m,)."""

@@ -17,7 +17,7 @@ from actors.optimizer.core.covariance import Covariance
 Array = NDArray[np.float64]
 
 _IMPOSSIBLE = 1e12
-_ITERATIONS = 40
+ITERATIONS = 40
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,16 @@ class Fitted:
     log_likelihood: float
 
 
-def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Sequence[Array]) -> Fitted:
+def maximum_a_posteriori(
+    covariance: Covariance, residuals: Array, starts: Sequence[Array], iterations: int = ITERATIONS
+) -> Fitted:
     """Fit.
 
     Args:
         covariance: of the observations.
         residuals: (n,), costs less their prior mean, in units of the scale.
-        starts: of the search, (p,) each.
+        starts: of the search, (p,) each, at least one.
+        iterations: of the search from each; 0 takes the first start as it is.
 
     Raises:
         ValueError: no start gave a covariance that can be factorised.
@@ -57,15 +60,15 @@ def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Seque
         value, gradient = negative_log_likelihood(covariance, residuals, theta)
         return value + 0.5 * float(z @ z), gradient + z / covariance.deviation
 
-    best, lowest = np.clip(covariance.centre, bounds[:, 0], bounds[:, 1]), math.inf
-    for start in starts:
+    best, lowest = np.clip(starts[0] if iterations == 0 else covariance.centre, bounds[:, 0], bounds[:, 1]), math.inf
+    for start in starts if iterations else ():
         found: Any = minimize(
             loss,
             np.clip(start, bounds[:, 0], bounds[:, 1]),
             jac=True,
             bounds=bounds,
             method="L-BFGS-B",
-            options={"maxiter": _ITERATIONS, "ftol": 1e-6, "gtol": 1e-3},
+            options={"maxiter": iterations, "ftol": 1e-6, "gtol": 1e-3},
         )
         if math.isfinite(found.fun) and found.fun < lowest:
             best, lowest = found.x, float(found.fun)

@@ -11,7 +11,7 @@ Point = tuple[float, ...]
 """A point of the unit cube."""
 
 MeanName = Literal["constant", "zero", "simulated", "pooled", "scaled"]
-AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol"]
+AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol", "knowledge"]
 NoiseName = Literal["constant", "varying"]
 
 
@@ -127,6 +127,20 @@ class RiskAnswer:
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How much a fit may cost. Without one it starts afresh and takes the time it needs.
+
+    Attributes:
+        start: hyperparameters to begin with, of each process in the order of fitting: `Suggestion.fitted` of an
+            earlier answer. A process without an entry is fitted afresh.
+        iterations: of the search for better ones, for processes that have a start; 0 takes them as they are.
+    """
+
+    start: tuple[tuple[float, ...], ...] = ()
+    iterations: int = 0
+
+
+@dataclass(frozen=True)
 class SuggestProblem:
     """Everything that a proposal depends on; the optimiser actor keeps no state that matters.
 
@@ -141,7 +155,8 @@ class SuggestProblem:
             and an offset of their own), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once).
         simulated: cheap observations of the same cost, for the last three.
         acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
-            answer the penalised 'lcb'); 'random' and 'sobol' only draw.
+            answer the penalised 'lcb'); 'random' and 'sobol' only draw. 'knowledge' looks for *simulations*: where one
+            more of them would teach most about which action is best (a mean that knows simulations is needed).
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has at least two dimensions, the answer carries the surrogate on a square
             grid over the two axes that matter most.
@@ -160,6 +175,8 @@ class SuggestProblem:
         risk: if given, the observations are of requests as they were executed, disturbances included: points of `data`
             have `space.dimension` coordinates (which may leave the cube) followed by the disturbances' context. What is
             minimised, predicted and mapped is the measure over the disturbances of a request.
+        pouring: 'knowledge': places of real observations whose outcome is out; `pending` are simulations then.
+        effort: limits the fit, and has the answer carry what was fitted.
     """
 
     space: Space
@@ -181,6 +198,8 @@ class SuggestProblem:
     widening: float = 1.0
     posterior: PosteriorQuestion | None = None
     risk: Risk | None = None
+    pouring: tuple[Point, ...] = ()
+    effort: Effort | None = None
 
     @property
     def beside(self) -> int:
@@ -241,6 +260,9 @@ class Suggestion:
         posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
         risk: with a risk: what else is known at `SuggestProblem.predict_at`.
+        values: 'knowledge': what a simulation at each point is worth, those before it given; in the cost's unit, ≥ 0.
+        pour_value: 'knowledge': the same of the one real observation that is worth most.
+        fitted: with `SuggestProblem.effort`: hyperparameters of each process, to start the next fit with.
     """
 
     points: tuple[Point, ...]
@@ -259,3 +281,6 @@ class Suggestion:
     posterior: Posterior | None = None
     best_noise: float | None = None
     risk: RiskAnswer | None = None
+    values: tuple[float, ...] = ()
+    pour_value: float | None = None
+    fitted: tuple[tuple[float, ...], ...] = ()

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
 from actors.optimizer.core import acquisition
 from actors.optimizer.core.checks import check
+from actors.optimizer.core.folded import AbsoluteProcess
+from actors.optimizer.core.knowledge import Knowledge, most_instructive
 from actors.optimizer.core.posterior import sample_posterior
 from actors.optimizer.core.problem import (
     Data,
@@ -25,8 +28,9 @@ from actors.optimizer.core.problem import (
 from actors.optimizer.core.region import Feasibility, Region
 from actors.optimizer.core.risk import RiskProcess
 from actors.optimizer.core.surrogate import (
-    AbsoluteProcess,
+    AFRESH,
     GaussianProcess,
+    Search,
     Surrogate,
     constant_mean_process,
     joint_process,
@@ -73,11 +77,16 @@ def _answer(problem: SuggestProblem) -> Suggestion:
     model = _fit(problem, asked)
     feasibility = asked.feasibility()
 
+    knowledge: Knowledge | None = None
     if problem.acquisition == "random":
         points = asked.region.draw(problem.count, rng, even=False)
     elif problem.acquisition == "sobol" or model is None:
         taken = np.concatenate([asked.known, asked.busy, asked.refused])
         points = acquisition.spread_out(problem.count, taken, asked.region, rng, feasibility)
+    elif problem.acquisition == "knowledge":
+        candidates = _candidates(problem, asked, model, rng)
+        knowledge = most_instructive(problem, model.process, candidates, asked.busy, asked.pouring, feasibility)
+        points = knowledge.points
     else:
         points = _search(problem, asked, model, feasibility, rng)
 
@@ -86,6 +95,10 @@ def _answer(problem: SuggestProblem) -> Suggestion:
         answer = _describe(problem, asked, model, points, feasibility)
     if model is not None and problem.posterior is not None:
         answer["posterior"] = _posterior(problem, problem.posterior, asked.region, model, rng)
+    if model is not None and problem.effort is not None:
+        answer["fitted"] = _tuples([process.theta for process in model.fitted])
+    if knowledge is not None:
+        answer |= {"values": tuple(map(float, knowledge.values)), "pour_value": knowledge.pour_value}
     if feasibility is not None and len(points):
         answer["feasibilities"] = tuple(map(float, np.exp(feasibility.log_probability(points))))
     return Suggestion(
@@ -106,6 +119,7 @@ class _Asked:
         busy: (b, dimension).
         infeasible: (i, dimension), refused of any kind of request.
         really_refused: (r, dimension), of real ones.
+        pouring: (p, dimension).
     """
 
     region: Region
@@ -117,6 +131,7 @@ class _Asked:
     busy: Array
     infeasible: Array
     really_refused: Array
+    pouring: Array
 
     @classmethod
     def of(cls, problem: SuggestProblem) -> _Asked:
@@ -137,6 +152,7 @@ class _Asked:
             region.snap(_array(sorted(problem.pending), dimension)),
             region.snap(_array(sorted(problem.infeasible), dimension)),
             region.snap(_array(sorted(problem.refused), dimension)),
+            region.snap(_array(sorted(problem.pouring), dimension)),
         )
 
     @property
@@ -165,11 +181,13 @@ class _Model:
         process: with the observations in it.
         lengths: (dimension,) lengthscales of the searched axes. Around a simulated mean they are the simulations':
             a handful of pours says little about what the pours' remainder depends on.
+        fitted: all processes that were fitted, in order.
     """
 
     surrogate: Surrogate
     process: GaussianProcess
     lengths: Array
+    fitted: tuple[GaussianProcess, ...]
 
 
 def _fit(problem: SuggestProblem, asked: _Asked) -> _Model | None:
@@ -177,12 +195,14 @@ def _fit(problem: SuggestProblem, asked: _Asked) -> _Model | None:
     points, costs = asked.points, asked.costs
     informed = problem.mean in ("simulated", "pooled", "scaled") and len(asked.simulated) >= 2
     varying = problem.noise == "varying"
+    first = _search_for(problem, 0)
     if informed and problem.mean == "simulated":
-        process = constant_mean_process(asked.simulated, asked.simulated_costs)
-        lengths = process.lengths
-        if len(points):
-            process = simulated_mean_process(process, points, costs, varying=varying)
-        return _Model(process, process, lengths)
+        simulated = constant_mean_process(asked.simulated, asked.simulated_costs, search=first)
+        if not len(points):
+            return _Model(simulated, simulated, simulated.lengths, (simulated,))
+        second = _search_for(problem, 1)
+        process = simulated_mean_process(simulated, points, costs, varying=varying, search=second)
+        return _Model(process, process, simulated.lengths, (simulated, process))
     if informed:
         process = joint_process(
             asked.simulated,
@@ -192,19 +212,38 @@ def _fit(problem: SuggestProblem, asked: _Asked) -> _Model | None:
             scaled=problem.mean == "scaled",
             varying=varying,
             widening=problem.widening,
+            search=first,
         )
-        return _Model(process, process, process.lengths)
+        return _Model(process, process, process.lengths, (process,))
     if len(points) < 2:
         return None
     build = zero_mean_process if problem.mean == "zero" else constant_mean_process
-    process = build(points, costs, varying=varying)
+    process = build(points, costs, varying=varying, search=first)
     dimension = problem.space.dimension
     if problem.risk is not None:
-        return _Model(RiskProcess.of(process, problem.risk), process, process.lengths[:dimension])
+        return _Model(RiskProcess.of(process, problem.risk), process, process.lengths[:dimension], (process,))
     if problem.context:
         context = _array(problem.context, points.shape[1] - dimension)
-        return _Model(AbsoluteProcess(process, context), process, process.lengths[:dimension])
-    return _Model(process, process, process.lengths)
+        return _Model(AbsoluteProcess(process, context), process, process.lengths[:dimension], (process,))
+    return _Model(process, process, process.lengths, (process,))
+
+
+def _search_for(problem: SuggestProblem, number: int) -> Search:
+    """How the `number`-th process looks for its hyperparameters."""
+    effort = problem.effort
+    if effort is None or number >= len(effort.start):
+        return AFRESH
+    return Search(np.array(effort.start[number], dtype=np.float64), effort.iterations)
+
+
+def _candidates(problem: SuggestProblem, asked: _Asked, model: _Model, rng: np.random.Generator) -> Array:
+    """Places to think about: all over the region, and around the best of those observed."""
+    seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled") else asked.known
+    if problem.risk is not None:
+        seen = np.clip(seen, 0.0, 1.0)  # what was executed may lie beside the box
+    means = model.surrogate.predict(seen)[0]
+    around = [seen[i] for i in np.argsort(means, kind="stable")[:4]]
+    return acquisition.search_candidates(asked.region, problem.space.dimension, around, rng)
 
 
 def _search(
@@ -218,12 +257,7 @@ def _search(
     chosen: list[Array] = []
     surrogate = model.surrogate
     if problem.count:
-        seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled") else asked.known
-        if problem.risk is not None:
-            seen = np.clip(seen, 0.0, 1.0)  # what was executed may lie beside the box
-        means = surrogate.predict(seen)[0]
-        around = [seen[i] for i in np.argsort(means, kind="stable")[:4]]
-        candidates = acquisition.search_candidates(asked.region, problem.space.dimension, around, rng)
+        candidates = _candidates(problem, asked, model, rng)
     for index in range(problem.count):
         taken = np.concatenate([asked.busy, np.array(chosen).reshape(-1, problem.space.dimension)])
         if _looks_round(problem, asked, model, index):
@@ -252,7 +286,7 @@ def _looks_round(problem: SuggestProblem, asked: _Asked, model: _Model, index: i
         return model.process.evidence < STRUCTURE
     if problem.mean not in ("pooled", "scaled") or len(asked.known) < 2 or len(asked.simulated) < 2:
         return False
-    if asked.costs.min() <= np.median(asked.simulated_costs):
+    if asked.costs.min() <= _promised(problem, asked):
         return False
     return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
 
@@ -265,6 +299,19 @@ def _kappa(problem: SuggestProblem, model: _Model) -> float:
     """
     settled = problem.mean == "constant" and not problem.context and model.process.evidence >= STRUCTURE
     return problem.kappa * (SETTLED if settled else 1.0)
+
+
+def _promised(problem: SuggestProblem, asked: _Asked) -> float:
+    """What pours should at least come to, by the simulations.
+
+    That is their median. Where they are made by what they are worth (`effort`), most of them lie in the valley: there
+    each counts for the part of the region that it is nearest to, and it is half-way from the least to the median.
+    """
+    if problem.effort is None:
+        return float(np.median(asked.simulated_costs))
+    everywhere = asked.region.draw(256, np.random.default_rng(0), even=True)
+    typical = np.median(asked.simulated_costs[cdist(everywhere, asked.simulated).argmin(axis=1)])
+    return 0.5 * float(asked.simulated_costs.min() + typical)
 
 
 def _describe(
@@ -354,5 +401,5 @@ def _array(points: Sequence[Point], dimension: int) -> Array:
     return np.array(points, dtype=np.float64).reshape(len(points), dimension)
 
 
-def _tuples(rows: Array) -> tuple[tuple[float, ...], ...]:
+def _tuples(rows: Array | Sequence[Array]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(map(float, row)) for row in rows)

@@ -10,10 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import ndtr
 
 from actors.optimizer.core.covariance import Covariance, HyperPrior
-from actors.optimizer.core.fitting import maximum_a_posteriori
+from actors.optimizer.core.fitting import ITERATIONS, maximum_a_posteriori
 
 Array = NDArray[np.float64]
 Mean = Callable[[Array], Array]
@@ -57,6 +56,7 @@ class GaussianProcess:
         signal: fitted standard deviation of the signal, in the cost's unit.
         noise: fitted standard deviation of the real observations, in the cost's unit; where it varies, its
             geometric mean over them.
+        simulated_noise: the same of simulations; where there is only one kind of observation, that one's.
         evidence: by how much the log-likelihood is above that of noise around the prior mean and nothing else.
         hyperparameters: what else was fitted, by name.
 
@@ -72,6 +72,7 @@ class GaussianProcess:
         scale: float,
         growth: NoiseGrowth | None = None,
         start: Array | None = None,
+        iterations: int = ITERATIONS,
     ) -> None:
         """Fit.
 
@@ -82,16 +83,22 @@ class GaussianProcess:
             scale: unit in which the priors are meant, in the cost's unit.
             growth: what the covariance's noise grows with.
             start: hyperparameters to start from; None: their priors' centre, and more noise than that.
+            iterations: of the search for better ones.
+
+        Raises:
+            ValueError: the start has another number of hyperparameters.
         """
         self.points, self.mean, self.scale, self.growth = covariance.points, mean, scale, growth
         starts = [start]
+        if start is not None and len(start) != len(covariance.names):
+            raise ValueError(f"a start of {len(start)} hyperparameters for a model of {len(covariance.names)}")
         if start is None:
             noisy = covariance.centre.copy()
             noisy[[i for i, name in enumerate(covariance.names) if name in ("length", "noise")]] += 0.5
             noisy[covariance.names.index("noise")] += 1.0
             starts = [covariance.centre, noisy]
         residuals = (costs - mean(self.points)) / scale
-        fitted = maximum_a_posteriori(covariance, residuals, [s for s in starts if s is not None])
+        fitted = maximum_a_posteriori(covariance, residuals, [s for s in starts if s is not None], iterations)
         self._covariance, self._fitted = covariance, fitted
         theta = fitted.theta
         self.lengths: Array = covariance.lengths(theta)
@@ -100,6 +107,9 @@ class GaussianProcess:
         self.log_likelihood = fitted.log_likelihood
         self.evidence = fitted.log_likelihood - _of_noise_alone(residuals)
         self.theta = theta
+        self.simulated_noise = self.noise
+        if "simulated_noise" in covariance.names:
+            self.simulated_noise = covariance.value(theta, "simulated_noise") * scale
         self.hyperparameters: dict[str, float] = {
             name: covariance.value(theta, name) * (1.0 if name in ("rho", "delta_length") else scale)
             for name in ("simulated_noise", "offset", "rho", "delta_signal", "delta_length")
@@ -137,6 +147,17 @@ class GaussianProcess:
     def prior_covariance(self, points: Array) -> Array:
         """Of the noise-free cost between points (m, d): (m, m), in its unit squared."""
         return np.asarray(self.scale**2 * self._covariance.between(self._fitted.theta, points, points))
+
+    def joint_covariance(self, simulated: Array, real: Array) -> Array:
+        """Posterior covariance of the noise-free simulated cost at points (a, d) and the real one at points (m, d):
+        (a + m, a + m), in the cost's unit squared."""
+        theta, covariance = self._fitted.theta, self._covariance
+        K = np.concatenate([covariance.cross_simulated(theta, simulated), covariance.cross(theta, real)])
+        V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
+        mixed = covariance.between_simulated(theta, simulated, real, real=True)
+        own = covariance.between_simulated(theta, simulated, simulated, real=False)
+        prior = np.block([[own, mixed], [mixed.T, covariance.between(theta, real, real)]])
+        return np.asarray(self.scale**2 * (prior - V.T @ V))
 
     def noise_at(self, points: Array) -> Array:
         """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
@@ -210,46 +231,37 @@ def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior
 
 
 @dataclass(frozen=True)
-class AbsoluteProcess:
-    """A surrogate of the mean absolute value over a context, of a signed quantity: 1/J Σ_j |f(x, z_j)|.
+class Search:
+    """How hyperparameters are looked for; see `GaussianProcess`."""
 
-    |f| of a normal f is folded normal. The deviation is the mean of the contexts' deviations of |f|, as if their errors
-    were fully correlated: an upper bound.
-
-    Source: moments of the folded normal distribution (Leone, Nelson & Nottingham, 1961).
-    """
-
-    process: GaussianProcess
-    context: Array
-
-    def predict(self, points: Array) -> tuple[Array, Array]:
-        """See `Surrogate.predict`."""
-        m, J = len(points), len(self.context)
-        joint = np.concatenate([np.repeat(points, J, axis=0), np.tile(self.context, (m, 1))], axis=1)
-        mean, deviation = (values.reshape(m, J) for values in self.process.predict(joint))
-        ratio = mean / deviation
-        folded = deviation * math.sqrt(2 / math.pi) * np.exp(-0.5 * ratio**2) + mean * (2 * ndtr(ratio) - 1)
-        spread = np.sqrt(np.maximum(mean**2 + deviation**2 - folded**2, 0.0))
-        return folded.mean(axis=1), np.maximum(spread.mean(axis=1), 1e-9 * self.process.scale)
+    start: Array | None = None
+    iterations: int = ITERATIONS
 
 
-def constant_mean_process(points: Array, costs: Array, *, varying: bool = False) -> GaussianProcess:
+AFRESH = Search()
+
+
+def constant_mean_process(
+    points: Array, costs: Array, *, varying: bool = False, search: Search = AFRESH
+) -> GaussianProcess:
     """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
     centre = float(costs.mean())
-    return _fitted(points, costs, _constant(centre), _scale(costs - centre, costs), varying)
+    return _fitted(points, costs, _constant(centre), _scale(costs - centre, costs), varying, search=search)
 
 
-def zero_mean_process(points: Array, costs: Array, *, varying: bool = False) -> GaussianProcess:
+def zero_mean_process(
+    points: Array, costs: Array, *, varying: bool = False, search: Search = AFRESH
+) -> GaussianProcess:
     """GP with prior mean zero, as in the paper: unexplored means 'spills nothing'.
 
     Limitations: on a cost in [0, 1] that is minimised by a lower confidence bound, it explores corners for ever and
     loses to random search. For replication.
     """
-    return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying)
+    return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying, search=search)
 
 
 def simulated_mean_process(
-    simulated: GaussianProcess, points: Array, costs: Array, *, varying: bool = False
+    simulated: GaussianProcess, points: Array, costs: Array, *, varying: bool = False, search: Search = AFRESH
 ) -> GaussianProcess:
     """GP of the real cost around a surrogate of the simulated one: f_r = f_s + δ, f_s ~ `simulated`'s posterior.
 
@@ -260,7 +272,9 @@ def simulated_mean_process(
     """
     scale = max(simulated.scale, 1e-9)
     terms = {"known": simulated, "unit": scale}
-    return _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, **terms)
+    process = _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, search, **terms)
+    process.simulated_noise = simulated.noise
+    return process
 
 
 def joint_process(
@@ -272,6 +286,7 @@ def joint_process(
     scaled: bool,
     varying: bool = False,
     widening: float = 1.0,
+    search: Search = AFRESH,
 ) -> GaussianProcess:
     """GP of the real cost from simulations and real observations at once.
 
@@ -284,6 +299,7 @@ def joint_process(
         scaled: which of the two.
         varying: whether the noise of real observations may vary.
         widening: factor on the median of the prior of the simulations' noise.
+        search: for the hyperparameters.
 
     Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
         available, Biometrika 2000.
@@ -296,7 +312,7 @@ def joint_process(
     if widening != 1.0:
         median, deviation = prior.simulated_noise
         prior = replace(prior, simulated_noise=(widening * median, deviation))
-    return _fitted(both, values, _constant(centre), scale, varying, prior, **terms)
+    return _fitted(both, values, _constant(centre), scale, varying, prior, search, **terms)
 
 
 def _fitted(
@@ -306,9 +322,13 @@ def _fitted(
     scale: float,
     varying: bool,
     prior: HyperPrior = CONSTANT_PRIOR,
+    search: Search = AFRESH,
     **terms: Any,
 ) -> GaussianProcess:
-    process = GaussianProcess(costs, Covariance(points, prior, **terms), mean=mean, scale=scale)
+    covariance = Covariance(points, prior, **terms)
+    process = GaussianProcess(
+        costs, covariance, mean=mean, scale=scale, start=search.start, iterations=search.iterations
+    )
     return with_varying_noise(process, costs, prior, **terms) if varying else process
 
 

@@ -1,0 +1,259 @@
+"""What simulating beside pours buys, how busy it keeps the pool, and whether the arm ever waits for a decision.
+
+    python benchmarks/dyna.py [--worlds right half ...] [--problem spill2] [--arms fixed priced ...] [--seeds 30]
+                              [--first 0] [--simulation 1.5] [--slots 2] [--pour 90] [--pours 15] [--prior 37]
+                              [--no-trust] [--json]
+
+Toy worlds (`optimiser_problems.py`, and simulators that know them more or less as in `hybrid_models.py`) behind the
+real strategy, scheduler, journal and optimiser, in one process, on a clock that leaves waiting out
+(`skipping_clock.py`). A simulation takes `--simulation` seconds, give or take a fifth, one at a time on each of
+`--slots` simulators; a pour takes `--pour`; an answer of the optimiser what it takes in CPU time.
+
+    D2      pours alone
+    fixed   D3 with 37 simulations and 2 beside each pour (the paper's form)
+    plain   D3 with 37 simulations, and beside pours as many as there is time for, by lower confidence bounds
+    priced  D3 with `per_pour: free`: simulations by what they are worth, before the first pour at most 37
+    longer  the same, with at most 200 before the first pour
+    tireless  as priced, but the pool never rests
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import random
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hybrid_models import SCATTER, WORLDS
+from machine import describe, pin, say, show
+from optimiser_problems import BY_NAME, Floats, Problem, World
+from skipping_clock import SkippingLoop, run
+
+from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from actors.optimizer.core.propose import propose
+from actors.protocols import ProgressCallback, SimulationResult
+from actors.spec import LaboratorySpec
+from orchestrator.campaign import run_campaign
+from orchestrator.events import DecisionMade, Event
+from orchestrator.occupancy import RESTS, Occupancy
+from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan, PricesPlan, TrustPlan
+from sim_engine.action import DEG
+from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.losses import Loss
+from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.space import Axis, Space
+from sim_engine.task import PourTask, Scene
+from sim_engine.vessel.spec import cylinder
+
+AXES = (
+    Axis("angular_velocity", 15 * DEG, 120 * DEG),
+    Axis("x_offset", 0.08, 0.15),
+    Axis("height", 0.03, 0.1),
+    Axis("max_angle", 70 * DEG, 125 * DEG),
+)
+SCENE = Scene(
+    "cup",
+    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
+    cylinder("cup", inner_radius=0.03, inner_height=0.08),
+    Liquid(mass=0.2),
+    fixed={"height": 0.03},
+)
+AFTER = (1, 3, 5, 10, 15)
+SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
+    **WORLDS,
+    "shifted by 0.04": lambda world, u, sign: world.true(u + 0.04 * sign),
+}
+TRUST = TrustPlan()
+
+
+def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
+    """What is compared."""
+    free = DeploymentPlan(
+        "D3", (SCENE,), space, Loss(), pours=asked.pours, prior_simulations=asked.prior, per_pour=None, model="scaled"
+    )
+    free = replace(free, trust=None if asked.no_trust else TRUST)
+    prices = PricesPlan(pour=asked.pour)
+    return {
+        "D2": replace(free, strategy="D2", per_pour=0, model="residual", trust=None),
+        "fixed": replace(free, per_pour=2),
+        "plain": free,
+        "priced": replace(free, prices=prices),
+        "longer": replace(free, prices=prices, prior_simulations=200),
+        "tireless": replace(free, prices=replace(prices, worth=0.0)),
+    }
+
+
+class Bench:
+    """A laboratory of numbers: simulators, arm and optimiser, with prices, and a record of who was busy when."""
+
+    mode = "virtual"
+
+    def __init__(self, problem: Problem, world: str, seed: int, space: Space, asked: argparse.Namespace) -> None:
+        self._world, self._space, self._asked = World(problem, seed), space, asked
+        self._simulated = SIMULATORS[world]
+        self._sign = np.random.default_rng([seed, 999]).choice([-1.0, 1.0], problem.dimension)
+        self._free = asyncio.Semaphore(asked.slots)
+        self.size = asked.slots
+        self.simulators = self.bench = self.optimizer = self
+        self.occupancy = Occupancy(asked.slots)
+        self.poured: list[float] = []
+        self.before_first = 0
+        self.simulations = 0
+        self.answers: list[float] = []
+
+    async def __aenter__(self) -> Bench:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        return None
+
+    @property
+    def _clock(self) -> SkippingLoop:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, SkippingLoop)
+        return loop
+
+    def watch(self, event: Event) -> None:
+        """The strategy says when the pool may rest."""
+        if isinstance(event, DecisionMade) and RESTS in event.decision.values:
+            self.occupancy.rests(self._clock.time())
+
+    async def simulate(self, task: PourTask) -> SimulationResult:
+        """One of the pool's members takes its time."""
+        rng = np.random.default_rng(task.seed)
+        unit = self._space.encode({name: getattr(task.action, name) for name in self._space.names})
+        cost = self._simulated(self._world, unit, self._sign) + SCATTER * float(rng.standard_normal())
+        spilled, seconds = min(max(cost, 0.0), 1.0), self._asked.simulation * rng.uniform(0.8, 1.2)
+        async with self._free:
+            self.occupancy.simulation_started(self._clock.time())
+            await asyncio.sleep(seconds)
+            self.occupancy.simulation_finished(self._clock.time())
+        self.simulations += 1
+        outcome = PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, seconds, task.seed)
+        return SimulationResult(outcome)
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+    ) -> PourMeasurement:
+        """The arm pours, the operator mops."""
+        self.before_first = self.before_first if self.poured else self.simulations
+        self.occupancy.pour_started(self._clock.time())
+        await asyncio.sleep(self._asked.pour)
+        unit = self._space.encode({name: getattr(action, name) for name in self._space.names})
+        cost = self._world.true(unit)
+        self.poured.append(cost)
+        noise = (0.01 + 0.12 * cost) * float(np.random.default_rng(seed).standard_normal())
+        self.occupancy.pour_finished(self._clock.time())
+        return PourMeasurement(scene.liquid.mass, scene.liquid.mass * min(max(cost + noise, 0.0), 1.0), 0.0)
+
+    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+        """The real optimiser; in a laboratory it is a process of its own."""
+        begun = time.thread_time()
+        suggestion = propose(problem)
+        seconds = time.thread_time() - begun
+        self.answers.append(seconds)
+        await self._clock.spend(seconds, seconds)
+        return suggestion
+
+    def true(self, values: dict[str, float]) -> float:
+        """Spillage of an action without noise."""
+        return self._world.true(self._space.encode(values))
+
+
+def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespace) -> dict[str, Any]:
+    """One campaign, and what it came to."""
+    problem = BY_NAME[asked.problem]
+    bench = Bench(problem, world, seed, arm.actions, asked)
+    with tempfile.TemporaryDirectory() as folder:
+        plan = CampaignPlan(
+            name="dyna",
+            seed=seed,
+            source=Path(folder) / "dyna.yaml",
+            laboratory=LaboratorySpec("numbers"),
+            parameters=SimulationParameters(particles=500),
+            calibration=None,
+            deployment=arm,
+            outputs=OutputPlan(Path(folder), record_rate=0.0),
+            parallel_simulations=asked.slots,
+        )
+        begun = time.thread_time()
+        result = run(run_campaign(plan, bench, Path(folder) / "run", watchers=[bench.watch]))
+    bench.occupancy.finish()
+    (stage,) = result.results.values()
+    values: dict[str, Any] = {
+        "before first": bench.before_first,
+        "simulations": bench.simulations,
+        "busy": bench.occupancy.fraction if bench.simulations else None,
+        "useful": bench.occupancy.useful / bench.occupancy.total if bench.simulations else None,
+        "longest wait, ms": 1e3 * max(bench.occupancy.waits, default=0.0),
+        "mean wait, ms": 1e3 * float(np.mean(bench.occupancy.waits)),
+        "longest answer, ms": 1e3 * max(bench.answers),
+        "CPU, s": time.thread_time() - begun,
+        "alarm": float(bool((stage.get("trust") or {}).get("alarm"))),
+        "reported": bench.true(stage["action_si"]),
+    }
+    for pours in (n for n in AFTER if n <= asked.pours):
+        values[f"least of {pours}"] = min(bench.poured[:pours])
+        values[f"mean of {pours}"] = float(np.mean(bench.poured[:pours]))
+    return values
+
+
+def interval(values: list[float]) -> list[float]:
+    """Mean, and its 95 % bootstrap interval."""
+    draws = random.Random(0)
+    means = sorted(float(np.mean(draws.choices(values, k=len(values)))) for _ in range(2000))
+    return [round(v, 4) for v in (float(np.mean(values)), means[50], means[1949])]
+
+
+def rows_of(asked: argparse.Namespace) -> list[dict[str, Any]]:
+    """Every world with every arm."""
+    space = Space(AXES[: BY_NAME[asked.problem].dimension])
+    rows = []
+    for world in asked.worlds:
+        for name in asked.arms:
+            plan = arms(asked, space)[name]
+            runs = []
+            for seed in range(asked.first, asked.first + asked.seeds):
+                runs.append(campaign(plan, world, seed, asked))
+                say(f"{world}, {name}, seed {seed}: {runs[-1]}")
+            row: dict[str, Any] = {"world": world, "arm": name}
+            for key in runs[0]:
+                known = [run[key] for run in runs if run[key] is not None]
+                if key.startswith("longest"):
+                    row[key] = round(max(known), 1)
+                elif known:
+                    row[key] = interval(known)
+            rows.append(row)
+    return rows
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = ["D2", "fixed", "plain", "priced", "longer", "tireless"]
+    parser.add_argument("--worlds", nargs="+", choices=list(SIMULATORS), default=["right", "shifted by 0.08"])
+    parser.add_argument("--problem", choices=["spill2", "narrow2", "spill4"], default="spill2")
+    parser.add_argument("--arms", nargs="+", choices=names, default=["D2", "fixed", "priced"])
+    parser.add_argument("--seeds", type=int, default=30)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--simulation", type=float, default=1.5)
+    parser.add_argument("--slots", type=int, default=2)
+    parser.add_argument("--pour", type=float, default=90.0)
+    parser.add_argument("--pours", type=int, default=15)
+    parser.add_argument("--prior", type=int, default=37)
+    parser.add_argument("--no-trust", action="store_true", help="never fall back on pours alone")
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    pin(None)
+    rows = rows_of(asked)
+    show({"settings": vars(asked), "rows": rows, "machine": describe()}, asked.json)
+
+
+if __name__ == "__main__":
+    main()
