@@ -44,7 +44,7 @@ def fill(text: str, report: Path) -> str:
 
     def filled(match: re.Match[str]) -> str:
         wanted: dict[str, set[str]] = {}
-        for part in match["wanted"].split(";"):
+        for part in match["wanted"].strip(" ;").split(";"):
             if part.strip():
                 name, _, values = part.strip().partition("=")
                 wanted[name.strip()] = {value.strip() for value in values.split("/")}

@@ -74,7 +74,7 @@ def test_beside_a_boundary_pours_come_closer_than_where_refusals_cost_the_worst(
     least = {}
     for refusals in ("avoid", "penalise"):
         found = []
-        for seed in range(4):
+        for seed in range(12):
             plan = deployment_plan(strategy="D2", pours=8, refusals=refusals)
             found.append(min(Play(touching)(RealOnly(plan, SCENE, THETA, seed)).real_spills))
         least[refusals] = float(np.mean(found))

@@ -39,7 +39,7 @@ class Session:
         spec = self._spec
         self._worker = WorkerProcess()
         # Only a virtual controller has its time scaled; its process may be kept waiting where a real one isn't.
-        silence = SILENCE if spec.time_scale == 1.0 else 5.0 * SILENCE
+        silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
         try:
             self.ask("open", spec.address, spec.rate, silence, deadline=OPEN_TIME)
             self.facts = self.find_out()
