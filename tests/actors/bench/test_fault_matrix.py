@@ -44,7 +44,7 @@ STANDING = 2.0
 """After which an arm that was told to stop must stand [s of the clock]: half a second of missing heartbeats, the rest
 for a busy machine."""
 
-pytestmark = pytest.mark.timeout(120)
+pytestmark = pytest.mark.timeout(240)
 
 
 @dataclass
