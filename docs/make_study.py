@@ -23,8 +23,9 @@ FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7")
 def table(path: Path, wanted: dict[str, set[str]]) -> str:
     """A CSV of the report as Markdown, a mean and its interval in one cell."""
     with path.open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if all(row[name] in some for name, some in wanted.items())]
-        names = list(csv.DictReader(path.open(encoding="utf-8")).fieldnames or [])
+        reader = csv.DictReader(file)
+        rows = [row for row in reader if all(row[name] in some for name, some in wanted.items())]
+        names = list(reader.fieldnames or [])
     shown = [name for name in names if not name.endswith((", low", ", high")) and len(wanted.get(name, "12")) > 1]
     lines = [f"| {' | '.join(shown)} |", f"|{'---|' * len(shown)}"]
     for row in rows:

@@ -210,6 +210,11 @@ class ParametersBase(Section):
             if isinstance(section := self.value(name), RangeSection) and section.range is not None
         }
 
+    def in_force(self) -> dict[str, float]:
+        """What is named, SI: a value as it is, and of a range the default or what is nearest to it."""
+        default = SimulationParameters().model_dump()
+        return self.fixed() | {n: min(max(default[n], axis.lower), axis.upper) for n, axis in self.searched().items()}
+
 
 def _parameters_model() -> type[ParametersBase]:
     fields: Any = {}

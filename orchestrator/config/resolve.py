@@ -49,7 +49,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         )
     if report.problems or laboratory is None or file.name is None:
         return None
-    in_force = fixed | {name: min(max(default[name], axis.lower), axis.upper) for name, axis in searched.items()}
+    in_force = default if parameters is None else default | parameters.in_force()
     return CampaignPlan(
         name=file.name,
         seed=file.seed,

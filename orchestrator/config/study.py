@@ -305,9 +305,7 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
 def _with_parameters(base: CampaignPlan, changes: ParametersBase, place: Place, report: Report) -> CampaignPlan:
     """The plan with other values or ranges of θ."""
     fixed, searched = changes.fixed(), changes.searched()
-    default = SimulationParameters().model_dump()
-    middle = {name: min(max(default[name], axis.lower), axis.upper) for name, axis in searched.items()}
-    base = replace(base, parameters=SimulationParameters.from_values(base.parameters.model_dump() | fixed | middle))
+    base = replace(base, parameters=SimulationParameters.from_values(base.parameters.model_dump() | changes.in_force()))
     if base.calibration is None:
         return base
     axes = {axis.name: axis for axis in base.calibration.parameters.axes if axis.name not in fixed} | searched

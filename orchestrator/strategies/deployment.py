@@ -142,7 +142,8 @@ class Deployment(ABC):
                 trial.status, trial.reason = "failed", f"{kind}: {reason}"
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
-        if not self._avoids if trial.status == "refused" else self._plan.on_failed_pour == "penalise":
+        penalised = self._plan.on_failed_pour == "penalise"
+        if (not self._avoids) if trial.status == "refused" else penalised:
             trial.cost, trial.vector = self._costing.worst, self._costing.worst_vector
 
     # -- pieces for subclasses -------------------------------------------------------------------------------------

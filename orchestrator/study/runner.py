@@ -93,7 +93,7 @@ class Worker:
     def ended(self) -> tuple[Cell, str | None] | None:
         """The cell that has just ended, if one has, and what went wrong with it."""
         assert self.process.stdout is not None
-        dead = self.process.poll() is not None  # before the last look at what it wrote
+        dead = self.dead  # before the last look at what it wrote
         self._heard += self.process.stdout.read() or b""
         line, newline, rest = self._heard.partition(b"\n")
         if self.cell is None or not (newline or dead):
