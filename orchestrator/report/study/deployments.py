@@ -138,6 +138,8 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
 
 
 def _prices(study: StudyPlan, found: Gathered) -> Drawn:
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
     levels, receivers, arms = places(study, found)
     level = study.compared if study.compared in levels else levels[0]
     unit = deployment_unit(study.deployments[0].plan)
@@ -149,6 +151,8 @@ def _prices(study: StudyPlan, found: Gathered) -> Drawn:
             axes, planned = grid[i][j], []
             for arm in arms:
                 times, values = _spent(study, found, level, receivers, arm, simulation, pour)
+                if not times:
+                    continue
                 rows += [[level, simulation, pour, arm, t, unit.factor * v] for t, v in zip(times, values)]  # noqa: B905
                 shown = [max(unit.factor * value, 0.01) for value in values]
                 if arm.startswith("D1"):
@@ -160,6 +164,10 @@ def _prices(study: StudyPlan, found: Gathered) -> Drawn:
                 axes.plot(*np.transpose(planned), "s--", color=colour("D1"), label="D1", markersize=5)
             axes.set_xscale("log")
             axes.set_yscale("log")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                axis.set_major_formatter(FormatStrFormatter("%g"))
+                axis.set_minor_formatter(NullFormatter())
             x, y = "total time [s]" if i == shape[0] - 1 else "", f"least {unit.label}" if j == 0 else ""
             style.dress(axes, title=f"{simulation:g} s a simulation, {pour:g} s a pour", x=x, y=y, grid="both")
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
