@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
 from tests.end_to_end.small import CAMPAIGN, write_campaign
@@ -114,6 +115,7 @@ def test_when_a_node_dies_its_simulations_are_repeated_elsewhere_and_people_are_
         while not (log.exists() and log.read_text().count("end") >= 6 and busy_on_both(log)):
             assert time.monotonic() < end, program.poll()
             time.sleep(0.05)
+        hold_amid_a_simulation(cluster.workers(1), log)
         cluster.kill_node(1)
         output, errors = program.communicate(timeout=120)
     finally:
@@ -131,6 +133,27 @@ def test_when_a_node_dies_its_simulations_are_repeated_elsewhere_and_people_are_
     assert begun - ended == 1, "the one that was under way there"
     assert cluster.is_alive(), "the cluster is others'"
     assert cluster.workers(0) == []
+
+
+def hold_amid_a_simulation(workers: list[psutil.Process], log: Path) -> None:
+    """Stop the simulator among a node's processes between the begin and the end of a simulation."""
+    end = time.monotonic() + 30.0
+    while time.monotonic() < end:
+        for worker in workers:
+            if not under_way(log, worker.pid):
+                continue
+            worker.suspend()
+            if under_way(log, worker.pid):
+                return
+            worker.resume()  # it ended just before it was stopped
+        time.sleep(0.01)
+    raise AssertionError(log.read_text())
+
+
+def under_way(log: Path, pid: int) -> bool:
+    """Whether a simulator's last word is that it has begun."""
+    words = [line.split()[0] for line in log.read_text().splitlines() if line.split()[1:2] == [str(pid)]]
+    return words[-1:] == ["begin"]
 
 
 def busy_on_both(log: Path) -> bool:
