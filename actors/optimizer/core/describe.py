@@ -1,0 +1,96 @@
+"""What a fitted surrogate says, for the answer: predictions, the best observation, a map, draws of θ."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.optimizer.core.asked import Asked, array, tuples
+from actors.optimizer.core.models import Model
+from actors.optimizer.core.posterior import sample_posterior
+from actors.optimizer.core.problem import Point, Posterior, PosteriorQuestion, SuggestProblem, SurrogateMap
+from actors.optimizer.core.region import Feasibility, Region
+from actors.optimizer.core.risk import RiskProcess
+
+Array = NDArray[np.float64]
+
+WORST = 8
+"""Disturbances that an answer names as the worst of a request."""
+
+
+def describe(
+    problem: SuggestProblem, asked: Asked, model: Model, points: Array, feasibility: Feasibility | None
+) -> dict[str, object]:
+    """What the surrogate says about the proposals, the observations and the rest."""
+    known = asked.known if len(asked.known) else asked.simulated
+    if problem.risk is not None:
+        known = asked.region.snap(array(problem.predict_at, problem.space.dimension))
+    elif feasibility is not None:
+        known = known[feasibility.likely(known)]
+    means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
+    at_known, known_deviations = model.surrogate.predict(known)
+    best = int(np.argmin(at_known))
+    process = model.process
+    description: dict[str, object] = {
+        "means": tuple(map(float, means)),
+        "deviations": tuple(map(float, deviations)),
+        "noises": () if problem.beside or problem.risk else tuple(map(float, process.noise_at(points))),
+        "best_point": tuple(map(float, known[best])),
+        "best_mean": float(at_known[best]),
+        "best_deviation": float(known_deviations[best]),
+        "best_noise": None if problem.beside or problem.risk else float(process.noise_at(known[best : best + 1])[0]),
+        "hyperparameters": {
+            "signal": process.signal,
+            "noise": process.noise,
+            **process.hyperparameters,
+            **dict(zip((f"length.{name}" for name in _axis_names(problem)), map(float, process.lengths), strict=True)),
+        },
+    }
+    if problem.predict_at:
+        predictions, spreads = model.surrogate.predict(
+            asked.region.snap(array(problem.predict_at, problem.space.dimension))
+        )
+        description["predictions"] = tuple(map(float, predictions))
+        description["prediction_deviations"] = tuple(map(float, spreads))
+        if isinstance(model.surrogate, RiskProcess):
+            description["risk"] = model.surrogate.answer(known, WORST)
+    if problem.map_resolution and problem.space.dimension >= 2:
+        sought = problem.acquisition == "posterior_minimum" and len(points) > 0
+        description["surrogate"] = _map(problem, asked.region, model, points[0] if sought else known[best])
+    return description
+
+
+def posterior_of(
+    problem: SuggestProblem, question: PosteriorQuestion, region: Region, model: Model, rng: np.random.Generator
+) -> Posterior:
+    """Draws of θ given weighed pours."""
+    contexts = array(question.contexts, model.process.points.shape[1] - problem.space.dimension)
+    sampled = sample_posterior(
+        model.process,
+        contexts,
+        np.array(question.offsets),
+        noise=question.noise,
+        count=question.count,
+        snap=region.snap,
+        rng=rng,
+    )
+    return Posterior(tuples(sampled.points), tuple(map(float, sampled.discrepancies)), sampled.effective)
+
+
+def _axis_names(problem: SuggestProblem) -> list[str]:
+    return [*problem.space.names, *(f"context{i + 1}" for i in range(problem.beside))]
+
+
+def _map(problem: SuggestProblem, region: Region, model: Model, at: Array) -> SurrogateMap:
+    """The surrogate on the plane through `at` (dimension,) that its two most important axes span."""
+    across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
+    places = np.linspace(0.0, 1.0, problem.map_resolution)
+    first, second = np.meshgrid(places, places)
+    grid = np.tile(at, (first.size, 1))
+    grid[:, across], grid[:, up] = first.ravel(), second.ravel()
+    mean, deviation = model.surrogate.predict(region.snap(grid))
+    shape, names = first.shape, problem.space.names
+    cut: tuple[tuple[str, ...], Point] = ((), ())
+    if problem.space.dimension > 2:
+        cut = (names[across], names[up]), tuple(map(float, at))
+    return SurrogateMap(tuples(mean.reshape(shape)), tuples(deviation.reshape(shape)), *cut)

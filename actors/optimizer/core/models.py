@@ -1,0 +1,89 @@
+"""Which surrogate a question asks for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.optimizer.core.asked import Asked, array
+from actors.optimizer.core.folded import AbsoluteProcess
+from actors.optimizer.core.problem import SuggestProblem
+from actors.optimizer.core.risk import RiskProcess
+from actors.optimizer.core.surrogate import (
+    AFRESH,
+    GaussianProcess,
+    Search,
+    Surrogate,
+    constant_mean_process,
+    joint_process,
+    simulated_mean_process,
+    zero_mean_process,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A fitted surrogate.
+
+    Attributes:
+        surrogate: of what is minimised.
+        process: with the observations in it.
+        lengths: (dimension,) lengthscales of the searched axes. Around a simulated mean they are the simulations':
+            a handful of pours says little about what the pours' remainder depends on.
+        fitted: all processes that were fitted, in order.
+    """
+
+    surrogate: Surrogate
+    process: GaussianProcess
+    lengths: Array
+    fitted: tuple[GaussianProcess, ...]
+
+
+def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
+    """The surrogate that the problem asks for; None with too few observations."""
+    points, costs = asked.points, asked.costs
+    informed = problem.mean in ("simulated", "pooled", "scaled") and len(asked.simulated) >= 2
+    varying = problem.noise == "varying"
+    first = _search_for(problem, 0)
+    if informed and problem.mean == "simulated":
+        simulated = constant_mean_process(asked.simulated, asked.simulated_costs, search=first)
+        if not len(points):
+            return Model(simulated, simulated, simulated.lengths, (simulated,))
+        second = _search_for(problem, 1)
+        process = simulated_mean_process(simulated, points, costs, varying=varying, search=second)
+        return Model(process, process, simulated.lengths, (simulated, process))
+    if informed:
+        process = joint_process(
+            asked.simulated,
+            asked.simulated_costs,
+            points,
+            costs,
+            scaled=problem.mean == "scaled",
+            varying=varying,
+            widening=problem.widening,
+            search=first,
+        )
+        return Model(process, process, process.lengths, (process,))
+    if len(points) < 2:
+        return None
+    build = zero_mean_process if problem.mean == "zero" else constant_mean_process
+    process = build(points, costs, varying=varying, search=first)
+    dimension = problem.space.dimension
+    if problem.risk is not None:
+        return Model(RiskProcess.of(process, problem.risk), process, process.lengths[:dimension], (process,))
+    if problem.context:
+        context = array(problem.context, points.shape[1] - dimension)
+        return Model(AbsoluteProcess(process, context), process, process.lengths[:dimension], (process,))
+    return Model(process, process, process.lengths, (process,))
+
+
+def _search_for(problem: SuggestProblem, number: int) -> Search:
+    """How the `number`-th process looks for its hyperparameters."""
+    effort = problem.effort
+    if effort is None or number >= len(effort.start):
+        return AFRESH
+    return Search(np.array(effort.start[number], dtype=np.float64), effort.iterations)
