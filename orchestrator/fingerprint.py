@@ -27,7 +27,7 @@ _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "han
 """Of its parts: a controller may get another address, a balance another socket."""
 
 _YOUNGER: dict[str, dict[str, Any]] = {
-    "calibration": {"grid": {}, "thetas": 0},
+    "calibration": {"grid": {}, "thetas": 0, "constraints": []},
     "deployment": {
         "data": None,
         "objectives": None,
@@ -38,6 +38,7 @@ _YOUNGER: dict[str, dict[str, Any]] = {
         "risk": None,
         "tolerance": None,
         "prices": None,
+        "constraints": [],
     },
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
@@ -53,8 +54,8 @@ _CAME_TOGETHER: tuple[dict[str, Any], ...] = (
 )
 """Fields of a deployment that came at the same time, each with what a campaign has that doesn't name it."""
 
-_NEWEST = ("noise", "refusals", "risk", "tolerance", "prices")
-"""Fields of a deployment that came after the first studies."""
+_NEWEST = ("noise", "refusals", "risk", "tolerance", "prices", "constraints")
+"""Fields of a calibration or deployment that came after the first studies."""
 
 
 def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
@@ -84,10 +85,10 @@ def deployment_as_begun(today: DeploymentPlan, before: Mapping[str, Any]) -> Dep
     return replace(today, **changes) if changes else today
 
 
-def without_newest(deployment: dict[str, Any]) -> dict[str, Any]:
-    """A deployment's JSON without those of the newest fields that change nothing, as it was written before them."""
+def without_newest(section: dict[str, Any]) -> dict[str, Any]:
+    """A calibration's or deployment's JSON without those of the newest fields that change nothing, as it was written before them."""
     unused = {name: _YOUNGER["deployment"][name] for name in _NEWEST}
-    return {name: value for name, value in deployment.items() if name not in unused or value != unused[name]}
+    return {name: value for name, value in section.items() if name not in unused or value != unused[name]}
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:

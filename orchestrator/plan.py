@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
 from orchestrator.strategies.objectives import Objectives
 from sim_engine.action import Action
@@ -102,6 +103,7 @@ class CalibrationPlan:
         kappa: C3, C4: κ of the lower confidence bound.
         grid: C1: values tried of every searched θ_s, by name.
         thetas: C2, C3: how many θ are tried, each on all training pours.
+        constraints: on actions, beside the bounds of their space.
     """
 
     strategy: CalibrationName
@@ -119,6 +121,7 @@ class CalibrationPlan:
     kappa: float = 2.0
     grid: dict[str, int] = field(default_factory=dict)
     thetas: int = 0
+    constraints: tuple[Linear, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -201,6 +204,7 @@ class DeploymentPlan:
         tolerance: D1: loss up to which one may miss the action, as a share of that of spilling all; None: no safe
             window is looked for.
         prices: D3 with `per_pour` None: simulations by what they are worth; None: as they come, as in older runs.
+        constraints: on actions, beside the bounds of their space.
     """
 
     strategy: DeploymentName
@@ -225,6 +229,7 @@ class DeploymentPlan:
     risk: RiskPlan | None = None
     tolerance: float | None = None
     prices: PricesPlan | None = None
+    constraints: tuple[Linear, ...] = ()
 
     @property
     def loss_name(self) -> str:

@@ -111,7 +111,9 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
     if plan.pour_count > 0:
 
         def pours(results: Results, seed: int) -> Strategy:
-            return DesignedPours(plan.scene, plan.actions, plan.pour_count, plan.holdout, seed)
+            return DesignedPours(
+                plan.scene, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
+            )
 
         stages.append(StageDefinition(POURS, pours, pours=True))
 

@@ -14,9 +14,11 @@ import numpy as np
 
 from actors.arm.joint_path import PathReport
 from actors.arm.spec import UrArmSpec
+from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
 from orchestrator.commands.common import BAD_INPUT, RefusalError, say
 from orchestrator.safety import SafetyRecordError, accepted_checksum
+from orchestrator.strategies.prior import region_of
 from sim_engine.action import Action
 from sim_engine.space import Space
 from sim_engine.task import Scene
@@ -90,18 +92,20 @@ def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> lis
     calibrating, deploying = _pouring(stages)
     cases: list[tuple[Scene, Action]] = []
     if plan.calibration is not None and calibrating:
-        cases += _from_all_over(plan.calibration.scene, plan.calibration.actions)
+        cases += _from_all_over(plan.calibration.scene, plan.calibration.actions, plan.calibration.constraints)
     if plan.deployment is not None and deploying:
         for scene in plan.deployment.scenes:
-            cases += _from_all_over(scene, plan.deployment.actions)
+            cases += _from_all_over(scene, plan.deployment.actions, plan.deployment.constraints)
     return cases
 
 
-def _from_all_over(scene: Scene, actions: Space) -> list[tuple[Scene, Action]]:
+def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) -> list[tuple[Scene, Action]]:
     corners = itertools.islice(itertools.product((0.0, 1.0), repeat=actions.dimension), CORNERS)
     drawn = np.random.default_rng(0).random((INTERIOR, actions.dimension)).tolist()
-    found = []
+    found, region = [], region_of(actions, constraints)
     for point in ([0.5] * actions.dimension, *map(list, corners), *drawn):
+        if region is not None and not region.allows(np.array([point]))[0]:
+            continue
         try:
             found.append((scene, scene.action(actions.decode(point))))
         except ValueError:

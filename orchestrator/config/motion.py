@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag, create_model, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
+from actors.optimizer.core.problem import Linear
+from orchestrator.config.constraints import constraint_as_file
 from orchestrator.config.quantities import Quantity, format_quantity
-from orchestrator.config.sections import Section
+from orchestrator.config.sections import Section, Text
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Scale, Space
@@ -168,6 +170,9 @@ def _motion_model() -> type[MotionBase]:
 class ActionsBase(Section):
     """Searched dimensions of the motion, each with its range; any subset."""
 
+    constraints: list[Text] | None = None
+    """What must hold between them besides, 'x_offset >= 60 mm + 0.5 * height' for example: sums of one kind."""
+
     def space(self) -> Space | None:
         """The action space, axes in the order of the declarations; None if nothing is searched."""
         axes = tuple(
@@ -252,8 +257,14 @@ def fixed_as_file(fixed: Mapping[str, float | None], pivot: Pivot, hold_cap: flo
     return section
 
 
+def actions_as_file(space: Space, constraints: Sequence[Linear]) -> dict[str, object]:
+    """An `actions:` section, JSON-ready."""
+    section = space_as_file(space)
+    return section | {"constraints": [constraint_as_file(c) for c in constraints]} if constraints else section
+
+
 def space_as_file(space: Space) -> dict[str, object]:
-    """An `actions:` or `parameters:` section, JSON-ready."""
+    """A `parameters:` section, or an `actions:` section without constraints, JSON-ready."""
     info = SimulationParameters.info()
     section: dict[str, object] = {}
     for axis in space.axes:

@@ -64,6 +64,7 @@ def resolve_calibration(
     pourer = builder.pourer(section.pourer, place)
     receiver = builder.receiver(section.receiver, place)
     actions = builder.space(section.actions, section.motion, place)
+    constraints = builder.constraints(section.actions, place, actions)
     motions = ((section.motion, place.at("motion")),)
     searched_actions = () if actions is None else actions.names
     table = read_table(pours, pours.source, at.at("from"), builder) if pours is not None else None
@@ -122,6 +123,7 @@ def resolve_calibration(
         strategy=section.strategy,
         scene=scene,
         actions=actions,
+        constraints=constraints,
         parameters=Space(tuple(searched.values())),
         fixed_parameters=fixed,
         pour_count=count,

@@ -41,6 +41,7 @@ def resolve_deployment(
     pourer = builder.pourer(section.pourer, place)
     receivers = builder.receivers(section, place)
     actions = builder.space(section.actions, section.motion, place)
+    constraints = builder.constraints(section.actions, place, actions)
     for key, strategies in BELONGS_TO.items():
         if strategy is not None and section.value(key) is not None and strategy not in strategies:
             report.add(place.at(key), f"belongs to {' and '.join(strategies)}, not to {strategy}; remove it", key=True)
@@ -94,6 +95,7 @@ def resolve_deployment(
         strategy=strategy,
         scenes=complete,
         actions=actions,
+        constraints=constraints,
         loss=Loss(loss.name, 1.0 if loss.retained_weight is None else loss.retained_weight),
         pours=pours,
         iterations=section.iterations or (15 if risk is None else 30),

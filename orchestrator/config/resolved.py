@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from orchestrator.config.laboratory import laboratory_as_file, pose_as_file
-from orchestrator.config.motion import fixed_as_file, space_as_file, value_as_file
+from orchestrator.config.motion import actions_as_file, fixed_as_file, space_as_file, value_as_file
 from orchestrator.config.vessel import liquid_as_file, vessel_as_file
 from orchestrator.journal import JOURNAL_NAME
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, ExistingPours, RiskPlan
@@ -71,7 +71,7 @@ def _calibration(plan: CalibrationPlan) -> dict[str, object]:
     return {
         "strategy": plan.strategy,
         **_scene(plan.scene),
-        "actions": space_as_file(plan.actions),
+        "actions": actions_as_file(plan.actions, plan.constraints),
         "pours": _pours(plan),
         **_budget(plan),
         "random_baseline": plan.random_baseline,
@@ -121,7 +121,7 @@ def _deployment(plan: DeploymentPlan) -> dict[str, object]:
         "pourer": scene["pourer"],
         "receivers": [vessel_as_file(s.receiver) for s in plan.scenes],
         "motion": scene["motion"],
-        "actions": space_as_file(plan.actions),
+        "actions": actions_as_file(plan.actions, plan.constraints),
         "loss": loss,
         "pours": plan.pours,
         "kappa": plan.kappa,

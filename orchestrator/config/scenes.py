@@ -6,11 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from actors.optimizer.core.problem import Linear
 from orchestrator.config.campaign import CampaignFile
+from orchestrator.config.constraints import parse_constraint
 from orchestrator.config.errors import dotted
 from orchestrator.config.motion import EXAMPLES, ActionsBase, MotionBase
+from orchestrator.config.quantities import QuantityError
 from orchestrator.config.references import References
 from orchestrator.config.yaml_source import Place, Report
+from orchestrator.strategies.prior import actions_of_prior
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquid import Liquid
 from sim_engine.space import Space
@@ -19,6 +23,9 @@ from sim_engine.vessel.spec import VesselSpec
 
 NEEDED = ("angular_velocity", "max_angle", "x_offset", "height")
 """Dimensions that have no default: each campaign fixes or searches them."""
+
+LEAST_LEFT = 64
+"""Of some 30,000 actions all over the ranges, as many at least must meet the constraints."""
 
 DEFAULTS = Action(angular_velocity=1.0, x_offset=0.0, height=0.0).values()
 
@@ -65,6 +72,25 @@ class SceneBuilder:
                     searched = dotted(at.at(name).loc)
                     self.report.add(fixed_at.at(name), f"is searched by {searched} too; keep one of them", key=True)
         return space
+
+    def constraints(self, actions: ActionsBase | None, place: Place, space: Space | None) -> tuple[Linear, ...]:
+        """The constraints of the action space of a section, which leave something of it."""
+        used, at = (self.file.actions, self.root) if actions is None else (actions, place)
+        if space is None or used is None or not used.constraints:
+            return ()
+        at, before = at.at("actions").at("constraints"), len(self.report.problems)
+        found = []
+        for i, text in enumerate(used.constraints):
+            try:
+                found.append(parse_constraint(text, space))
+            except QuantityError as error:
+                self.report.add(at.at(i), str(error))
+        if len(self.report.problems) == before:
+            try:
+                actions_of_prior(space, LEAST_LEFT, 0, found)
+            except ValueError:
+                self.report.add(at, "leave next to nothing of the ranges beside them; loosen one, or widen a range")
+        return tuple(found)
 
     def scene(
         self,

@@ -88,7 +88,8 @@ class ContinuousBayesianCalibration(Calibration):
 
     def _ask_regression(self) -> None:
         """c_r(a), and whether it is defined, along the prior's sequence of actions."""
-        sequence = actions_of_prior(self._plan.actions, 2 * self._plan.simulations, self._seeds.next())
+        count, seed = 2 * self._plan.simulations, self._seeds.next()
+        sequence = actions_of_prior(self._plan.actions, count, seed, self._plan.constraints)
         encode = self._plan.actions.encode
         spillage, poured = Data(), Data()
         for pour in self._train:

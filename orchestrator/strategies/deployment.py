@@ -293,6 +293,7 @@ class Deployment(ABC):
             self._plan.actions,
             data,
             kappa=self._plan.kappa,
+            constraints=self._plan.constraints,
             infeasible=tuple(trial.point for trial in trials if trial.refused),
             refused=tuple(p.point for p in self._pours if p.status == "refused") if self._avoids else (),
             noise=self._plan.noise,

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.optimizer.core.problem import Point
+from actors.optimizer.core.problem import Linear, Point
 from orchestrator.plan import RecordedPour
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.display import displayed_action
+from orchestrator.strategies.prior import region_of
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from sim_engine.action import Action, described
@@ -19,10 +21,17 @@ from sim_engine.losses import normalised_spillage
 from sim_engine.space import Space
 from sim_engine.task import Scene
 
+if TYPE_CHECKING:
+    from actors.optimizer.core.region import Region
+
 Array = NDArray[np.float64]
 
 MAX_TRIES = 12
 """Actions tried in one stratum before it is given up as impossible."""
+
+
+MAX_DRAWS = 100
+"""Points of a stratum of which none meets the constraints, before one from anywhere is taken."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,18 @@ def stratified(count: int, dimension: int, rng: np.random.Generator) -> list[Str
     return [Stratum(tuple((c / k).tolist()), tuple(((c + 1) / k).tolist())) for c in cells[order]]
 
 
+def draw_allowed(stratum: Stratum, region: Region | None, rng: np.random.Generator) -> Point:
+    """A point of the stratum that lies in the region; one from anywhere in it where the stratum seems to have none."""
+    point = stratum.draw(rng)
+    if region is None:
+        return point
+    for _ in range(MAX_DRAWS):
+        if region.allows(np.array([point]))[0]:
+            return point
+        point = stratum.draw(rng)
+    return tuple(map(float, region.draw(1, rng, even=False)[0]))
+
+
 def choose_holdout(strata: list[Stratum], count: int, rng: np.random.Generator) -> frozenset[int]:
     """Indices of the strata kept for testing: spread over the first axis, one from each of `count` equal groups."""
     if not 0 <= count < len(strata):
@@ -119,11 +140,13 @@ class DesignedPours:
         seed: int,
         *,
         points: Sequence[Point] | None = None,
+        constraints: Sequence[Linear] = (),
     ) -> None:
         """Plan.
 
         Args:
             points: the actions themselves, in the unit cube, in place of drawn ones: pours that are to be repeated.
+            constraints: that the actions meet, if drawn.
         """
         self._scene = scene
         self._actions = actions
@@ -134,6 +157,7 @@ class DesignedPours:
             strata = [Stratum(point, point) for point in points]
         kept = choose_holdout(strata, holdout, self._seeds.rng)
         self._planned = [_Planned(s, "test" if i in kept else "train") for i, s in enumerate(strata)]
+        self._region = region_of(actions, constraints if points is None else ())
         self._current = 0
         self._pouring: Pour | None = None
         self.decisions: list[Decision] = []
@@ -153,7 +177,7 @@ class DesignedPours:
         if self.finished or self._pouring is not None or slots.pours < 1:
             return []
         planned = self._planned[self._current]
-        values = self._actions.decode(planned.stratum.draw(self._seeds.rng))
+        values = self._actions.decode(draw_allowed(planned.stratum, self._region, self._seeds.rng))
         planned.tries += 1
         planned.action = self._scene.action(values)
         self._pouring = Pour(

@@ -22,7 +22,8 @@ from orchestrator.stages import (
     measured_pours,
     stage_seed,
 )
-from orchestrator.strategies.design import DesignedPours, stratified
+from orchestrator.strategies.design import DesignedPours, draw_allowed, stratified
+from orchestrator.strategies.prior import region_of
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.scorecard import Scorecard
 from orchestrator.study.cells import GRID, Cell
@@ -74,7 +75,9 @@ def calibration_actions(study: StudyPlan) -> list[tuple[float, ...]]:
     calibration = study.base.calibration
     assert calibration is not None
     rng = np.random.default_rng(stage_seed(study.seed, "actions"))
-    return [stratum.draw(rng) for stratum in stratified(study.pour_count, calibration.actions.dimension, rng)]
+    region = region_of(calibration.actions, calibration.constraints)
+    strata = stratified(study.pour_count, calibration.actions.dimension, rng)
+    return [draw_allowed(stratum, region, rng) for stratum in strata]
 
 
 def _actions(study: StudyPlan) -> list[Action]:

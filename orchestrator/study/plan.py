@@ -108,7 +108,9 @@ def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
         "seed": study.seed,
         "base": base,
         "levels": {level.name: to_json(level.bench, VirtualBenchSpec) for level in study.levels},
-        "calibrations": {arm.plan.strategy: to_json(arm.plan, CalibrationPlan) for arm in study.calibrations},
+        "calibrations": {
+            arm.plan.strategy: without_newest(to_json(arm.plan, CalibrationPlan)) for arm in study.calibrations
+        },
         "deployments": {arm.label: without_newest(to_json(arm.plan, DeploymentPlan)) for arm in study.deployments},
         "pours": [study.pour_count, study.holdout],
         "compared": study.compared,

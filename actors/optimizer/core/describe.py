@@ -27,6 +27,8 @@ def describe(
         known = asked.region.snap(array(problem.predict_at, problem.space.dimension))
     elif feasibility is not None:
         known = known[feasibility.likely(known)]
+    if problem.risk is None and (allowed := asked.region.allows(known)).any():
+        known = known[allowed]  # former data may lie beside what is allowed today
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
     at_known, known_deviations = model.surrogate.predict(known)
     best = int(np.argmin(at_known))
