@@ -130,7 +130,7 @@ class TrustPlan:
 
     Attributes:
         pours: that are compared with what simulations say of them.
-        limit: mean |z| above which the simulator is called wrong.
+        limit: mean of max(z, 0) above which the simulator is called wrong.
         policy: what follows. 'D2': its simulations are forgotten; 'widen': they are believed less; 'ask'.
     """
 

@@ -173,7 +173,7 @@ class TrustSection(Section):
     """Weighed pours that are compared with the simulations, from the third on."""
 
     limit: Annotated[float, Quantity("1", "2.5", 0.5, 100.0)] = 2.5
-    """Mean |z| above which the simulator is called wrong."""
+    """Mean of max(z, 0) above which the simulator is called wrong."""
 
     policy: Literal["ask", "D2", "widen"] = "D2"
     """D2: its simulations are forgotten; widen: they are believed less; ask: the campaign pauses with a question."""

@@ -33,9 +33,10 @@ def trust_line(trust: Mapping[str, Any]) -> str | None:
     text = "the first pours were far from what was predicted; the simulator may not fit this vessel"
     if "followed" not in trust:  # a run that only tells
         return text
+    text = "the first pours were worse than simulated; the simulator may not fit this vessel"
     followed = trust["followed"]
     what = "nobody has said yet how to go on" if followed is None else f"after pour {_last(trust)} {FOLLOWED[followed]}"
-    return f"{text} (mean |z| {trust['mean_z']:.1f}, limit {trust['limit']:g}); {what}"
+    return f"{text} (by {trust['mean_z']:.1f} deviations in the mean, limit {trust['limit']:g}); {what}"
 
 
 def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver: str) -> Path:
@@ -57,7 +58,11 @@ def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver
     if not pours:
         raise ValueError("trust figure: no pour was compared with the simulations")
     figure, (left, right) = style.new_figure(1, 2, size=(8.2, 3.9))
-    verdict = "the simulator is wrong here" if trust["alarm"] else "the simulator is borne out"
+    z = np.array(trust["z_scores"])
+    if trust["alarm"]:
+        verdict = "the simulator is wrong here"
+    else:
+        verdict = "better than simulated" if np.abs(z).mean() > trust["limit"] else "the simulator is borne out"
     figure.suptitle(
         f"First pours against simulation: {receiver}: {verdict}", fontsize=12.5, color=style.INK, x=0.02, ha="left"
     )
@@ -65,13 +70,14 @@ def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver
     _losses(left, numbers, pours, unit)
     style.dress(left, title="weighed and simulated", x="pour", y=unit.label)
     limit = trust["limit"]
-    z = np.abs(trust["z_scores"])
     right.bar(numbers, z, 0.5, color=[style.BEST if value > limit else style.GOOD for value in z])
     right.axhline(limit, color=style.INK, linewidth=1.0, linestyle="--", label=f"limit {limit:g}")
-    right.axhline(trust["mean_z"], color=style.MEASURED, linewidth=1.6, label=f"mean {trust['mean_z']:.1f}")
+    mean = f"mean, better counts as 0: {trust['mean_z']:.1f}"
+    right.axhline(trust["mean_z"], color=style.MEASURED, linewidth=1.6, label=mean)
+    right.axhline(0.0, color=style.INK, linewidth=0.8)
     right.legend(fontsize=8.5, frameon=False)
     right.set_xticks(numbers)
-    style.dress(right, title="distance", x="pour", y="|z|, standard deviations")
+    style.dress(right, title="distance", x="pour", y="worse by, standard deviations")
     return style.save(figure, path)
 
 

@@ -110,6 +110,31 @@ def test_a_wrong_simulator_is_forgotten_from_the_alarm_on() -> None:
     assert done == total
 
 
+def pessimistic(action: Any, theta: Any, rng: Any) -> float:
+    """Twice what is really spilled, at least a third of it; the best action is the same."""
+    return min(0.35 + 2.0 * narrow_cup(action, theta, rng), 1.0)
+
+
+def test_a_simulator_that_promised_too_little_is_not_forgotten_and_people_are_told() -> None:
+    strategy = hybrid(pours=6, per_pour=2, model="scaled")
+    played = Play(pessimistic, narrow_cup)(strategy)
+    trust = strategy.result()["trust"]
+    assert np.mean(np.abs(trust["z_scores"])) > 2.5
+    assert (trust["alarm"], trust["followed"]) == (False, None)
+    assert not [d for d in strategy.decisions if d.urgent]
+    assert [d for d in strategy.decisions if d.text.startswith("pours are better than simulated: weighed for")]
+    last = [r.problem for r in played.asked if isinstance(r, Suggest)][-1]
+    assert len(last.simulated) == 20 + 6 * 2
+    line = trust_line(trust)
+    assert line is None
+
+
+def test_one_pour_that_is_better_does_not_excuse_those_that_are_worse() -> None:
+    check = TrustCheck(TrustPlan(limit=2.5), worst=1.0)
+    check.compare(weighed(0.05, 0.5, 0.5), said(0.9, 0.1, 0.1))
+    assert check.alarm
+
+
 def test_a_wrong_simulator_is_believed_less_where_the_policy_is_to_widen() -> None:
     played = Play(upside_down, narrow_cup)(hybrid(policy="widen", pours=4))
     last = [r.problem for r in played.asked if isinstance(r, Suggest)][-1]

@@ -1,0 +1,136 @@
+"""What the trust alarm costs and saves: D3 with it and without, beside D2, on simulators that are right or wrong.
+
+Toy pours after toy simulations:
+
+    python benchmarks/trust.py [--worlds right half ...] [--problem narrow2] [--seeds 12] [--pours 15]
+                               [--simulations 37] [--model scaled] [--json]
+
+A world is a problem of `optimiser_problems.py`, and a simulator that knows it more or less (`hybrid_models.py`), or
+promises that nothing is ever spilled. A seed has the same world and the same scatter of pours in all arms. All of it in
+this process.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from hybrid_models import SCATTER, WORLDS
+from machine import describe, pin, say, show
+from optimiser_problems import BY_NAME, Floats, World
+
+from actors.optimizer.core.propose import propose
+from orchestrator.plan import DeploymentPlan, TrustPlan
+from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
+from orchestrator.strategies.deployment import Deployment
+from orchestrator.strategies.deployment_d2 import RealOnly
+from orchestrator.strategies.deployment_d3 import Hybrid
+from sim_engine.action import DEG
+from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.losses import Loss
+from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.space import Axis, Space
+from sim_engine.task import Scene
+from sim_engine.vessel.spec import cylinder
+
+SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
+SCENE = Scene(
+    "cup",
+    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
+    cylinder("cup", inner_radius=0.03, inner_height=0.08),
+    Liquid(mass=0.2),
+    fixed={"height": 0.03},
+)
+SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
+    **WORLDS,
+    "twice": lambda world, u, _: min(2.0 * world.true(u), 1.0),
+    "promises everything": lambda world, u, _: 0.0,
+}
+ARMS: dict[str, TrustPlan | None] = {"D3": TrustPlan(), "D3, no alarm": None, "D2": None}
+
+
+class Numbers:
+    """Answers a strategy until it has finished."""
+
+    def __init__(self, world: World, simulator: str) -> None:
+        self._world, self._simulator = world, SIMULATORS[simulator]
+        self._sign = np.random.default_rng([world.seed, 999]).choice([-1.0, 1.0], SPACE.dimension)
+        self.poured: list[float] = []
+
+    def play(self, strategy: Deployment) -> None:
+        """From the first question to the last answer."""
+        waiting: list[Request] = []
+        while not strategy.finished:
+            busy = sum(isinstance(one, Simulate) for one in waiting), sum(isinstance(one, Pour) for one in waiting)
+            waiting += strategy.ask(Slots(1 - busy[0], 1 - busy[1]))
+            waiting.sort(key=lambda one: isinstance(one, Pour))  # a pour takes longest
+            request = waiting.pop(0)
+            strategy.tell(request, self._answer(request))
+
+    def _answer(self, request: Request) -> Outcome:
+        if isinstance(request, Suggest):
+            return Suggested(propose(request.problem))
+        assert isinstance(request, Simulate | Pour)
+        unit = SPACE.encode({name: getattr(request.action, name) for name in SPACE.names})
+        if isinstance(request, Pour):
+            spilled = self._world.observe(unit, len(self.poured))
+            self.poured.append(self._world.true(unit))
+            return Poured(PourMeasurement(0.2, 0.2 * spilled, 0.0))
+        scatter = SCATTER * float(np.random.default_rng(request.seed).standard_normal())
+        spilled = min(max(self._simulator(self._world, unit, self._sign) + scatter, 0.0), 1.0)
+        outcome = PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, 1.0, request.seed)
+        return Simulated(outcome)
+
+
+def campaign(arm: str, simulator: str, seed: int, asked: argparse.Namespace) -> dict[str, float]:
+    """One campaign; losses without noise."""
+    world = World(BY_NAME[asked.problem], seed)
+    kind = RealOnly if arm == "D2" else Hybrid
+    plan = DeploymentPlan(
+        kind.NAME, (SCENE,), SPACE, Loss(), pours=asked.pours, prior_simulations=asked.simulations,
+        per_pour=0 if arm == "D2" else 2, model="residual" if arm == "D2" else asked.model, trust=ARMS[arm],
+        refusals="avoid",
+    )  # fmt: skip
+    strategy, numbers = kind(plan, SCENE, SimulationParameters(), seed), Numbers(world, simulator)
+    numbers.play(strategy)
+    best = strategy.best_values
+    trust: Any = strategy.result().get("trust") or {}
+    return {
+        "best of 3": min(numbers.poured[:3]),
+        "mean": float(np.mean(numbers.poured)),
+        "reported": 1.0 if best is None else world.true(SPACE.encode(best)),
+        "alarm": float(bool(trust.get("followed"))),
+    }
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", nargs="+", choices=list(SIMULATORS), default=list(SIMULATORS))
+    parser.add_argument("--problem", choices=["spill2", "narrow2"], default="narrow2")
+    parser.add_argument("--model", choices=["residual", "pooled", "scaled"], default="scaled")
+    parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--pours", type=int, default=15)
+    parser.add_argument("--simulations", type=int, default=37)
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    pin(None)
+    rows = []
+    for simulator in asked.worlds:
+        for arm in ARMS:
+            runs = [campaign(arm, simulator, seed, asked) for seed in range(asked.seeds)]
+            row: dict[str, Any] = {"simulator": simulator, "arm": arm}
+            for key in ("best of 3", "mean", "reported"):
+                values = [run[key] for run in runs]
+                row[key] = round(float(np.mean(values)), 3)
+                row[f"{key}, error"] = round(float(np.std(values, ddof=1) / len(values) ** 0.5), 3)
+            row["alarms"] = int(sum(run["alarm"] for run in runs))
+            rows.append(row)
+            say(f"{simulator}, {arm}: {row}")
+    show({"seeds": asked.seeds, "rows": rows, "machine": describe()}, asked.json)
+
+
+if __name__ == "__main__":
+    main()
