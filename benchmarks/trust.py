@@ -89,7 +89,7 @@ def campaign(arm: str, simulator: str, seed: int, asked: argparse.Namespace) -> 
     world = World(BY_NAME[asked.problem], seed)
     kind = RealOnly if arm == "D2" else Hybrid
     plan = DeploymentPlan(
-        kind.NAME, (SCENE,), SPACE, Loss(), pours=asked.pours, prior_simulations=asked.simulations,
+        "D2" if arm == "D2" else "D3", (SCENE,), SPACE, Loss(), pours=asked.pours, prior_simulations=asked.simulations,
         per_pour=0 if arm == "D2" else 2, model="residual" if arm == "D2" else asked.model, trust=ARMS[arm],
         refusals="avoid",
     )  # fmt: skip

@@ -223,7 +223,8 @@ class FreeHybrid(Hybrid):
         key = (problem.mean, len(problem.simulated) >= 2)
         effort = Effort()
         if len(problem.data) + len(problem.simulated) > FRESH_FITS and not self._compromise.wanted:
-            effort = Effort(self._fitted.get(key, ()), STEPS)
+            # noise that varies with the cost is fitted afresh: what it depends on is found in two steps
+            effort = Effort(self._fitted.get(key, ()) if problem.noise == "constant" else (), STEPS)
 
         def answered(suggestion: Suggestion) -> None:
             if suggestion.fitted:
