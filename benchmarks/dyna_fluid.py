@@ -1,0 +1,204 @@
+"""The Dyna loop with liquid in it: real simulations beside pours of the virtual bench's own liquid, at 90 s a pour.
+
+    python benchmarks/dyna_fluid.py [--level moderate] [--receiver narrow] [--arms D2 fixed priced tireless]
+                                    [--seeds 3] [--particles 500] [--slots 2] [--pour 90] [--pours 15] [--json]
+
+Simulator, strategy, scheduler, journal and optimiser are the real ones, in one process, on a clock that leaves waiting
+out (`skipping_clock.py`): a simulation takes its own CPU time on one of `--slots` simulators, a pour takes `--pour`. The
+bench's own liquid is accounted apart: it takes no time on that clock. Bench, scenes and actions are those of
+`configs/studies/paper.yaml`; θ is not calibrated. Arms are those of `dyna.py`; `tireless` simulates for as long as a
+pour takes, some 900 times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dyna import AFTER, TRUST, Bench, interval
+from machine import describe, pin, say, show
+from skipping_clock import run
+
+from actors.bench.world import World
+from actors.protocols import InvalidActionError, ProgressCallback, SimulationResult
+from orchestrator.campaign import run_campaign
+from orchestrator.config.study import load_study
+from orchestrator.occupancy import Occupancy
+from orchestrator.plan import DeploymentPlan, OutputPlan, PricesPlan
+from orchestrator.study.plan import StudyPlan
+from sim_engine.errors import InvalidSceneError
+from sim_engine.liquid import SimulationParameters
+from sim_engine.outcome import PourMeasurement
+from sim_engine.pour import PourSimulator
+from sim_engine.task import PourTask, Scene
+
+ROOT = Path(__file__).resolve().parents[1]
+Row = dict[str, Any]
+
+
+class Fluid(Bench):
+    """A laboratory whose numbers are simulated: the pool's by the strategy's θ, the bench's by the hidden one."""
+
+    def __init__(self, study: StudyPlan, level: str, simulator: PourSimulator, asked: argparse.Namespace) -> None:
+        self._asked, self._simulator = asked, simulator
+        self._free = asyncio.Semaphore(asked.slots)
+        self.size = asked.slots
+        self.simulators = self.bench = self.optimizer = self
+        self.occupancy = Occupancy(asked.slots)
+        self.poured: list[float] = []
+        self.before_first = self.simulations = 0
+        self.answers: list[float] = []
+        self.priced: list[float] = []
+        self.apart = 0.0
+        self._real = World(study.level(level).bench, _Apart(self))
+
+    def _run(self, task: PourTask) -> tuple[SimulationResult, float]:
+        """A simulation, and the CPU time that this thread spent on it."""
+        begun = time.thread_time()
+        try:
+            found = self._simulator.simulate(task)
+        except InvalidSceneError as error:
+            raise InvalidActionError(str(error)) from None
+        return SimulationResult(found.outcome), time.thread_time() - begun
+
+    async def simulate(self, task: PourTask) -> SimulationResult:
+        """One of the pool's members takes the CPU time that the simulation takes."""
+        async with self._free:
+            self.occupancy.simulation_started(self._clock.time())
+            try:
+                result, used = self._run(task)
+                self.priced.append(result.outcome.cpu_s)
+                await self._clock.spend(result.outcome.cpu_s, used)
+            finally:
+                self.occupancy.simulation_finished(self._clock.time())
+        self.simulations += 1
+        return result
+
+    async def simulate_apart(self, task: PourTask) -> SimulationResult:
+        """Of the bench's own liquid: it takes none of the campaign's time."""
+        result, used = self._run(task)
+        self.apart += result.outcome.cpu_s
+        await self._clock.spend(0.0, used)
+        return result
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+    ) -> PourMeasurement:
+        """The arm pours, the operator mops."""
+        self.before_first = self.before_first if self.poured else self.simulations
+        self.occupancy.pour_started(self._clock.time())
+        try:
+            spill = await self._real.pour(scene, action, seed)
+            await asyncio.sleep(self._asked.pour)
+        finally:
+            self.occupancy.pour_finished(self._clock.time())
+        mass = scene.liquid.mass
+        self.poured.append((spill.spilled + spill.retained) / mass)
+        return PourMeasurement(mass, spill.spilled, spill.retained)
+
+
+class _Apart:
+    """The bench's simulator."""
+
+    size = 1
+
+    def __init__(self, fluid: Fluid) -> None:
+        self._fluid = fluid
+
+    async def simulate(self, task: PourTask) -> SimulationResult:
+        return await self._fluid.simulate_apart(task)
+
+
+def arms(asked: argparse.Namespace, base: DeploymentPlan) -> dict[str, DeploymentPlan]:
+    """What is compared; see `dyna.py`."""
+    free = replace(base, pours=asked.pours, per_pour=None, model="scaled", refusals="avoid", trust=TRUST)
+    prices = PricesPlan(pour=asked.pour)
+    return {
+        "D2": replace(free, strategy="D2", per_pour=0, model="residual", trust=None),
+        "fixed": replace(free, per_pour=2),
+        "priced": replace(free, prices=prices),
+        "tireless": replace(free, prices=replace(prices, worth=0.0)),
+    }
+
+
+def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, asked: argparse.Namespace) -> Row:
+    """One campaign, and what it came to."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan = replace(
+            study.base,
+            name="dyna",
+            seed=seed,
+            parameters=replace_particles(study, asked.particles),
+            calibration=None,
+            deployment=arm,
+            outputs=OutputPlan(Path(folder), rrd=False, figures=False, record_rate=0.0),
+            parallel_simulations=asked.slots,
+        )
+        result = run(run_campaign(plan, fluid, Path(folder) / "run", watchers=[fluid.watch]))
+    fluid.occupancy.finish()
+    (stage,) = result.results.values()
+    simulated = bool(fluid.simulations)
+    values: Row = {
+        "before first": fluid.before_first,
+        "simulations": fluid.simulations,
+        "a simulation, s": float(np.mean(fluid.priced)) if simulated else None,
+        "busy": fluid.occupancy.fraction if simulated else None,
+        "useful": fluid.occupancy.useful / fluid.occupancy.total if simulated else None,
+        "longest wait, ms": 1e3 * max(fluid.occupancy.waits, default=0.0),
+        "mean wait, ms": 1e3 * float(np.mean(fluid.occupancy.waits)),
+        "longest answer, ms": 1e3 * max(fluid.answers),
+        "alarm": float(bool((stage.get("trust") or {}).get("followed"))),
+        "apart, s": fluid.apart,
+    }
+    for pours in (n for n in AFTER if n <= asked.pours):
+        values[f"least of {pours}"] = min(fluid.poured[:pours])
+        values[f"mean of {pours}"] = float(np.mean(fluid.poured[:pours]))
+    return values
+
+
+def replace_particles(study: StudyPlan, particles: int) -> SimulationParameters:
+    """The study's θ at another resolution."""
+    return study.base.parameters.model_copy(update={"particles": particles})
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = ["D2", "fixed", "priced", "tireless"]
+    parser.add_argument("--level", default="moderate")
+    parser.add_argument("--receiver", choices=["narrow", "cone", "bowl"], default="narrow")
+    parser.add_argument("--arms", nargs="+", choices=names, default=names[:3])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--particles", type=int, default=500)
+    parser.add_argument("--slots", type=int, default=2)
+    parser.add_argument("--pour", type=float, default=90.0)
+    parser.add_argument("--pours", type=int, default=15)
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    pin(None)
+    study = load_study(ROOT / "configs/studies/paper.yaml")
+    base = study.deployment("D3").plan
+    scene = next(s for s in base.scenes if s.name == f"deployment-{asked.receiver}")
+    simulator, rows = PourSimulator(), []
+    for name in asked.arms:
+        arm = arms(asked, replace(base, scenes=(scene,)))[name]
+        runs = []
+        for seed in range(asked.seeds):
+            runs.append(campaign(study, arm, seed, Fluid(study, asked.level, simulator, asked), asked))
+            say(f"{name}, seed {seed}: {runs[-1]}")
+        row: Row = {"arm": name}
+        for key in runs[0]:
+            known = [run[key] for run in runs if run[key] is not None]
+            row[key] = max(known) if key.startswith("longest") else interval(known) if known else None
+        rows.append(row)
+    show({"settings": vars(asked), "rows": rows, "machine": describe()}, asked.json)
+
+
+if __name__ == "__main__":
+    main()
