@@ -4,8 +4,8 @@
                                     [--seeds 3] [--particles 500] [--slots 2] [--pour 90] [--pours 15] [--json]
 
 Simulator, strategy, scheduler, journal and optimiser are the real ones, in one process, on a clock that leaves waiting
-out (`skipping_clock.py`): a simulation takes its own CPU time on one of `--slots` simulators, a pour takes `--pour`. The
-bench's own liquid is accounted apart: it takes no time on that clock. Bench, scenes and actions are those of
+out (`skipping_clock.py`): a simulation takes its own CPU time on one of `--slots` simulators, a pour takes `--pour`.
+The bench's own liquid is accounted apart: it takes no time on that clock. Bench, scenes and actions are those of
 `configs/studies/paper.yaml`; θ is not calibrated. Arms are those of `dyna.py`; `tireless` simulates for as long as a
 pour takes, some 900 times.
 """
