@@ -120,9 +120,9 @@ class ActionRangeSection(RangeSection):
     """C4: how likely its values are beforehand, in place of all alike."""
 
     def normal(self, name: str) -> NormalPrior | None:
-        """The prior of the dimension; None where its values are all alike, or where something is wrong with it."""
+        """The prior of the dimension; None where its values are all alike, or where something is wrong here."""
         prior: PriorSection | None = self.prior
-        if prior is None or prior.mean is None or prior.deviation is None:
+        if self.range is None or prior is None or prior.mean is None or prior.deviation is None:
             return None
         return NormalPrior(name, float(prior.mean), float(prior.deviation))
 

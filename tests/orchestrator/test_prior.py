@@ -148,6 +148,11 @@ WRONG = {
     "a length": ("deviation: 10 deg/s", "deviation: 10 mm", f"{AT}.deviation: '10 mm' is a length"),
     "no unit": ("mean: 30 deg/s", "mean: 30", f"{AT}.mean: 30 has no unit; write '30 deg/s'"),
     "no deviation": (", deviation: 10 deg/s", "", f"{AT}: key 'deviation' is missing; add for example"),
+    "no range beside it": (
+        "{angular_velocity: {range: [15 deg/s, 120 deg/s], ",
+        "{height: [80 mm, 99 mm], angular_velocity: {",
+        "calibration.actions.angular_velocity: key 'range' is missing; add for example 'range: [lowest, highest]'",
+    ),
     "misspelt": ("deviation:", "deviaton:", f"{AT}.deviaton: unknown key; did you mean 'deviation'?"),
     "beside the constraints": (
         "10 deg/s}}",
