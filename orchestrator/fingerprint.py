@@ -27,7 +27,7 @@ _WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "han
 """Of its parts: a controller may get another address, a balance another socket."""
 
 _YOUNGER: dict[str, dict[str, Any]] = {
-    "calibration": {"grid": {}, "thetas": 0, "constraints": []},
+    "calibration": {"grid": {}, "thetas": 0, "constraints": [], "prior": [], "averaging": "context"},
     "deployment": {
         "data": None,
         "objectives": None,
@@ -39,6 +39,7 @@ _YOUNGER: dict[str, dict[str, Any]] = {
         "tolerance": None,
         "prices": None,
         "constraints": [],
+        "plain": False,
     },
 }
 """Fields that runs from before them hadn't got, by section, each with the value that changes nothing."""
@@ -51,18 +52,19 @@ _CAME_TOGETHER: tuple[dict[str, Any], ...] = (
     {"model": NEW_MODEL, "trust": TrustPlan()},
     {"prices": PricesPlan()},
     {"noise": "constant", "refusals": "avoid"},
+    {"plain": True},
 )
 """Fields of a deployment that came at the same time, each with what a campaign has that doesn't name it."""
 
-_NEWEST = ("noise", "refusals", "risk", "tolerance", "prices", "constraints")
+_NEWEST = ("noise", "refusals", "risk", "tolerance", "prices", "constraints", "plain", "prior", "averaging")
 """Fields of a calibration or deployment that came after the first studies."""
 
 
 def as_begun(plan: CampaignPlan, begun: Mapping[str, Any]) -> CampaignPlan:
     """The plan of a run that began before a deployment had some fields, if the campaign asks for nothing else.
 
-    Such a run goes on as it began: with the paper's model and an alarm that only tells, without prices, and with
-    the worst cost for actions that can't be made.
+    Such a run goes on as it began: with the paper's model and an alarm that only tells, without prices, with the
+    worst cost for actions that can't be made, and with κ halved before the first pour, once simulations show structure.
 
     Args:
         plan: of the campaign, as it is read today.
@@ -86,8 +88,9 @@ def deployment_as_begun(today: DeploymentPlan, before: Mapping[str, Any]) -> Dep
 
 
 def without_newest(section: dict[str, Any]) -> dict[str, Any]:
-    """A calibration's or deployment's JSON without those of the newest fields that change nothing, as before them."""
-    unused = {name: _YOUNGER["deployment"][name] for name in _NEWEST}
+    """A calibration's or deployment's JSON as it was written before the newest fields, where those change nothing."""
+    either = _YOUNGER["calibration"] | _YOUNGER["deployment"]
+    unused = {name: either[name] for name in _NEWEST}
     return {name: value for name, value in section.items() if name not in unused or value != unused[name]}
 
 

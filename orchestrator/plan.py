@@ -20,6 +20,7 @@ DeploymentName = Literal["D1", "D2", "D3"]
 ModelName = Literal["residual", "pooled", "scaled"]
 PolicyName = Literal["ask", "D2", "widen"]
 RefusalsName = Literal["avoid", "penalise"]
+AveragingName = Literal["context", "noise"]
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,20 @@ class ExistingPours:
 
 
 @dataclass(frozen=True)
+class NormalPrior:
+    """The prior g along one dimension of an action: normal, cut off at the ends of its range.
+
+    Attributes:
+        name: of the dimension.
+        mean, deviation: of the normal before it is cut off, in the dimension's SI unit.
+    """
+
+    name: str
+    mean: float
+    deviation: float
+
+
+@dataclass(frozen=True)
 class CalibrationPlan:
     """C1, C2, C3 or C4: which θ_s reproduces the weighed spills.
 
@@ -104,6 +119,9 @@ class CalibrationPlan:
         grid: C1: values tried of every searched θ_s, by name.
         thetas: C2, C3: how many θ are tried, each on all training pours.
         constraints: on actions, beside the bounds of their space.
+        prior: C4: dimensions along which g is not uniform.
+        averaging: C4: whether the surrogate knows the action that was simulated ('context'), or takes its influence for
+            noise ('noise', the paper's).
     """
 
     strategy: CalibrationName
@@ -122,6 +140,8 @@ class CalibrationPlan:
     grid: dict[str, int] = field(default_factory=dict)
     thetas: int = 0
     constraints: tuple[Linear, ...] = ()
+    prior: tuple[NormalPrior, ...] = ()
+    averaging: AveragingName = "context"
 
 
 @dataclass(frozen=True)
@@ -205,6 +225,8 @@ class DeploymentPlan:
             window is looked for.
         prices: D3 with `per_pour` None: simulations by what they are worth; None: as they come, as in older runs.
         constraints: on actions, beside the bounds of their space.
+        plain: D3 'residual': the simulations before the first pour are chosen as in the paper, with a constant κ; in
+            older runs they were not.
     """
 
     strategy: DeploymentName
@@ -230,6 +252,7 @@ class DeploymentPlan:
     tolerance: float | None = None
     prices: PricesPlan | None = None
     constraints: tuple[Linear, ...] = ()
+    plain: bool = False
 
     @property
     def loss_name(self) -> str:

@@ -74,6 +74,12 @@ def _check_posterior(plan: CampaignPlan) -> None:
             "theta.json of a calibration",
             BAD_INPUT,
         )
+    if plan.calibration.averaging == "noise":
+        raise RefusalError(
+            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which no surrogate makes that takes "
+            "actions for noise; write 'calibration: {averaging: context}', or 'theta: best'",
+            BAD_INPUT,
+        )
 
 
 def calibrate(path: Path, options: RunOptions) -> None:

@@ -109,6 +109,9 @@ class CalibrationSection(Section):
     kappa: Kappa = 2.0
     """C3, C4: κ of the lower confidence bound."""
 
+    averaging: Literal["context", "noise"] = "context"
+    """C4: context: the surrogate knows which action was simulated; noise, the paper's: its influence is noise."""
+
     random_baseline: Count = 0
     """Random parameters that are scored for comparison."""
 

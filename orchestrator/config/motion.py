@@ -13,6 +13,7 @@ from actors.optimizer.core.problem import Linear
 from orchestrator.config.constraints import constraint_as_file
 from orchestrator.config.quantities import Quantity, format_quantity
 from orchestrator.config.sections import Section, Text
+from orchestrator.plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Scale, Space
@@ -35,6 +36,10 @@ EXAMPLES = {
     )
 }
 """A right value of every action dimension and simulation parameter, for messages and schemas."""
+
+
+DEVIATIONS = {"rad/s": "20 deg/s", "rad": "10 deg", "rad/s^2": "200 deg/s^2", "s": "0.5 s", "m": "15 mm"}
+"""A right standard deviation of a dimension in each unit."""
 
 
 def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity:
@@ -98,13 +103,59 @@ class RangeSection(Section):
         return Axis(name, float(self.range[0]), float(self.range[1]), self.scale, integer)
 
 
-def _range_model(name: str, quantity: Quantity) -> type[RangeSection]:
+class PriorSection(Section):
+    """How likely values of a searched dimension are beforehand: a normal distribution, cut off at the range's ends."""
+
+    mean: Any = None
+    """Its mean, within the range."""
+
+    deviation: Any = None
+    """Its standard deviation."""
+
+
+class ActionRangeSection(RangeSection):
+    """Bounds of a searched dimension: `[lowest, highest]`, or `{range: [...], scale: log, prior: {...}}`."""
+
+    prior: Any = None
+    """C4: how likely its values are beforehand, in place of all alike."""
+
+    def normal(self, name: str) -> NormalPrior | None:
+        """The prior of the dimension; None where its values are all alike, or where something is wrong here."""
+        prior: PriorSection | None = self.prior
+        if self.range is None or prior is None or prior.mean is None or prior.deviation is None:
+            return None
+        return NormalPrior(name, float(prior.mean), float(prior.deviation))
+
+
+def _range_model(
+    name: str, quantity: Quantity, base: type[RangeSection] = RangeSection, **further: Any
+) -> type[RangeSection]:
     end = Annotated[float, quantity]
-    fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]"))}
-    model: type[RangeSection] = create_model(
-        f"{name.title().replace('_', '')}Range", __base__=RangeSection, __doc__=RangeSection.__doc__, **fields
-    )
+    fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]")), **further}
+    model: type[RangeSection] = create_model(f"{_title(name)}Range", __base__=base, __doc__=base.__doc__, **fields)
     return model
+
+
+def _action_range_model(dimension: Dimension) -> type[RangeSection]:
+    name, quantity = dimension.name, dimension_quantity(dimension)
+    width = dimension.upper - dimension.lower
+    spread = Quantity(dimension.unit, DEVIATIONS[dimension.unit], 0.0, width, positive=True)
+    fields: Any = {
+        key: (Annotated[float, number] | None, Field(default=None, description=_described(PriorSection, key)))
+        for key, number in (("mean", quantity), ("deviation", spread))
+    }
+    prior: Any = create_model(f"{_title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, **fields)
+    prior.required = {"mean": quantity.example, "deviation": spread.example}
+    field = (prior | None, Field(default=None, description=_described(ActionRangeSection, "prior")))
+    return _range_model(name, quantity, ActionRangeSection, prior=field)
+
+
+def _title(name: str) -> str:
+    return name.title().replace("_", "")
+
+
+def _described(section: type[Section], field: str) -> str | None:
+    return section.model_fields[field].description
 
 
 class PivotPoint(Section):
@@ -182,11 +233,17 @@ class ActionsBase(Section):
         )
         return Space(axes) if axes else None
 
+    def prior(self) -> tuple[NormalPrior, ...]:
+        """Dimensions whose values are not all alike beforehand."""
+        ranges = ((name, self.value(name)) for name in ACTION_DIMENSIONS)
+        normals = (section.normal(name) for name, section in ranges if section is not None)
+        return tuple(normal for normal in normals if normal is not None)
+
 
 def _actions_model() -> type[ActionsBase]:
     fields: Any = {
         name: (
-            _range_model(name, dimension_quantity(dimension)) | None,
+            _action_range_model(dimension) | None,
             Field(default=None, description=dimension.meaning),
         )
         for name, dimension in ACTION_DIMENSIONS.items()
@@ -257,9 +314,15 @@ def fixed_as_file(fixed: Mapping[str, float | None], pivot: Pivot, hold_cap: flo
     return section
 
 
-def actions_as_file(space: Space, constraints: Sequence[Linear]) -> dict[str, object]:
+def actions_as_file(
+    space: Space, constraints: Sequence[Linear], prior: Sequence[NormalPrior] = ()
+) -> dict[str, object]:
     """An `actions:` section, JSON-ready."""
-    section = space_as_file(space)
+    section: dict[str, Any] = space_as_file(space)
+    for one in prior:
+        unit, display = ACTION_DIMENSIONS[one.name].unit, ACTION_DIMENSIONS[one.name].display_unit
+        numbers = {"mean": one.mean, "deviation": one.deviation}
+        section[one.name]["prior"] = {key: format_quantity(v, unit, display) for key, v in numbers.items()}
     return section | {"constraints": [constraint_as_file(c) for c in constraints]} if constraints else section
 
 

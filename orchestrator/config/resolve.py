@@ -40,6 +40,8 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     if file.deployment is not None:
         deployment = resolve_deployment(file.deployment, builder, root.at("deployment"), laboratory)
     broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
+    if not broken and (file.calibration is None or file.calibration.actions is not None):
+        builder.refuse_prior(file.actions, root, "decides nothing: no calibration takes its actions from here")
     if file.calibration is None and file.deployment is None and not broken:
         report.add(root, "there is nothing to do; add a 'calibration' or a 'deployment' section")
     if file.on_unknown == "repeat" and laboratory is not None and not _is_virtual(laboratory):

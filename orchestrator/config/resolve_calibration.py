@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign import CalibrationSection
 from orchestrator.config.records_resolve import read_table, resolve_records
 from orchestrator.config.resolve_data import records_of_run
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place, Report
-from orchestrator.plan import CalibrationPlan, RecordSet
+from orchestrator.plan import CalibrationPlan, NormalPrior, RecordSet
 from sim_engine.space import Axis, Space
 
 BELONGS_TO = {
@@ -21,6 +22,7 @@ BELONGS_TO = {
     "iterations": ("C3",),
     "initial": ("C3", "C4"),
     "kappa": ("C3", "C4"),
+    "averaging": ("C4",),
 }
 """Keys that only some strategies use: given to another, they were misunderstood."""
 
@@ -65,6 +67,7 @@ def resolve_calibration(
     receiver = builder.receiver(section.receiver, place)
     actions = builder.space(section.actions, section.motion, place)
     constraints = builder.constraints(section.actions, place, actions)
+    prior = _prior(section, builder, place, actions, constraints)
     motions = ((section.motion, place.at("motion")),)
     searched_actions = () if actions is None else actions.names
     table = read_table(pours, pours.source, at.at("from"), builder) if pours is not None else None
@@ -124,6 +127,7 @@ def resolve_calibration(
         scene=scene,
         actions=actions,
         constraints=constraints,
+        prior=prior,
         parameters=Space(tuple(searched.values())),
         fixed_parameters=fixed,
         pour_count=count,
@@ -136,7 +140,27 @@ def resolve_calibration(
         kappa=section.kappa,
         grid=budget.grid,
         thetas=budget.thetas,
+        averaging=section.averaging,
     )
+
+
+def _prior(
+    section: CalibrationSection,
+    builder: SceneBuilder,
+    place: Place,
+    actions: Space | None,
+    constraints: tuple[Linear, ...],
+) -> tuple[NormalPrior, ...]:
+    """The prior over actions, which C4 alone averages over."""
+    if section.strategy == "C4":
+        return builder.prior(section.actions, place, actions, constraints)
+    if not builder.report.is_broken(place.at("strategy")):
+        why = f"belongs to C4, which averages over the prior; {section.strategy} simulates the weighed pours"
+        if section.actions is None:
+            builder.refuse_prior(builder.file.actions, builder.root, why)
+        else:
+            builder.refuse_prior(section.actions, place, why)
+    return ()
 
 
 def _training_pours(to_be_made: int, records: RecordSet | None) -> int:

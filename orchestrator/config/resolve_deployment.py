@@ -42,6 +42,9 @@ def resolve_deployment(
     receivers = builder.receivers(section, place)
     actions = builder.space(section.actions, section.motion, place)
     constraints = builder.constraints(section.actions, place, actions)
+    builder.refuse_prior(
+        section.actions, place, "is what calibration averages over; deployment looks for the best action"
+    )
     for key, strategies in BELONGS_TO.items():
         if strategy is not None and section.value(key) is not None and strategy not in strategies:
             report.add(place.at(key), f"belongs to {' and '.join(strategies)}, not to {strategy}; remove it", key=True)
@@ -91,6 +94,7 @@ def resolve_deployment(
             key=True,
         )
     prices = section.prices or PricesSection()
+    model = (section.model or NEW_MODEL) if strategy == "D3" else "residual"
     return DeploymentPlan(
         strategy=strategy,
         scenes=complete,
@@ -108,13 +112,14 @@ def resolve_deployment(
         on_failed_pour=section.on_failed_pour,
         data=data,
         objectives=objectives,
-        model=(section.model or NEW_MODEL) if strategy == "D3" else "residual",
+        model=model,
         trust=TrustPlan(trust.pours, trust.limit, trust.policy) if strategy == "D3" else None,
         noise=section.noise,
         refusals="avoid",
         risk=risk,
         tolerance=None if section.window is None else section.window.tolerance,
         prices=PricesPlan(prices.pour, prices.simulation, prices.worth) if free else None,
+        plain=strategy == "D3" and model == "residual",
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from orchestrator.config.yaml_source import Place, Report
 from orchestrator.fingerprint import NEW_MODEL
-from orchestrator.plan import CalibrationPlan, DeploymentName, DeploymentPlan, TrustPlan
+from orchestrator.plan import CalibrationName, CalibrationPlan, DeploymentName, DeploymentPlan, TrustPlan
 from orchestrator.study.plan import CalibrationArm, DeploymentArm
 
 if TYPE_CHECKING:
@@ -52,9 +52,9 @@ def calibration_arms(
         levels: all names; C4 is run at all of them, the others at `compared`.
     """
     arms = []
-    for name in ("C1", "C2", "C3", "C4") if section is not None else ():
-        arm: Any = section.value(name) if section is not None else None
-        at = root.at("calibration", name)
+    for written in ("C1", "C2", "C3", "C4", "C4_paper") if section is not None else ():
+        arm: Any = section.value(written) if section is not None else None
+        at, name = root.at("calibration", written), cast("CalibrationName", written[:2])
         if arm is None:
             continue
         _check_keys(arm, name, CALIBRATION_KEYS, at, report)
@@ -64,13 +64,14 @@ def calibration_arms(
             if not report.is_broken(at.at(key)):
                 report.add(at, f"key '{key}' is missing; add for example '{key}: {example}'", key=True)
             continue
-        changes: dict[str, Any] = {"strategy": name, "grid": {}, "thetas": 0}
+        changes: dict[str, Any] = {"strategy": name, "grid": {}, "thetas": 0, "averaging": "context", "prior": ()}
         match name:
             case "C1":
                 changes |= {"grid": dict.fromkeys(base.parameters.names, budget)}
                 changes |= {"simulations": train * budget**base.parameters.dimension}
             case "C4":
-                changes |= {"simulations": budget}
+                averaging = "noise" if written == "C4_paper" else base.averaging
+                changes |= {"simulations": budget, "averaging": averaging, "prior": base.prior}
             case _:
                 changes |= {"thetas": budget, "simulations": train * budget}
         trials = budget if name in ("C3", "C4") else math.inf
@@ -78,8 +79,8 @@ def calibration_arms(
         if arm.initial is not None and initial > trials:
             report.add(at.at("initial"), f"{initial} random θ don't fit into {key}: {budget}")
         changes |= {"initial": int(min(initial, trials)), "kappa": base.kappa if arm.kappa is None else arm.kappa}
-        where = levels if name == "C4" else (compared,)
-        arms.append(CalibrationArm(replace(base, **changes), arm.repetitions or 1, where))
+        where = levels if written == "C4" else (compared,)
+        arms.append(CalibrationArm(_label(written), replace(base, **changes), arm.repetitions or 1, where))
     return tuple(arms)
 
 
@@ -96,14 +97,16 @@ def deployment_arms(
     if base is None:
         report.add(root.at("deployment"), "the base campaign has no 'deployment' section to take receivers from")
         return ()
-    most = max((arm.repetitions for arm in calibrations if arm.plan.strategy == "C4"), default=0)
+    most = max((arm.repetitions for arm in calibrations if arm.label == "C4"), default=0)
     arms: list[DeploymentArm] = []
-    for key in ("D1", "D2", "D3", "D3_paper"):
+    for key in ("D1", "D2", "D2_paper", "D3", "D3_paper"):
         arm: Any = section.value(key)
         at, name = root.at("deployment", key), cast("DeploymentName", key[:2])
         if arm is None:
             continue
         _check_keys(arm, name, DEPLOYMENT_KEYS, at, report)
+        if key == "D2_paper" and arm.mean == "constant":
+            report.add(at.at("mean"), "D2_paper has the paper's mean, 'zero'; remove the key, or compare with D2")
         repetitions = arm.repetitions or 1
         if name != "D2" and repetitions > most:
             report.add(
@@ -123,7 +126,8 @@ def deployment_arms(
             data=None,
             model="residual",
             trust=None,
-            mean=arm.mean or "constant",
+            plain=False,
+            mean="zero" if key == "D2_paper" else arm.mean or "constant",
             kappa=base.kappa if arm.kappa is None else arm.kappa,
             initial=base.initial if arm.initial is None else arm.initial,
         )
@@ -141,10 +145,15 @@ def deployment_arms(
             if key == "D3":
                 model, trust = (base.model, base.trust) if base.strategy == "D3" else (NEW_MODEL, TrustPlan())
                 common = replace(common, model=model, trust=trust)
-            arms.append(DeploymentArm(key.replace("_", "-"), common, repetitions))
+            arms.append(DeploymentArm(_label(key), replace(common, plain=common.model == "residual"), repetitions))
         else:
-            arms.append(DeploymentArm(name, common, repetitions))
+            arms.append(DeploymentArm(_label(key), common, repetitions))
     return tuple(arms)
+
+
+def _label(key: str) -> str:
+    """What figures and folders call an arm."""
+    return key.replace("_", "-")
 
 
 def _check_keys(arm: Any, name: str, belongs: dict[str, tuple[str, ...]], at: Place, report: Report) -> None:

@@ -71,7 +71,7 @@ def _calibration(plan: CalibrationPlan) -> dict[str, object]:
     return {
         "strategy": plan.strategy,
         **_scene(plan.scene),
-        "actions": actions_as_file(plan.actions, plan.constraints),
+        "actions": actions_as_file(plan.actions, plan.constraints, plan.prior),
         "pours": _pours(plan),
         **_budget(plan),
         "random_baseline": plan.random_baseline,
@@ -88,7 +88,7 @@ def _budget(plan: CalibrationPlan) -> dict[str, object]:
         case "C3":
             return {"iterations": plan.thetas, **bayesian}
         case "C4":
-            return {"simulations": plan.simulations, **bayesian}
+            return {"simulations": plan.simulations, **bayesian, "averaging": plan.averaging}
 
 
 def _pours(plan: CalibrationPlan) -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from orchestrator.config.motion import EXAMPLES, ActionsBase, MotionBase
 from orchestrator.config.quantities import QuantityError
 from orchestrator.config.references import References
 from orchestrator.config.yaml_source import Place, Report
+from orchestrator.plan import NormalPrior
 from orchestrator.strategies.prior import actions_of_prior
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquid import Liquid
@@ -91,6 +92,34 @@ class SceneBuilder:
             except ValueError:
                 self.report.add(at, "leave next to nothing of the ranges beside them; loosen one, or widen a range")
         return tuple(found)
+
+    def prior(
+        self, actions: ActionsBase | None, place: Place, space: Space | None, constraints: Sequence[Linear]
+    ) -> tuple[NormalPrior, ...]:
+        """The prior over the action space of C4, which leaves something of it."""
+        used, at = (self.file.actions, self.root) if actions is None else (actions, place)
+        prior: tuple[NormalPrior, ...] = () if space is None or used is None else used.prior()
+        if space is None or not prior:
+            return ()
+        at, before = at.at("actions"), len(self.report.problems)
+        for one in prior:
+            axis, info = space.axes[space.names.index(one.name)], ACTION_DIMENSIONS[one.name]
+            if not axis.lower <= one.mean <= axis.upper:
+                mean, lower, upper = (f"{value / info.factor:g}" for value in (one.mean, axis.lower, axis.upper))
+                text = f"{mean} {info.display_unit} is outside the range, {lower} … {upper} {info.display_unit}"
+                self.report.add(at.at(one.name, "prior", "mean"), text)
+        if constraints and len(self.report.problems) == before:
+            try:
+                actions_of_prior(space, LEAST_LEFT, 0, constraints, prior)
+            except ValueError:
+                text = "leave next to nothing where the prior lies; loosen one, or move or widen the prior"
+                self.report.add(at.at("constraints"), text)
+        return prior
+
+    def refuse_prior(self, actions: ActionsBase | None, place: Place, why: str) -> None:
+        """Say of every prior of a section's own dimensions that it decides nothing."""
+        for one in () if actions is None else actions.prior():
+            self.report.add(place.at("actions").at(one.name, "prior"), f"{why}; remove it", key=True)
 
     def scene(
         self,

@@ -49,7 +49,7 @@ class LevelSection(Section):
 
 
 class CalibrationArmSection(Section):
-    """One of C1 to C4: how often, and what it may spend."""
+    """A calibration: how often, and what it may spend."""
 
     required: ClassVar[dict[str, str]] = {"repetitions": "10"}
 
@@ -90,9 +90,12 @@ class CalibrationsSection(Section):
     C4: CalibrationArmSection | None = None
     """Bayesian optimisation, one simulation an iteration; its θ* are what D1 and D3 simulate with."""
 
+    C4_paper: CalibrationArmSection | None = None
+    """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""
+
 
 class DeploymentArmSection(Section):
-    """One of D1 to D3: how often, and what it may spend."""
+    """A deployment: how often, and what it may spend."""
 
     required: ClassVar[dict[str, str]] = {"repetitions": "10"}
 
@@ -132,6 +135,9 @@ class DeploymentsSection(Section):
 
     D2: DeploymentArmSection | None = None
     """Learn on real pours."""
+
+    D2_paper: DeploymentArmSection | None = None
+    """D2 as in the paper: a surrogate with a zero mean."""
 
     D3: DeploymentArmSection | None = None
     """Real pours with a simulated prior, the campaign's model of it and check of trust."""

@@ -38,37 +38,34 @@ class ContinuousBayesianCalibration(Calibration):
       covers g evenly.
     * The discrepancy varies far more over actions than over θ, and |·| folds away its sign. So the surrogate is a GP of
       the signed difference c_r − c_s over (θ, a), and what is minimised is the mean over g of the absolute
-      value that it predicts (`averaging='differences'`). With `averaging='noise'`, as in the paper, the surrogate
-      sees |c_r − c_s| over θ alone and takes the action's influence for noise.
+      value that it predicts (the plan's `averaging`: 'context'). With 'noise', as in the paper, the surrogate sees
+      |c_r − c_s| over θ alone and takes the action's influence for noise; κ is a constant then, too.
 
-    g is uniform over the box of actions, but limited to where c_r is defined: actions at which less than 5 % is
-    expected to be poured are left out. A simulation that failed, or poured too little for c_s to be defined,
-    says nothing about its neighbours and is dropped. θ* minimises the posterior mean over the whole box: the lowest
-    observation would only be the luckiest.
+    g is uniform over the box of actions unless the plan has a `prior`, but limited to where c_r is defined: actions at
+    which less than 5 % is expected to be poured are left out. A simulation that failed, or poured too little for c_s to
+    be defined, says nothing about its neighbours and is dropped. θ* minimises the posterior mean over the whole box:
+    the lowest observation would only be the luckiest.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); a surrogate over both arguments of an expected cost:
     Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
     Limitations: θ that make the simulated pour stop short are judged only by the actions at which they do pour. With
-    `averaging='noise'` the optimiser sees heteroscedastic noise, large where the discrepancy varies over g.
+    `averaging` 'noise' the optimiser sees heteroscedastic noise, large where the discrepancy varies over g, and nothing
+    can be said about θ beside θ*.
     """
 
     NAME = "C4"
 
-    def __init__(
-        self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int, *, averaging: str = "differences"
-    ) -> None:
+    def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
         """Plan the campaign; only pours of the split 'train' are used.
 
         Raises:
             LearningError: fewer than two usable pours.
-            ValueError: no budget, or no such averaging.
+            ValueError: no budget.
         """
         super().__init__(plan, measured, seed)
         if plan.simulations < 1:
             raise ValueError(f"calibration needs a budget of simulations, got {plan.simulations}")
-        if averaging not in ("differences", "noise"):
-            raise ValueError(f"averaging must be 'differences' or 'noise', got {averaging!r}")
-        self._averaging = averaging
+        self._knows_actions = plan.averaging == "context"
         self._started = False
         self._mapped = 0
         self._actions: tuple[Point, ...] = ()
@@ -89,8 +86,8 @@ class ContinuousBayesianCalibration(Calibration):
     def _ask_regression(self) -> None:
         """c_r(a), and whether it is defined, along the prior's sequence of actions."""
         count, seed = 2 * self._plan.simulations, self._seeds.next()
-        sequence = actions_of_prior(self._plan.actions, count, seed, self._plan.constraints)
-        encode = self._plan.actions.encode
+        plan, encode = self._plan, self._plan.actions.encode
+        sequence = actions_of_prior(plan.actions, count, seed, plan.constraints, plan.prior)
         spillage, poured = Data(), Data()
         for pour in self._train:
             point = tuple(encode({name: _number(pour, name) for name in self._plan.actions.names}))
@@ -145,7 +142,7 @@ class ContinuousBayesianCalibration(Calibration):
     def _conclude(self, suggestion: Suggestion) -> None:
         """θ* is known; what the pours say about θ beside it is asked."""
         self._settle_at_minimum(suggestion)
-        if self._averaging != "noise":
+        if self._knows_actions:
             self._ask_posterior()
 
     def _ask_posterior(self) -> None:
@@ -190,7 +187,8 @@ class ContinuousBayesianCalibration(Calibration):
             acquisition=acquisition,  # type: ignore[arg-type]
             kappa=self._plan.kappa,
             map_resolution=resolution,
-            context=self._actions[:CONTEXT_SIZE] if self._averaging != "noise" else (),
+            context=self._actions[:CONTEXT_SIZE] if self._knows_actions else (),
+            plain=not self._knows_actions,
         )
 
     # -- listening -------------------------------------------------------------------------------------------------
@@ -201,7 +199,7 @@ class ContinuousBayesianCalibration(Calibration):
             theta = self.parameters_at(point)
             action = self._plan.scene.action(self._plan.actions.decode(self._actions[index]))
             request = Simulate(self._plan.scene.name, action, theta, self._seeds.next(), "calibrate")
-            context = self._actions[index] if self._averaging != "noise" else ()
+            context = self._actions[index] if self._knows_actions else ()
             self._expected_at[request] = self._measured_at[index]
             self._trials.add(Trial(point, (request,), context))
             if suggestion.means:
@@ -211,7 +209,7 @@ class ContinuousBayesianCalibration(Calibration):
     def _discrepancy(self, request: Simulate, simulated: float) -> float:
         """c_r(a) − c_s(a, θ); without its sign where the surrogate takes actions for noise."""
         difference = self._expected_at[request] - simulated
-        return abs(difference) if self._averaging == "noise" else difference
+        return difference if self._knows_actions else abs(difference)
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -232,7 +230,7 @@ class ContinuousBayesianCalibration(Calibration):
             "action_si": {name: getattr(action, name) for name in self._plan.actions.names},
             "measured": self._measured_at[number],
             "discrepancy": None if trial.cost is None else abs(trial.cost),
-            "difference": trial.cost if self._averaging == "differences" else None,
+            "difference": trial.cost if self._knows_actions else None,
         }
 
 

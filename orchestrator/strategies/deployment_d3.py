@@ -116,7 +116,8 @@ class Hybrid(Deployment):
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif self._trials.ready:
             self._compromise.weigh(exploring=True)
-            problem = self._problem(self._simulated(), everything=False, pending=self._trials.pending())
+            known, pending, plain = self._simulated(), self._trials.pending(), self._plan.plain
+            problem = self._problem(known, everything=False, pending=pending, plain=plain)
             self._questions.put(problem, "prior", simulate)
 
     def _next_pour(self) -> None:

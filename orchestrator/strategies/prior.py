@@ -1,32 +1,55 @@
-"""The prior g over actions: uniform over what of the box meets the constraints, drawn evenly."""
+"""The prior g over actions, where they meet the constraints: uniform, or along some dimensions normal; drawn evenly."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
 from actors.optimizer.core.problem import Linear, Point
+from orchestrator.plan import NormalPrior
 from sim_engine.space import Space
 
 if TYPE_CHECKING:
     from actors.optimizer.core.region import Region
 
+Array = NDArray[np.float64]
 
-def actions_of_prior(actions: Space, count: int, seed: int, constraints: Sequence[Linear] = ()) -> tuple[Point, ...]:
+FINENESS = 2.0**30
+"""Places that a draw may have on an axis, those of a Sobol number: logarithms that differ between machines in their
+last bits still give the same action."""
+
+
+def actions_of_prior(
+    actions: Space, count: int, seed: int, constraints: Sequence[Linear] = (), prior: Sequence[NormalPrior] = ()
+) -> tuple[Point, ...]:
     """A scrambled Sobol sequence over the unit cube of actions: every stretch of it covers g evenly.
 
-    Its numbers are binary fractions made by integer arithmetic, the same on every machine.
+    Its numbers are binary fractions made by integer arithmetic, the same on every machine. Those of dimensions with a
+    normal prior are sent through the inverse of its distribution, and rounded to such fractions again.
+
+    Args:
+        prior: dimensions of `actions` along which g is not uniform.
+
+    Raises:
+        ValueError: constraints and prior leave next to nothing.
+
+    Source: sampling by inversion: Devroye, Non-uniform random variate generation, 1986, chapter 2.
     """
     region = region_of(actions, constraints)
+    law = partial(_distributed, actions=actions, prior=prior) if prior else None
     if region is not None:
-        drawn = region.draw(count, np.random.default_rng(seed), even=True)
+        drawn = region.draw(count, np.random.default_rng(seed), even=True, law=law)
         return tuple(tuple(map(float, row)) for row in drawn)
     sampler = qmc.Sobol(actions.dimension, scramble=True, rng=np.random.default_rng(seed))
     exponent = max(1, int(np.ceil(np.log2(max(count, 1)))))
-    return tuple(tuple(map(float, row)) for row in sampler.random_base2(exponent)[:count])
+    uniform = sampler.random_base2(exponent)[:count]
+    return tuple(tuple(map(float, row)) for row in (uniform if law is None else law(uniform)))
 
 
 def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
@@ -36,3 +59,16 @@ def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
     from actors.optimizer.core.region import Region
 
     return Region(actions, constraints)
+
+
+def _distributed(uniform: Array, actions: Space, prior: Sequence[NormalPrior]) -> Array:
+    """Points (m, dimension) of the unit cube that are distributed as g is, from uniform ones."""
+    points = uniform.copy()
+    for one in prior:
+        i = actions.names.index(one.name)
+        axis = actions.axes[i]
+        below, above = ndtr((np.array([axis.lower, axis.upper]) - one.mean) / one.deviation)
+        values = one.mean + one.deviation * ndtri(below + uniform[:, i] * (above - below))
+        places = [axis.encode(value) for value in np.clip(values, axis.lower, axis.upper)]
+        points[:, i] = np.rint(np.array(places) * FINENESS) / FINENESS
+    return points

@@ -31,7 +31,7 @@ class Cell:
         id: unique in the study, good as a folder's name.
         kind: what is done: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment.
         level: of mismatch; '' for the grid, which knows no bench.
-        arm: 'C1' … 'C4', or the label of a deployment; '' otherwise.
+        arm: label of a calibration or deployment; '' otherwise.
         receiver: name of a deployment's scene.
         repetition: from 1; 0 for the grid.
         needs: ids of the cells whose results it is made from.
@@ -83,7 +83,7 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
                 known = arm.plan.strategy == "C1"
                 spent = 0 if known else calibration_simulations(arm.plan, train)
                 needs = (pours, GRID) if known else (pours,)
-                add("calibration", spent + study.pour_count, 0, *needs, **place, arm=arm.plan.strategy)
+                add("calibration", spent + study.pour_count, 0, *needs, **place, arm=arm.label)
             for deployment in (a for a in study.deployments if number <= a.repetitions):
                 plan = deployment.plan
                 theta = f"calibration.{level.name}.C4.{number:02d}"

@@ -30,9 +30,11 @@ class CalibrationArm:
     """One of C1 to C4 with its budget (in `plan`, which has no pours yet).
 
     Attributes:
+        label: the strategy; 'C4-paper' for C4 as in the paper.
         levels: names of the levels that it is run at.
     """
 
+    label: str
     plan: CalibrationPlan
     repetitions: int
     levels: tuple[str, ...]
@@ -43,7 +45,8 @@ class DeploymentArm:
     """One of D1 to D3 with its budget (in `plan`, which has all receivers).
 
     Attributes:
-        label: 'D1-15' for D1 with 15 iterations, 'D3-paper' for D3 as in the paper, otherwise the strategy.
+        label: 'D1-15' for D1 with 15 iterations, 'D2-paper' and 'D3-paper' for those as in the paper, otherwise the
+            strategy.
     """
 
     label: str
@@ -85,9 +88,9 @@ class StudyPlan:
         """A level by its name. Raises KeyError."""
         return {level.name: level for level in self.levels}[name]
 
-    def calibration(self, strategy: str) -> CalibrationArm:
-        """The arm of C1, C2, C3 or C4. Raises KeyError."""
-        return {str(arm.plan.strategy): arm for arm in self.calibrations}[strategy]
+    def calibration(self, label: str) -> CalibrationArm:
+        """The arm by its label. Raises KeyError."""
+        return {arm.label: arm for arm in self.calibrations}[label]
 
     def deployment(self, label: str) -> DeploymentArm:
         """The arm by its label. Raises KeyError."""
@@ -108,9 +111,7 @@ def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
         "seed": study.seed,
         "base": base,
         "levels": {level.name: to_json(level.bench, VirtualBenchSpec) for level in study.levels},
-        "calibrations": {
-            arm.plan.strategy: without_newest(to_json(arm.plan, CalibrationPlan)) for arm in study.calibrations
-        },
+        "calibrations": {arm.label: without_newest(to_json(arm.plan, CalibrationPlan)) for arm in study.calibrations},
         "deployments": {arm.label: without_newest(to_json(arm.plan, DeploymentPlan)) for arm in study.deployments},
         "pours": [study.pour_count, study.holdout],
         "compared": study.compared,

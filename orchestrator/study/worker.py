@@ -61,7 +61,7 @@ def run_cell(
         "pours": result.pours,
         "cpu_s": result.cpu_s,
         "seconds": result.seconds,
-        "expected": _expected(directory) if cell.arm == "C4" else [],
+        "expected": _expected(directory) if cell.arm.startswith("C4") else [],
     }
     write_result(folder, cell.id, data)
     return data

@@ -241,9 +241,10 @@ def test_once_costs_show_structure_less_is_given_for_the_unknown():
     points = tuple(map(tuple, np.random.default_rng(4).random((10, 2)).tolist()))
     cover = tuple(map(tuple, np.random.default_rng(5).random((2000, 2)).tolist()))
 
-    def excess(costs, kappa):
+    def excess(costs, kappa, **changes):
         """By how much the proposal misses the least m − κ s of a cover."""
-        answer = propose(SuggestProblem(PLANE, Data(points, tuple(costs)), kappa=2.0, seed=1, predict_at=cover))
+        problem = SuggestProblem(PLANE, Data(points, tuple(costs)), kappa=2.0, seed=1, predict_at=cover)
+        answer = propose(replace(problem, **changes))
         bound = np.array(answer.predictions) - kappa * np.array(answer.prediction_deviations)
         return (answer.means[0] - kappa * answer.deviations[0] - bound.min()) / np.std(costs)
 
@@ -251,3 +252,18 @@ def test_once_costs_show_structure_less_is_given_for_the_unknown():
     noise = np.random.default_rng(1).random(10).tolist()
     assert excess(bowl, 1.0) < 0.01 < excess(bowl, 2.0)
     assert excess(noise, 2.0) < 0.01 < excess(noise, 1.0)
+    assert excess(bowl, 2.0, plain=True) < 0.01 < excess(bowl, 1.0, plain=True), "the paper's κ is a constant"
+
+
+def test_asked_plainly_it_does_not_leave_the_bound_to_fill_space_on_a_plateau():
+    points = tuple(map(tuple, np.random.default_rng(4).random((11, 2)).tolist()))  # the next is a third one
+    costs = tuple(np.random.default_rng(1).random(11).tolist())
+    everywhere = tuple(map(tuple, np.random.default_rng(5).random((2000, 2)).tolist()))
+
+    def excess(plain):
+        """By how much the proposal misses the least m − 2 s of a cover."""
+        answer = propose(SuggestProblem(PLANE, Data(points, costs), seed=1, predict_at=everywhere, plain=plain))
+        bound = np.array(answer.predictions) - 2.0 * np.array(answer.prediction_deviations)
+        return (answer.means[0] - 2.0 * answer.deviations[0] - bound.min()) / np.std(costs)
+
+    assert excess(plain=True) < 0.01 < excess(plain=False)

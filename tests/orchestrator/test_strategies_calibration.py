@@ -192,14 +192,14 @@ def test_test_pours_are_not_used_for_fitting():
 def test_signed_differences_calibrate_better_than_noise_at_the_same_price():
     pours = measured()
     scores = {}
-    for averaging in ("differences", "noise"):
+    for averaging in ("context", "noise"):
         scores[averaging] = []
         for seed in range(4):
-            plan = calibration_plan(simulations=24)
-            strategy = ContinuousBayesianCalibration(plan, pours, seed, averaging=averaging)
+            plan = calibration_plan(simulations=24, averaging=averaging)
+            strategy = ContinuousBayesianCalibration(plan, pours, seed)
             Play(calibration_spill)(strategy)
             scores[averaging].append(true_discrepancy(strategy.theta))
-    assert np.mean(scores["differences"]) < 0.7 * np.mean(scores["noise"])
+    assert np.mean(scores["context"]) < 0.7 * np.mean(scores["noise"])
 
 
 BOX = Space((*PARAMETERS.axes, Axis("viscosity", 0.0, 1.0), Axis("friction", 0.0, 0.5)))

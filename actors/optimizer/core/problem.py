@@ -177,6 +177,7 @@ class SuggestProblem:
             minimised, predicted and mapped is the measure over the disturbances of a request.
         pouring: 'knowledge': places of real observations whose outcome is out; `pending` are simulations then.
         effort: limits the fit, and has the answer carry what was fitted.
+        plain: 'lcb' as it stands in the paper: κ is kept, and no point only fills space on a plateau.
     """
 
     space: Space
@@ -200,6 +201,7 @@ class SuggestProblem:
     risk: Risk | None = None
     pouring: tuple[Point, ...] = ()
     effort: Effort | None = None
+    plain: bool = False
 
     @property
     def beside(self) -> int:

@@ -127,9 +127,11 @@ def _looks_round(problem: SuggestProblem, asked: Asked, model: Model, index: int
 
     On a plateau the luckiest pours look like a slope, and following them, mostly along the faces of the cube, would
     take the whole budget. The same holds where every pour came to more than half of all simulations did, and pours
-    alone show no structure: what simulation promised isn't there. The paper's models, contexts and risks are left
-    alone.
+    alone show no structure: what simulation promised isn't there. The paper's ways (`plain`, 'zero', 'simulated'),
+    contexts and risks are left alone.
     """
+    if problem.plain:
+        return False
     number = len(asked.known) + len(asked.busy) + index
     if problem.acquisition != "lcb" or problem.context or problem.risk or number % FILL_EVERY != FILL_EVERY - 1:
         return False
@@ -146,9 +148,10 @@ def _kappa(problem: SuggestProblem, model: Model) -> float:
     """κ of the next point: half of it once the costs show structure.
 
     A constant κ goes on visiting what is merely unknown when the valley has long been found, and a budget of twenty
-    ends before its bottom is reached. The paper's models, and contexts, are left alone.
+    ends before its bottom is reached. The paper's ways (`plain`, 'zero', 'simulated'), and contexts, are left alone.
     """
-    settled = problem.mean == "constant" and not problem.context and model.process.evidence >= STRUCTURE
+    adapts = problem.mean == "constant" and not problem.context and not problem.plain
+    settled = adapts and model.process.evidence >= STRUCTURE
     return problem.kappa * (SETTLED if settled else 1.0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +58,13 @@ class Region:
             allowed &= np.sum(parts, axis=0) <= upper + slack
         return allowed
 
-    def draw(self, count: int, rng: np.random.Generator, *, even: bool) -> Array:
+    def draw(
+        self, count: int, rng: np.random.Generator, *, even: bool, law: Callable[[Array], Array] | None = None
+    ) -> Array:
         """(count, dimension) allowed points: of a scrambled Sobol sequence if `even`, else independent ones.
+
+        Args:
+            law: makes points of another distribution of uniform ones (m, dimension).
 
         Raises:
             ValueError: the constraints leave next to nothing.
@@ -75,7 +80,7 @@ class Region:
             some = 2 ** max(0, math.ceil(math.log2(max(count, drawn, 1))))
             fresh = rng.random((some, d)) if sequence is None else np.asarray(sequence.random(some))
             drawn += some
-            fresh = self.snap(fresh)
+            fresh = self.snap(fresh if law is None else law(fresh))
             found = np.concatenate([found, fresh[self.allows(fresh)]])
         return found[:count]
 

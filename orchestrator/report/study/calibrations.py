@@ -98,7 +98,7 @@ def _curve(name: str, result: Mapping[str, Any], expected: list[list[float]]) ->
         each = result["training_pours"]
         values = [float("nan") if t["discrepancy"] is None else t["discrepancy"] for t in result["trials"]]
         return [(each * (i + 1), value) for i, value in enumerate(running_least(values))]
-    if name == "C4":
+    if name.startswith("C4"):
         best = running_least([max(value, 0.0) for _, value in expected])
         return [(int(spent), value) for (spent, _), value in zip(expected, best, strict=True)]
     return [final]

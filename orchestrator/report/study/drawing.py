@@ -19,8 +19,10 @@ COLOURS = {
     "C2": style.PREDICTED,
     "C3": style.GOOD,
     "C4": style.BEST,
+    "C4-paper": style.ESCAPED,
     "D1": style.PREDICTED,
     "D2": style.MEASURED,
+    "D2-paper": style.ESCAPED,
     "D3": style.BEST,
     "D3-paper": style.GOOD,
 }

@@ -48,7 +48,7 @@ class Gathered:
     """Everything of a study that is finished.
 
     Attributes:
-        calibrated: by strategy, `UNCALIBRATED` first where it is there.
+        calibrated: by label, `UNCALIBRATED` first where it is there.
         losses: loss of every pour in order, one list a repetition; NaN where a pour gave none.
         numbers: of these repetitions.
         cells, finished: how many.
@@ -83,7 +83,7 @@ def gather(study: StudyPlan, results: Mapping[str, Mapping[str, Any]]) -> Gather
     """
     cells = cells_of(study)
     found = Gathered(cells=len(cells))
-    order = [UNCALIBRATED, *(arm.plan.strategy for arm in study.calibrations)]
+    order = [UNCALIBRATED, *(arm.label for arm in study.calibrations)]
     receivers = {scene.name: scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes}
     for cell in cells:
         if cell.id not in results:

@@ -33,6 +33,12 @@ _RESAMPLED = (
     "percentile bootstraps over repetitions; with ten or fewer they are rather too narrow than too wide."
 )
 
+_AS_IN_THE_PAPER = {
+    "C4-paper": ". As in the paper: the surrogate is over θ alone, and takes the action's influence for noise",
+    "D2-paper": ". As in the paper: the surrogate has a zero mean",
+    "D3-paper": ". As in the paper: a surrogate of the residual around the simulations' mean, always trusted",
+}
+
 
 def write_report(study: StudyPlan, folder: Path) -> Path:
     """Write figures, tables and the page of what is finished.
@@ -103,8 +109,8 @@ def _settings(study: StudyPlan) -> list[str]:
     for arm in study.calibrations:
         axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in arm.plan.parameters.axes)
         lines.append(
-            f"{arm.plan.strategy}: {arm.plan.simulations} simulations, {arm.repetitions} repetitions, searching "
-            f"{axes}; at {', '.join(arm.levels)} mismatch."
+            f"{arm.label}: {arm.plan.simulations} simulations, {arm.repetitions} repetitions, searching "
+            f"{axes}; at {', '.join(arm.levels)} mismatch{_AS_IN_THE_PAPER.get(arm.label, '')}."
         )
     for each in study.deployments:
         plan = each.plan
@@ -113,7 +119,8 @@ def _settings(study: StudyPlan) -> list[str]:
             "D2": f"{plan.pours} pours",
             "D3": f"{plan.prior_simulations} simulations, then {plan.pours} pours with {plan.per_pour} beside each",
         }[plan.strategy]
-        lines.append(f"{each.label}: {what}; {each.repetitions} repetitions into each receiver.")
+        paper = _AS_IN_THE_PAPER.get(each.label, "")
+        lines.append(f"{each.label}: {what}; {each.repetitions} repetitions into each receiver{paper}.")
     return [*lines, *(_level(level) for level in study.levels)]
 
 

@@ -107,10 +107,18 @@ def _calibrations(study: StudyPlan, found: Gathered) -> Table:
     )
 
 
-PAIRS = (("C4", "C3"), ("C4", "C2"), ("C4", "C1"), ("C4", UNCALIBRATED), ("C3", "C2"))
+PAIRS = (
+    ("C4", "C3"),
+    ("C4", "C2"),
+    ("C4", "C1"),
+    ("C4", "C4-paper"),
+    ("C4", UNCALIBRATED),
+    ("C4-paper", "C3"),
+    ("C3", "C2"),
+)
 """Calibrations whose test discrepancies are compared."""
 
-ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"))
+ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3-paper", "D2-paper"), ("D2", "D2-paper"))
 """Deployments whose losses are compared."""
 
 
