@@ -74,7 +74,7 @@ def resolve_deployment(
         if scene is None:
             break  # one cause, one message
     complete = tuple(scene for scene in scenes if scene is not None)
-    if len(complete) < len(receivers) or actions is None or strategy is None or pours is None:
+    if not complete or len(complete) < len(receivers) or actions is None or strategy is None or pours is None:
         return None
     risk = _resolve_risk(section, place, builder)
     objectives = resolve_objectives(section, place, complete[0], actions, report)

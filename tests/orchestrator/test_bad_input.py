@@ -212,6 +212,18 @@ BAD_CAMPAIGNS = {
         "cup.stl",
         "receiver: is a mesh; write {name: cup, mesh: cup.stl",
     ),
+    "no receivers at all": (
+        DEPLOYED,
+        "strategy: D3",
+        "strategy: D3\n  receivers: []",
+        "bad.yaml:16:14: deployment.receivers: is empty; name at least one vessel",
+    ),
+    "no receivers at the top": (
+        DEPLOYED.replace("calibration:\n", "calibration:\n  receiver: cup.yaml\n"),
+        "receiver: cup.yaml",
+        "receivers: []",
+        "bad.yaml:5:12: receivers: is empty; name at least one vessel",
+    ),
     "two receivers of one name": (
         CAMPAIGN + "deployment: {strategy: D2, pours: 3, receivers: [cup.yaml, cup.yaml], "
         "motion: {angular_velocity: 9 deg/s}, actions: {x_offset: [80 mm, 99 mm]}}",
