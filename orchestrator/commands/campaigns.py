@@ -144,7 +144,13 @@ def plan_pour(
     if parameters is None:
         say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
     finished = run_in_front_of_people(
-        plan, directory, resume=False, stages=stages, in_process=in_process, again=f"decant plan {path} (plans anew)"
+        plan,
+        directory,
+        resume=False,
+        stages=stages,
+        in_process=in_process,
+        again=f"Plan anew: decant plan {path}",
+        not_resumed="this planning is not resumed; what was simulated",
     )
     answers = []
     for stage in planning:
