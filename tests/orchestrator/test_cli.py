@@ -11,7 +11,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import pytest
 import trimesh
@@ -19,6 +19,9 @@ from typer.testing import CliRunner
 
 from orchestrator.cli import app
 from orchestrator.commands import single
+from orchestrator.commands.options import Answer
+from orchestrator.strategies.trust import OPTIONS
+from orchestrator.unknown import LOST, REPEAT
 from sim_engine.spread import spreads
 from tests.end_to_end import small
 from tests.orchestrator import watched
@@ -423,3 +426,9 @@ def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pyte
     assert refused.exit_code == 2
     assert "ur-rtde" in refused.stderr
     assert "twin.yaml" in refused.stderr
+
+
+def test_help_of_answer_names_all_that_may_be_answered() -> None:
+    (option,) = get_args(Answer)[1:]
+    for answer in (LOST, REPEAT, "weighed", *OPTIONS):
+        assert f"'{answer}" in option.help
