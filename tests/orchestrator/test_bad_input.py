@@ -206,6 +206,18 @@ BAD_CAMPAIGNS = {
     "empty value": (CAMPAIGN, "name: test", "name:", "1:1: name: has no value; give one, or remove the key"),
     "missing key": (CAMPAIGN, "liquid: {name: water, mass: 200 g}\n", "", "key 'liquid' is missing; add for example"),
     "missing file": (CAMPAIGN, "beaker.yaml", "baeker.yaml", "4:9: pourer: no such file: "),
+    "vessel in place of a laboratory": (
+        CAMPAIGN,
+        "lab.yaml",
+        "cup.yaml",
+        "bad.yaml:2:13: laboratory: cup.yaml describes a vessel, but a laboratory is needed here",
+    ),
+    "laboratory in place of a vessel": (
+        CAMPAIGN,
+        "cup.yaml",
+        "lab.yaml",
+        "bad.yaml:5:11: receiver: lab.yaml describes a laboratory, but a vessel is needed here",
+    ),
     "mesh in place of a vessel": (
         CAMPAIGN,
         "cup.yaml",
