@@ -134,7 +134,7 @@ def plan_pour(
     from orchestrator.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
 
     plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
-    check_campaign_can_run(plan)
+    check_campaign_can_run(plan, as_written=receiver is None)
     assert plan.deployment is not None
     planning = deployment_stages(plan, plan.deployment)
     drawn = _drawn(plan, parameters, thetas)

@@ -70,18 +70,17 @@ def read_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
         raise RefusalError(str(error), BAD_INPUT) from None
 
 
-def check_campaign_can_run(plan: CampaignPlan) -> None:
-    """Vessels, loads and motions, before anything starts.
+def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> None:
+    """Vessels (those of the campaign's file, or others), loads and motions, before anything starts.
 
     Raises:
         RefusalError: with everything that is wrong, exit code 2.
     """
     from orchestrator.config.check import check_campaign
-    from orchestrator.config.errors import shown_path
 
-    problems = check_campaign(plan)
+    problems = check_campaign(plan, as_written=as_written)
     if problems:
-        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(str(problem) for problem in problems), BAD_INPUT)
 
 
 def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool) -> None:

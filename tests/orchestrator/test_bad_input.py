@@ -376,24 +376,28 @@ def test_bad_vessel_is_refused_with(case: str, folder: Path) -> None:
 def test_bad_mesh_is_refused_by_the_check_with_its_file(folder: Path) -> None:
     write(folder, "open.stl", TETRAHEDRON_WITH_A_HOLE)
     write(folder, "cup.yaml", "name: open\nmesh: open.stl\nunit: mm\n")
-    problems = check_campaign(load_campaign(write(folder, "campaign.yaml", CAMPAIGN)))
-    assert len(problems) == 1
-    assert "open.stl" in problems[0]
-    assert "watertight" in problems[0]
+    (problem,) = map(str, check_campaign(load_campaign(write(folder, "campaign.yaml", CAMPAIGN))))
+    assert problem.startswith("campaign.yaml:5:11: receiver: vessel 'open' (")
+    assert "open.stl" in problem
+    assert "watertight" in problem
 
 
 def test_vessel_that_is_too_small_is_refused_by_the_check(folder: Path) -> None:
     write(folder, "cup.yaml", VESSEL.replace("beaker", "thimble").replace("40", "12").replace("100", "30"))
-    problems = check_campaign(load_campaign(write(folder, "campaign.yaml", CAMPAIGN)))
-    assert any("receiver can't hold the water (200 g)" in problem and "thimble" in problem for problem in problems)
+    deployed = DEPLOYED.replace("strategy: D3", "strategy: D3\n  receivers: [beaker.yaml, cup.yaml]")
+    problems = map(str, check_campaign(load_campaign(write(folder, "campaign.yaml", deployed))))
+    small = [text for text in problems if "thimble holds" in text]
+    assert [text.partition(" ")[0] for text in small] == ["campaign.yaml:5:11:", "campaign.yaml:16:28:"]
+    assert all("receiver can't hold the water (200 g)" in text for text in small)
 
 
 def test_scene_in_which_all_actions_touch_is_refused_by_the_check(folder: Path) -> None:
     close = write(folder, "campaign.yaml", CAMPAIGN.replace("84 mm", "60 mm"))
-    problems = check_campaign(load_campaign(close))
-    assert len(problems) == 1
-    assert "calibration: the vessels touch at every action" in problems[0]
-    assert "x_offset" in problems[0]
+    (problem,) = map(str, check_campaign(load_campaign(close)))
+    assert problem.startswith(
+        "campaign.yaml:11:12: calibration.actions: calibration: the vessels touch at every action"
+    )
+    assert "x_offset" in problem
 
 
 BAD_ASSIGNMENTS = {
