@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,7 @@ from orchestrator.config.yaml_source import Document, Loc
 from orchestrator.plan import CampaignPlan
 from sim_engine.action import Action
 from sim_engine.contact import describe_contact, first_contact
+from sim_engine.hydrostatics import level
 from sim_engine.motion import plan_motion
 from sim_engine.space import Space
 from sim_engine.task import Scene
@@ -89,9 +91,9 @@ class _Checker:
         return (pourer, receiver) if ok else None
 
     def reachable(self, scene: Scene, actions: Space, role: _Role) -> None:
-        """Some action of the space must not touch, and be one that the arm can make."""
+        """Some action of the space must pour, not touch, and be one that the arm can make."""
         vessels = self.scene(scene, role)
-        if vessels is None:
+        if vessels is None or self._never_pours(scene, actions, vessels[0], role):
             return
         first = beyond = ""
         for chosen in _trials(actions):
@@ -115,6 +117,27 @@ class _Checker:
             f"A larger x_offset or height would clear them"
         )
         self.add(role.places(("actions",)), text)
+
+    def _never_pours(self, scene: Scene, actions: Space, pourer: Vessel, role: _Role) -> bool:
+        """Whether the liquid stays below the lip at the largest tilt of the space, which is told."""
+        tilts = []
+        for chosen in _trials(actions):
+            try:
+                tilts.append(scene.action(chosen).max_angle)
+            except ValueError:
+                continue  # no such action, which `touch` will tell
+        volume = scene.liquid.volume
+        if not tilts or level(pourer, volume, max(tilts)) > 0.0:
+            return False
+        steps = np.radians(np.arange(math.ceil(math.degrees(max(tilts))), 181))
+        lip = next((math.degrees(tilt) for tilt in steps if level(pourer, volume, float(tilt)) > 0.0), None)
+        when = "never reaches the lip" if lip is None else f"reaches the lip at {lip:.0f} deg; raise max_angle"
+        text = (
+            f"{role.text}: no action that was tried pours anything: max_angle is at most "
+            f"{math.degrees(max(tilts)):.4g} deg, and the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g) {when}"
+        )
+        self.add(role.places(("actions", "max_angle"), ("motion", "max_angle")), text)
+        return True
 
     def _for_the_arm(self, scene: Scene, action: Action, actions: Space, pourer: Vessel, receiver: Vessel) -> str:
         """Why the laboratory's arm, if it has one, can't make it; '' if it can."""
@@ -154,9 +177,9 @@ class _Checker:
 def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Problem]:
     """Build the vessels of a campaign and try its actions.
 
-    Checked for every scene: both vessels can be built and hold the liquid; some action of the space lets them stay
-    clear of each other, and can be made by the laboratory's arm (middle, corners and a few drawn at random are tried);
-    recorded pours stay clear.
+    Checked for every scene: both vessels can be built and hold the liquid; some action of the space tilts far enough
+    for the liquid to leave, and one lets the vessels stay clear of each other and can be made by the laboratory's arm
+    (middle, corners and a few drawn at random are tried); recorded pours stay clear.
 
     Args:
         plan: of the campaign.

@@ -400,6 +400,25 @@ def test_scene_in_which_all_actions_touch_is_refused_by_the_check(folder: Path) 
     assert "x_offset" in problem
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("max_angle: 110 deg", "max_angle: 20 deg", "campaign.yaml:6:21: motion.max_angle"),
+        ("deg/s]}", "deg/s], max_angle: [10 deg, 20 deg]}", "campaign.yaml:11:65: calibration.actions.max_angle"),
+    ],
+)
+def test_campaign_that_can_never_pour_is_refused_by_the_check(folder: Path, old: str, new: str, place: str) -> None:
+    text = CAMPAIGN if "motion" in place else CAMPAIGN.replace("max_angle: 110 deg, ", "")
+    (problem,) = map(str, check_campaign(load_campaign(write(folder, "campaign.yaml", text.replace(old, new)))))
+    assert problem.startswith(
+        f"{place}: calibration: no action that was tried pours anything: max_angle is at most 20 deg"
+    )
+    # by quadrature a glass of 80 mm × 100 mm retains 208.4 mL at 56 deg and 199.3 mL at 57 deg; 200.4 mL are loaded
+    assert "the water (200 g) reaches the lip at 57 deg; raise max_angle" in problem
+    enough = write(folder, "campaign.yaml", CAMPAIGN.replace("max_angle: 110 deg", "max_angle: 60 deg"))
+    assert check_campaign(load_campaign(enough)) == []
+
+
 BAD_ASSIGNMENTS = {
     "no value": ("x_offset", "'x_offset': should be name=value"),
     "unknown dimension": ("x_ofset=90", "unknown dimension 'x_ofset'; did you mean 'x_offset'?"),
