@@ -93,6 +93,7 @@ class _Checker:
     def reachable(self, scene: Scene, actions: Space, role: _Role) -> None:
         """Some action of the space must pour, not touch, and be one that the arm can make."""
         vessels = self.scene(scene, role)
+        self._payload(scene)
         if vessels is None or self._never_pours(scene, actions, vessels[0], role):
             return
         first = beyond = ""
@@ -117,6 +118,17 @@ class _Checker:
             f"A larger x_offset or height would clear them"
         )
         self.add(role.places(("actions",)), text)
+
+    def _payload(self, scene: Scene) -> None:
+        """What the arm believes to carry can't weigh less than the liquid alone."""
+        if self.arm is None or self.arm.payload >= scene.liquid.mass:
+            return
+        text = (
+            f"the arm is set to carry {self.arm.payload * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
+            f"alone, {scene.liquid.mass * 1e3:g} g; the payload is gripper and filled pourer, in the laboratory's file "
+            "and on the pendant"
+        )
+        self.add((("liquid", "mass"), ("liquid",)), text)
 
     def _never_pours(self, scene: Scene, actions: Space, pourer: Vessel, role: _Role) -> bool:
         """Whether the liquid stays below the lip at the largest tilt of the space, which is told."""

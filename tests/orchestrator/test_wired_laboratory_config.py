@@ -179,3 +179,12 @@ def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
     assert "widen arm.limits.box" in said
     assert problems[0].where == "calibration.actions"
     assert "deployment into 'narrow'" in problems[1].message
+
+
+def test_an_arm_that_is_set_to_carry_less_than_the_liquid_is_refused():
+    plan = load_campaign(QUICKSTART)
+    assert plan.laboratory.arm is not None
+    weak = replace(plan, laboratory=replace(plan.laboratory, arm=replace(plan.laboratory.arm, payload=0.05)))
+    (problem,) = check_campaign(weak)
+    assert problem.where == "liquid.mass"
+    assert "set to carry 50 g (arm.payload), less than the water alone, 200 g" in problem.message
