@@ -14,7 +14,7 @@ from sim_engine.liquid import Liquid
 from sim_engine.task import Scene
 from sim_engine.vessel.spec import MeshShape
 
-_FREE = ("source", "outputs", "resolved", "on_unknown")
+_FREE = ("source", "laboratory_source", "outputs", "resolved", "on_unknown")
 """Fields of a plan that may be changed between two parts of a run."""
 
 _TOLD = ("surface_tension", "dynamic_viscosity")

@@ -28,7 +28,15 @@ from sim_engine.task import PourTask, Scene
 
 
 class LaneError(RunError):
-    """The laboratory can't serve the campaign any longer, or was asked for something it can't know."""
+    """The laboratory can't serve the campaign any longer, or was asked for something it can't know.
+
+    Attributes:
+        problem: what is wrong, without what to do about a run that can be resumed.
+    """
+
+    def __init__(self, problem: str, way_on: str = "") -> None:
+        super().__init__(problem + way_on)
+        self.problem = problem
 
 
 class PourNotMadeError(LaneError):
@@ -143,15 +151,15 @@ class Lanes:
             except NotPouredError as error:
                 withdrawn(str(error))
                 _raise_if_cancelled()
-                raise PourNotMadeError(f"{error}; see to it, then resume the run") from error
+                raise PourNotMadeError(str(error), "; see to it, then resume the run") from error
             except UnknownPourError as error:
                 _raise_if_cancelled()
-                raise PourUnknownError(f"{error}; resuming asks what came of it") from error
+                raise PourUnknownError(str(error), "; resuming asks what came of it") from error
             except BenchLostError as error:
                 # No outcome: a person has to look, and there is nothing left to pour with.
                 _raise_if_cancelled()
                 raise LaneError(
-                    f"{error}; what was poured is unknown: see to the bench, then resume the run"
+                    f"{error}; what was poured is unknown: see to the bench", ", then resume the run"
                 ) from error
             except LaboratoryError as error:
                 _raise_if_cancelled()
@@ -178,8 +186,8 @@ class Lanes:
                     reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
                     if attempt == 2:
                         raise LaneError(
-                            f"the optimiser failed twice on the same question ({reason}); nothing is lost: mend the "
-                            "cause and resume the run"
+                            f"the optimiser failed twice on the same question ({reason})",
+                            "; nothing is lost: mend the cause and resume the run",
                         ) from error
                     retrying(f"the optimiser failed ({reason}); it is asked once more")
         raise AssertionError("unreachable")

@@ -284,6 +284,7 @@ class CampaignPlan:
 
     Attributes:
         source: the YAML file.
+        laboratory_source: the file that describes the laboratory; None where that is the campaign's own.
         parameters: θ_s in force where nothing is calibrated.
         parallel_simulations: logical slots of the simulation lane; part of the plan (not of the machine), so that the
             same seed asks for the same things anywhere.
@@ -302,3 +303,4 @@ class CampaignPlan:
     parallel_simulations: int = 2
     on_unknown: Literal["ask", "repeat"] = "ask"
     resolved: dict[str, Any] = field(default_factory=dict)
+    laboratory_source: Path | None = field(default=None, compare=False)

@@ -10,8 +10,6 @@ import re
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-from orchestrator.config.errors import ConfigError
-from orchestrator.config.yaml_source import Document
 from orchestrator.errors import RunError
 
 SUFFIX = ".safety.json"
@@ -94,27 +92,15 @@ def write_record(laboratory: Path, record: SafetyRecord) -> Path:
     return path
 
 
-def laboratory_file(campaign: Path) -> Path:
-    """The file that describes a campaign's laboratory; the campaign itself where it stands in there.
+def accepted_checksum(laboratory: Path) -> str | None:
+    """Checksum that was accepted for a laboratory; None if none was.
+
+    Args:
+        laboratory: the file that describes it, which is a campaign's where it stands in there.
 
     Raises:
-        ConfigError: the campaign can't be read.
+        SafetyRecordError: the record makes no sense.
     """
-    data = Document.read(campaign.resolve()).data
-    named = data.get("laboratory") if isinstance(data, dict) else None
-    return (campaign.resolve().parent / named).resolve() if isinstance(named, str) else campaign.resolve()
-
-
-def accepted_checksum(campaign: Path) -> str | None:
-    """Checksum that was accepted for a campaign's laboratory; None if none was.
-
-    Raises:
-        SafetyRecordError: the record makes no sense, or the campaign can't be read.
-    """
-    try:
-        laboratory = laboratory_file(campaign)
-    except ConfigError as error:
-        raise SafetyRecordError(str(error)) from None
     record = read_record(laboratory)
     return None if record is None else record.checksum.upper()
 

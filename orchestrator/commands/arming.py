@@ -17,6 +17,7 @@ from actors.arm.spec import UrArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
 from orchestrator.commands.common import BAD_INPUT, RefusalError, say
+from orchestrator.config.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
 from orchestrator.strategies.prior import region_of
 from sim_engine.action import Action
@@ -180,19 +181,19 @@ def require_flag(laboratory: LaboratorySpec, *, armed: bool, again: str) -> None
 
 
 def accepted(plan: CampaignPlan) -> str:
-    """The checksum that people have accepted for a campaign's hardware.
+    """The checksum that people have accepted for the hardware of the laboratory in use.
 
     Raises:
         RefusalError: none was (exit code 2).
     """
     try:
-        checksum = accepted_checksum(plan.source)
+        checksum = accepted_checksum(plan.laboratory_source or plan.source)
     except SafetyRecordError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
     if checksum is None:
         raise RefusalError(
             f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "
-            "'decant doctor' on its file first; it says how",
+            f"'decant doctor {shown_path(plan.laboratory_source or plan.source)}' first; it says how",
             BAD_INPUT,
         )
     return checksum

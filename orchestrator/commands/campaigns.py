@@ -140,7 +140,7 @@ def plan_pour(
     from orchestrator.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
 
     plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
-    check_campaign_can_run(plan)
+    check_campaign_can_run(plan, as_written=receiver is None)
     assert plan.deployment is not None
     planning = deployment_stages(plan, plan.deployment)
     drawn = _drawn(plan, parameters, thetas)
@@ -150,7 +150,13 @@ def plan_pour(
     if parameters is None:
         say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
     finished = run_in_front_of_people(
-        plan, directory, resume=False, stages=stages, in_process=in_process, again=f"decant plan {path} (plans anew)"
+        plan,
+        directory,
+        resume=False,
+        stages=stages,
+        in_process=in_process,
+        again=f"Plan anew: decant plan {path}",
+        not_resumed="this planning is not resumed; what was simulated",
     )
     answers = []
     for stage in planning:

@@ -70,18 +70,17 @@ def read_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
         raise RefusalError(str(error), BAD_INPUT) from None
 
 
-def check_campaign_can_run(plan: CampaignPlan) -> None:
-    """Vessels, loads and motions, before anything starts.
+def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> None:
+    """Vessels (those of the campaign's file, or others), loads and motions, before anything starts.
 
     Raises:
         RefusalError: with everything that is wrong, exit code 2.
     """
     from orchestrator.config.check import check_campaign
-    from orchestrator.config.errors import shown_path
 
-    problems = check_campaign(plan)
+    problems = check_campaign(plan, as_written=as_written)
     if problems:
-        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(str(problem) for problem in problems), BAD_INPUT)
 
 
 def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool) -> None:
@@ -164,6 +163,7 @@ def run_in_front_of_people(
     stages: Sequence[StageDefinition] | None = None,
     in_process: bool = False,
     again: str,
+    not_resumed: str = "",
     answer: str | None = None,
     checksum: str | None = None,
 ) -> Finished:
@@ -173,7 +173,8 @@ def run_in_front_of_people(
         directory: of the run.
         stages: in place of the plan's.
         in_process: everything in this process, without Ray (slower; for debugging).
-        again: the command that resumes, for the message after an interruption.
+        again: the command that resumes, for the message after an interruption; or that begins anew …
+        not_resumed: … where nothing resumes: what is not, and what of it is kept.
         answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
         checksum: of the safety settings that people have accepted for the controller of hardware.
 
@@ -220,26 +221,30 @@ def run_in_front_of_people(
                 )
 
             with stdout_for_results():
-                result = asyncio.run(_until_signalled(lambda: work(laboratory), again))
+                result = asyncio.run(_until_signalled(lambda: work(laboratory), resumable=not not_resumed))
     except (RunError, LaboratoryError) as error:
-        raise RefusalError(f"{error}{_way_on(directory, again)}", getattr(error, "exit_code", FAILED)) from None
+        problem = getattr(error, "problem", error) if not_resumed else error
+        way_on = _way_on(directory, again, not_resumed)
+        raise RefusalError(f"{problem}{way_on}", getattr(error, "exit_code", FAILED)) from None
     except OSError as error:
         if error.errno is None:
             raise  # not a file's: a defect, which wants its traceback
-        raise RefusalError(f"{error}{_way_on(directory, again)}") from None
+        raise RefusalError(f"{error}{_way_on(directory, again, not_resumed)}") from None
     except (asyncio.CancelledError, KeyboardInterrupt):
-        raise RefusalError(f"interrupted; nothing is lost. Go on with: {again}", INTERRUPTED) from None
+        way_on = _way_on(directory, again, not_resumed) if not_resumed else f"; nothing is lost. Go on with: {again}"
+        raise RefusalError(f"interrupted{way_on}", INTERRUPTED) from None
     finally:
         if monitor is not None:
             monitor.close()
     return _report(plan, result, monitor)
 
 
-def _way_on(directory: Path, again: str) -> str:
+def _way_on(directory: Path, again: str, not_resumed: str) -> str:
     from orchestrator.journal import JOURNAL_NAME
 
-    begun = (directory / JOURNAL_NAME).is_file()
-    return f"\nwhat is done so far is kept: {again}" if begun else "\nnothing had begun"
+    if not (directory / JOURNAL_NAME).is_file():
+        return "\nnothing had begun"
+    return f"\n{not_resumed} is in {directory}. {again}" if not_resumed else f"\nwhat is done so far is kept: {again}"
 
 
 def _warn_of_what_is_not_simulated(plan: CampaignPlan) -> None:
@@ -308,8 +313,9 @@ def _occupancy(plan: CampaignPlan, directory: Path) -> dict[str, dict[str, Any]]
     return {stage: as_summary(one) for stage, one in found.items()}
 
 
-async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], again: str) -> CampaignResult:
+async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, resumable: bool) -> CampaignResult:
     """Run; a first SIGINT, SIGTERM or SIGHUP pauses at the next safe point, a second gives up what is under way."""
+    begun = "a pour that has begun"
     task = asyncio.ensure_future(work())
     asked = 0
 
@@ -317,9 +323,13 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], again:
         nonlocal asked
         asked += 1
         if asked == 1:
-            say("\npausing: a pour that has begun is finished and weighed first; once more to give it up")
+            doing = "pausing" if resumable else "ending"
+            say(f"\n{doing}: {begun} is finished and weighed first; once more to give it up")
         else:
-            say("\nstopping now; a pour that has begun will have to be accounted for on resume")
+            left = (
+                "will have to be accounted for on resume" if resumable else "stays unknown: weigh by hand what can be"
+            )
+            say(f"\nstopping now; {begun} {left}")
         task.cancel()
 
     loop = asyncio.get_running_loop()

@@ -18,7 +18,8 @@ Answer = Annotated[
     str | None,
     typer.Option(
         help="With --resume: what came of the pour that was under way: 'lost', 'weighed 3.2 0.4' (g spilled, g "
-        "retained), or on the virtual bench 'repeat'.",
+        "retained), or on the virtual bench 'repeat'. Or, where a D3 asks whether to trust its simulator: 'D2', "
+        "'widen' or 'go on'.",
         show_default=False,
     ),
 ]

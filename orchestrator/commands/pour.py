@@ -99,7 +99,7 @@ def pour(
         assert chosen.path is not None
         pour_empty(chosen.plan, chosen.action, slowed(chosen.path, slow), slow=slow, as_json=as_json)
         return
-    _pour(chosen, in_process=in_process, again=f"decant pour {path} … (pours anew)", as_json=as_json)
+    _pour(chosen, in_process=in_process, again=f"Another pour: decant pour {path} …", as_json=as_json)
 
 
 def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) -> None:
@@ -272,7 +272,14 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     check_laboratory_answers(plan, stages, in_process=in_process)
     directory = run_directory(plan, resume=False, run_id=None)
     finished = run_in_front_of_people(
-        plan, directory, resume=False, stages=stages, in_process=in_process, again=again, checksum=checksum
+        plan,
+        directory,
+        resume=False,
+        stages=stages,
+        in_process=in_process,
+        again=again,
+        not_resumed="this pour is not resumed; what was weighed of it",
+        checksum=checksum,
     )
     result = finished.result.results[STAGE]
     if "failed" in result:

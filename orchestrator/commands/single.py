@@ -224,7 +224,7 @@ def validate(paths: list[Path]) -> None:
                 note = f"study, {len(cells_of(study))} cells, seed {study.seed}"
             else:
                 plan = load_campaign(path)
-                problems = [f"{path}: {problem}" for problem in check_campaign(plan)]
+                problems = [str(problem) for problem in check_campaign(plan)]
                 note = f"campaign, seed {plan.seed}"
         except ConfigError as error:
             problems = [str(error)]

@@ -72,7 +72,9 @@ def resolve_arm(
     from actors.arm.path.limits import check_limits  # brings scipy along
 
     for problem in check_limits(spec):
-        report.add(at, problem, key=True)
+        key, _, text = problem.partition(": ")
+        owner = place if key.startswith("cell.") else at
+        report.add(owner.at(*key.split(".")), text)
     return spec if len(report.problems) == before else None
 
 

@@ -24,6 +24,9 @@ PositiveMass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1, positive=True)
 Duration = Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0)]
 PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=True)]
 
+USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
+"""Speeds that balances can be set to [bits per second]."""
+
 VIRTUAL_DIALECT = "kcp"
 """Spoken by a virtual balance unless another dialect is named."""
 
@@ -159,11 +162,28 @@ def _check_line(section: BalanceDeviceSection, place: Place, report: Report, mod
     elif section.port is None and section.virtual is None and not report.is_broken(place.at("port")):
         example = "port: /dev/serial/by-id/usb-…" if mode == "hardware" else "virtual: {resolution: 0.1 g}"
         report.add(place, f"placement '{section.placement}' reads the balance; add '{example}', or type: 'manual'")
+    if section.baud is not None and section.baud not in USUAL_BAUDS:
+        usual = ", ".join(str(baud) for baud in USUAL_BAUDS)
+        report.add(place.at("baud"), f"no balance talks at {section.baud} baud; should be one of {usual}")
+    if section.step is not None:
+        _check_step(section.step, section.load_tolerance, place.at("step"), report)
+    if section.virtual is not None:
+        at = place.at("virtual", "resolution")
+        _check_step(section.virtual.resolution, section.load_tolerance, at, report)
     if section.format is not None:
         try:
             parse_format(section.format)
         except ValueError as error:
             report.add(place.at("format"), str(error))
+
+
+def _check_step(step: float, tolerance: float, place: Place, report: Report) -> None:
+    if step > tolerance:
+        report.add(
+            place,
+            f"a display in steps of {1e3 * step:g} g can't tell whether a load lies within load_tolerance, "
+            f"{1e3 * tolerance:g} g; weigh on a finer balance, or raise load_tolerance",
+        )
 
 
 def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:

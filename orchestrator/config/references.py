@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from orchestrator.config.errors import ConfigError
+from orchestrator.config.errors import ConfigError, shown_path
 from orchestrator.config.kinds import wrong_kind
 from orchestrator.config.laboratory import LaboratoryFile, resolve_laboratory
 from orchestrator.config.sections import Section
@@ -57,10 +57,16 @@ class References:
         if path.suffix.lower() not in YAML_SUFFIXES:
             self.report.add(place, f"{path.name} is no YAML file; its name should end in .yaml")
             return None
-        return self.file(path, model)
+        return self.file(path, model, place)
 
-    def file(self, path: Path, model: type[S]) -> tuple[S, Place] | None:
-        """The section that a whole file holds."""
+    def file(self, path: Path, model: type[S], named: Place | None = None) -> tuple[S, Place] | None:
+        """The section that a whole file holds.
+
+        Args:
+            path: of the file.
+            model: of the section.
+            named: where it is referred to; None where it was given by itself.
+        """
         key = (path, model)
         if key not in self._read:
             try:
@@ -71,7 +77,9 @@ class References:
             else:
                 kind = KINDS.get(model)
                 other = None if kind is None else wrong_kind(place.document, kind)
-                if other is not None:
+                if other is not None and named is not None:
+                    self.report.add(named, f"{shown_path(path)} {other.message}")
+                elif other is not None:
                     self.report.problems.append(other)
                 read = None if other is not None else validate(model, place, self.report)
                 self._read[key] = None if read is None else (read, place)

@@ -69,6 +69,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         ),
         parallel_simulations=file.parallel_simulations,
         on_unknown=file.on_unknown,
+        laboratory_source=((root.directory / file.laboratory).resolve() if isinstance(file.laboratory, str) else None),
     )
 
 

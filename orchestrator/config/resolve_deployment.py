@@ -5,12 +5,13 @@ from __future__ import annotations
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign import DeploymentSection, PricesSection, TrustSection
 from orchestrator.config.resolve_data import resolve_data
-from orchestrator.config.resolve_objectives import resolve_objectives
+from orchestrator.config.resolve_objectives import STOPS, resolve_objectives
 from orchestrator.config.scenes import SceneBuilder
 from orchestrator.config.yaml_source import Place
 from orchestrator.fingerprint import NEW_MODEL
 from orchestrator.plan import DeploymentPlan, PricesPlan, RiskPlan, TrustPlan
 from sim_engine.losses import Loss
+from sim_engine.space import Space
 from sim_engine.task import PoseError
 
 EXACT = PoseError(speed_factor=0.0)
@@ -66,6 +67,8 @@ def resolve_deployment(
         report.add(
             place.at("loss", "retained_weight"), f"belongs to spilled_and_retained, not to {loss.name}", key=True
         )
+    elif actions is not None and section.objectives is None:
+        _check_that_pouring_pays(section, actions, place.at("loss"), builder)
     scenes = []
     for receiver in receivers or [None]:
         name = "deployment" if receiver is None else f"deployment-{receiver.name}"
@@ -77,7 +80,7 @@ def resolve_deployment(
         if scene is None:
             break  # one cause, one message
     complete = tuple(scene for scene in scenes if scene is not None)
-    if len(complete) < len(receivers) or actions is None or strategy is None or pours is None:
+    if not complete or len(complete) < len(receivers) or actions is None or strategy is None or pours is None:
         return None
     risk = _resolve_risk(section, place, builder)
     objectives = resolve_objectives(section, place, complete[0], actions, report)
@@ -120,6 +123,25 @@ def resolve_deployment(
         tolerance=None if section.window is None else section.window.tolerance,
         prices=PricesPlan(prices.pour, prices.simulation, prices.worth) if free else None,
         plain=strategy == "D3" and model == "residual",
+    )
+
+
+def _check_that_pouring_pays(section: DeploymentSection, actions: Space, place: Place, builder: SceneBuilder) -> None:
+    """Where a pour may stop before anything has left, doing so must not be the best that there is."""
+    loss = section.loss
+    stops = [name for name in STOPS if name in actions.names]
+    if not stops or (loss.name == "spilled_and_retained" and loss.retained_weight != 0.0):
+        return
+    at, what = (
+        (place.at("retained_weight"), "with 0 the loss")
+        if loss.name == "spilled_and_retained"
+        else (place.at("name"), f"'{loss.name}'")
+    )
+    builder.report.add(
+        at,
+        f"{what} is least where next to nothing is poured, and with {' and '.join(stops)} searched a pour can stop so "
+        f"early; fix {' and '.join(stops)} under motion, use spilled_and_retained with a retained_weight above 0, or "
+        "'objectives' with their 'floor'",
     )
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from actors.virtual_ur.launcher import VirtualController
 from orchestrator.cli import app
-from orchestrator.commands.arming import Envelope, campaign_pours, envelope, pour_count
+from orchestrator.commands.arming import Envelope, accepted, campaign_pours, envelope, pour_count
 from orchestrator.config.load import load_campaign
 from orchestrator.safety import SafetyRecord, record_path, write_record
 from orchestrator.stages import stages_of
@@ -74,6 +74,17 @@ def test_settings_that_nobody_has_accepted_can_t_be_armed(campaign: Path) -> Non
     assert result.exit_code == 2
     assert "nobody has accepted" in result.stderr
     assert "decant doctor" in result.stderr
+
+
+def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path) -> None:
+    other = campaign.with_name("other.yaml")
+    other.write_text(campaign.with_name("rig.yaml").read_text().replace("name: rig", "name: other"))
+    result = decant("run", str(campaign), "--arm", "--laboratory", str(other))
+    assert result.exit_code == 2
+    assert "laboratory other: nobody has accepted" in result.stderr  # for rig.yaml, which the campaign names, somebody
+    assert "other.yaml" in result.stderr
+    write_record(other, SafetyRecord("0A0B0C0D", "2016300123", "ur10", "3.15.8", "2030-01-31", "a person"))
+    assert accepted(load_campaign(campaign, other)) == "0A0B0C0D"
 
 
 def test_a_wrong_name_moves_nothing(campaign: Path, controller: VirtualController) -> None:

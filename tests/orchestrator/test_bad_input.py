@@ -206,11 +206,35 @@ BAD_CAMPAIGNS = {
     "empty value": (CAMPAIGN, "name: test", "name:", "1:1: name: has no value; give one, or remove the key"),
     "missing key": (CAMPAIGN, "liquid: {name: water, mass: 200 g}\n", "", "key 'liquid' is missing; add for example"),
     "missing file": (CAMPAIGN, "beaker.yaml", "baeker.yaml", "4:9: pourer: no such file: "),
+    "vessel in place of a laboratory": (
+        CAMPAIGN,
+        "lab.yaml",
+        "cup.yaml",
+        "bad.yaml:2:13: laboratory: cup.yaml describes a vessel, but a laboratory is needed here",
+    ),
+    "laboratory in place of a vessel": (
+        CAMPAIGN,
+        "cup.yaml",
+        "lab.yaml",
+        "bad.yaml:5:11: receiver: lab.yaml describes a laboratory, but a vessel is needed here",
+    ),
     "mesh in place of a vessel": (
         CAMPAIGN,
         "cup.yaml",
         "cup.stl",
         "receiver: is a mesh; write {name: cup, mesh: cup.stl",
+    ),
+    "no receivers at all": (
+        DEPLOYED,
+        "strategy: D3",
+        "strategy: D3\n  receivers: []",
+        "bad.yaml:16:14: deployment.receivers: is empty; name at least one vessel",
+    ),
+    "no receivers at the top": (
+        DEPLOYED.replace("calibration:\n", "calibration:\n  receiver: cup.yaml\n"),
+        "receiver: cup.yaml",
+        "receivers: []",
+        "bad.yaml:5:12: receivers: is empty; name at least one vessel",
     ),
     "two receivers of one name": (
         CAMPAIGN + "deployment: {strategy: D2, pours: 3, receivers: [cup.yaml, cup.yaml], "
@@ -352,24 +376,47 @@ def test_bad_vessel_is_refused_with(case: str, folder: Path) -> None:
 def test_bad_mesh_is_refused_by_the_check_with_its_file(folder: Path) -> None:
     write(folder, "open.stl", TETRAHEDRON_WITH_A_HOLE)
     write(folder, "cup.yaml", "name: open\nmesh: open.stl\nunit: mm\n")
-    problems = check_campaign(load_campaign(write(folder, "campaign.yaml", CAMPAIGN)))
-    assert len(problems) == 1
-    assert "open.stl" in problems[0]
-    assert "watertight" in problems[0]
+    (problem,) = map(str, check_campaign(load_campaign(write(folder, "campaign.yaml", CAMPAIGN))))
+    assert problem.startswith("campaign.yaml:5:11: receiver: vessel 'open' (")
+    assert "open.stl" in problem
+    assert "watertight" in problem
 
 
 def test_vessel_that_is_too_small_is_refused_by_the_check(folder: Path) -> None:
     write(folder, "cup.yaml", VESSEL.replace("beaker", "thimble").replace("40", "12").replace("100", "30"))
-    problems = check_campaign(load_campaign(write(folder, "campaign.yaml", CAMPAIGN)))
-    assert any("receiver can't hold the water (200 g)" in problem and "thimble" in problem for problem in problems)
+    deployed = DEPLOYED.replace("strategy: D3", "strategy: D3\n  receivers: [beaker.yaml, cup.yaml]")
+    problems = map(str, check_campaign(load_campaign(write(folder, "campaign.yaml", deployed))))
+    small = [text for text in problems if "thimble holds" in text]
+    assert [text.partition(" ")[0] for text in small] == ["campaign.yaml:5:11:", "campaign.yaml:16:28:"]
+    assert all("receiver can't hold the water (200 g)" in text for text in small)
 
 
 def test_scene_in_which_all_actions_touch_is_refused_by_the_check(folder: Path) -> None:
     close = write(folder, "campaign.yaml", CAMPAIGN.replace("84 mm", "60 mm"))
-    problems = check_campaign(load_campaign(close))
-    assert len(problems) == 1
-    assert "calibration: the vessels touch at every action" in problems[0]
-    assert "x_offset" in problems[0]
+    (problem,) = map(str, check_campaign(load_campaign(close)))
+    assert problem.startswith(
+        "campaign.yaml:11:12: calibration.actions: calibration: the vessels touch at every action"
+    )
+    assert "x_offset" in problem
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("max_angle: 110 deg", "max_angle: 20 deg", "campaign.yaml:6:21: motion.max_angle"),
+        ("deg/s]}", "deg/s], max_angle: [10 deg, 20 deg]}", "campaign.yaml:11:65: calibration.actions.max_angle"),
+    ],
+)
+def test_campaign_that_can_never_pour_is_refused_by_the_check(folder: Path, old: str, new: str, place: str) -> None:
+    text = CAMPAIGN if "motion" in place else CAMPAIGN.replace("max_angle: 110 deg, ", "")
+    (problem,) = map(str, check_campaign(load_campaign(write(folder, "campaign.yaml", text.replace(old, new)))))
+    assert problem.startswith(
+        f"{place}: calibration: no action that was tried pours anything: max_angle is at most 20 deg"
+    )
+    # by quadrature a glass of 80 mm × 100 mm retains 208.4 mL at 56 deg and 199.3 mL at 57 deg; 200.4 mL are loaded
+    assert "the water (200 g) reaches the lip at 57 deg; raise max_angle" in problem
+    enough = write(folder, "campaign.yaml", CAMPAIGN.replace("max_angle: 110 deg", "max_angle: 60 deg"))
+    assert check_campaign(load_campaign(enough)) == []
 
 
 BAD_ASSIGNMENTS = {

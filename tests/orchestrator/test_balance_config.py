@@ -128,6 +128,9 @@ def test_the_balance_shown_on_that_page_is_one():
         (SIMPLE + "placment: tray", "hardware", r"did you mean 'placement'\?"),
         (SIMPLE + "settling: {span: 5 s, deadline: 2 s}", "hardware", r"'deadline' should be longer than 'span'"),
         (SIMPLE + "settling: {readings: 1}", "hardware", r"readings: 1 is too small; at least 2"),
+        (SIMPLE + "baud: 9601", "hardware", r"lab.yaml:3:7: baud: no balance talks at 9601 baud; .* 9600, "),
+        (SIMPLE + "step: 50 g", "hardware", r"lab.yaml:3:7: step: .* steps of 50 g can't tell .* load_tolerance, 5 g"),
+        ("virtual: {resolution: 2 g}\nload_tolerance: 1 g", "virtual", r"lab.yaml:1:23: virtual.resolution: a display"),
         (SIMPLE + "step: 0 g", "hardware", r"step: 0 g should be above 0"),
     ],
 )

@@ -11,7 +11,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import pytest
 import trimesh
@@ -19,6 +19,9 @@ from typer.testing import CliRunner
 
 from orchestrator.cli import app
 from orchestrator.commands import single
+from orchestrator.commands.options import Answer
+from orchestrator.strategies.trust import OPTIONS
+from orchestrator.unknown import LOST, REPEAT
 from sim_engine.spread import spreads
 from tests.end_to_end import small
 from tests.orchestrator import watched
@@ -116,7 +119,7 @@ BAD: dict[str, str] = {
     "run heavy.yaml": "narrow holds 113.1 mL to the brim, 120.2 mL asked for",
     "calibrate unwritable.yaml": "beaker.yaml/runs: can't be written: Not a directory",
     "plan unwritable.yaml": "beaker.yaml/runs: can't be written: Not a directory",
-    "run close.yaml": "close.yaml: deployment into 'narrow': the vessels touch at every action that was tried",
+    "run close.yaml": "deployment.actions: deployment into 'narrow': the vessels touch at every action that was",
     "run open-mesh.yaml": "open.stl: not watertight: 3 edge(s)",
     "run solid-mesh.yaml": "solid.stl: no cavity: the mesh is one closed skin",
     "run junk-mesh.yaml": "junk.stl: no triangles in it",
@@ -138,7 +141,7 @@ BAD: dict[str, str] = {
     "plan small.yaml --parameters gone.json": "gone.json: no such file",
     "plan small.yaml --receiver small.yaml": "small.yaml: describes a campaign, but a vessel is needed here",
     "plan small.yaml --receiver solid.stl": "is a mesh; describe the vessel in a YAML file: {name: solid, mesh:",
-    "plan small.yaml --receiver solid-cup.yaml": "solid.stl: no cavity",
+    "plan small.yaml --receiver solid-cup.yaml": "small.yaml: vessel 'solid' (",
     "simulate small.yaml --set angular_velocity=100": "x_offset has no value; add for example --set x_offset=80",
     f"{SIMULATE} --set x_ofset=80": "'x_ofset=80': unknown dimension 'x_ofset'; did you mean 'x_offset'?",
     f"{SIMULATE} --set x_offset=80": "'x_offset' is given twice; keep one",
@@ -423,3 +426,9 @@ def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pyte
     assert refused.exit_code == 2
     assert "ur-rtde" in refused.stderr
     assert "twin.yaml" in refused.stderr
+
+
+def test_help_of_answer_names_all_that_may_be_answered() -> None:
+    (option,) = get_args(Answer)[1:]
+    for answer in (LOST, REPEAT, "weighed", *OPTIONS):
+        assert f"'{answer}" in option.help

@@ -167,7 +167,7 @@ def test_another_tool_or_payload_than_the_file_s(laboratory: Path, controller: V
 
 def test_changed_safety_settings_are_shown_with_both_checksums(laboratory: Path, controller: VirtualController) -> None:
     doctor(laboratory, "--accept-safety")
-    before = accepted_checksum(laboratory)  # the file names itself: nothing else has a 'laboratory' key
+    before = accepted_checksum(laboratory)
     controller.fault("checksum", value="DEADBEEF")
     try:
         line = checked(laboratory)["safety checksum"]

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
+import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from math import degrees, radians
@@ -12,13 +16,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from actors.protocols import UnknownPourError
 from actors.virtual_ur.launcher import VirtualController
 from orchestrator.cli import app
-from orchestrator.journal import JournalReader
+from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.lanes import Deadlines, Lanes
+from orchestrator.plan import CampaignPlan
+from orchestrator.requests import Pour
 from orchestrator.safety import SafetyRecord, write_record
+from orchestrator.stages import scenes_of
 from orchestrator.states import State
+from sim_engine.action import Action
+from tests.end_to_end import small
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal
+from tests.orchestrator.toy import ToyBench, ToyLaboratory
 
 ADDRESS = "127.84.3.2"
 ACTION = ("--set", "angular_velocity=30", "--set", "x_offset=80")
@@ -126,6 +138,37 @@ def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, control
         assert terminal.end() == 1
     assert "nothing has moved" in terminal.screen
     assert controller.fault("state")["joints"] == before
+
+
+async def breaks_off(plan: CampaignPlan, laboratory: object, directory: Path, **_: object) -> None:
+    (directory / JOURNAL_NAME).touch()
+    bench = ToyBench(fails=lambda seed: UnknownPourError("protective stop. All weighings: pourer_full 512.1 g"))
+    lanes = Lanes(ToyLaboratory(bench=bench), scenes_of(plan), Deadlines(), 0.0)
+    scene, action = next(iter(scenes_of(plan).values())), Action(angular_velocity=1.0, x_offset=0.07, height=0.06)
+    await lanes.pour(Pour(scene.name, action, 1, 1), started=lambda: None, progress=lambda p: None)
+
+
+async def is_interrupted_twice(plan: CampaignPlan, laboratory: object, directory: Path, **_: object) -> None:
+    (directory / JOURNAL_NAME).touch()
+    for _again in range(2):
+        os.kill(os.getpid(), signal.SIGINT)
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(60.0)
+    raise asyncio.CancelledError
+
+
+@pytest.mark.parametrize(("ends", "code"), [(breaks_off, 3), (is_interrupted_twice, 130)])
+def test_pour_whose_outcome_is_unknown_doesn_t_promise_to_be_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: Callable[..., object], code: int
+) -> None:
+    monkeypatch.setattr("orchestrator.campaign.run_campaign", ends)
+    result = decant("pour", str(small.write_campaign(tmp_path)), *small.GOOD_ACTION, "--in-process")
+    assert result.exit_code == code, result.stderr
+    run = next((tmp_path / "runs").iterdir())
+    assert f"this pour is not resumed; what was weighed of it is in {run}" in result.stderr
+    told = result.stderr.replace("is not resumed", "")
+    for promise in ("resum", "paus", "nothing is lost", "Go on"):
+        assert promise not in told
 
 
 WEIGHTS = ("312.0 g", "412.1 g", "428.0 g", "431.2 g", "313.5 g")

@@ -104,7 +104,7 @@ def test_runs_from_before_the_other_strategies_can_be_gone_on_with(tmp_path: Pat
     assert new["calibration"]["thetas"] == 18
 
 
-# -- objectives ----------------------------------------------------------------------------------------------------
+# -- losses and objectives -----------------------------------------------------------------------------------------
 
 DEPLOYED = f"""\
 name: test
@@ -118,6 +118,35 @@ deployment:
   actions: {{angular_velocity: [15 deg/s, 120 deg/s], max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]}}
 """
 TARGET = "{name: target_volume, volume: 150 mL, tolerance: 2 mL}"
+
+
+LEAST_FOR_NOT_POURING = [
+    ("name: grams", "campaign.yaml:10:16: deployment.loss.name: 'grams' is least where next to nothing is poured"),
+    ("name: particles", "deployment.loss.name: 'particles' is least where next to nothing is poured"),
+    ("name: normalised", "deployment.loss.name: 'normalised' is least where next to nothing is poured"),
+    ("retained_weight: 0", "campaign.yaml:10:27: deployment.loss.retained_weight: with 0 the loss is least where next"),
+]
+
+
+@pytest.mark.parametrize("stop", ["max_angle: [70 deg, 125 deg]", "hold_time: [0 s, 3 s]"])
+@pytest.mark.parametrize(("loss", "expected"), LEAST_FOR_NOT_POURING)
+def test_a_loss_that_not_pouring_serves_best_is_refused_where_a_pour_may_stop_so_early(
+    loss: str, expected: str, stop: str, tmp_path: Path
+) -> None:
+    angle = "" if stop.startswith("max_angle") else "  motion: {max_angle: 120 deg}\n"
+    actions = f"actions: {{angular_velocity: [15 deg/s, 120 deg/s], {stop}}}"
+    text = f"{DEPLOYED[: DEPLOYED.index('actions')]}{actions}\n  loss: {{{loss}}}\n{angle}"
+    said = refusal(tmp_path, text)
+    assert expected in said
+    assert f"fix {stop.partition(':')[0]} under motion, use spilled_and_retained" in said
+    assert load(tmp_path, text.replace(loss, "retained_weight: 0.5")).deployment is not None
+
+
+@pytest.mark.parametrize("loss", [loss for loss, _ in LEAST_FOR_NOT_POURING])
+def test_any_loss_may_be_had_where_every_pour_empties_the_pourer(loss: str, tmp_path: Path) -> None:
+    text = DEPLOYED.replace(", max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]", "")
+    plan = load(tmp_path, f"{text}  motion: {{max_angle: 120 deg}}\n  loss: {{{loss}}}\n")
+    assert plan.deployment is not None
 
 
 def objectives(*parts: str, more: str = "") -> str:

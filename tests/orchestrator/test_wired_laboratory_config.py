@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,5 +173,18 @@ def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
     low = replace(plan, laboratory=replace(plan.laboratory, arm=replace(arm, limits=lower)))
     problems = check_campaign(low)
     assert len(problems) == 2
-    assert problems[0].startswith("calibration: the arm can make no action that was tried; for example")
-    assert "deployment into 'narrow'" in problems[1]
+    said = problems[0].message
+    assert said.startswith("calibration: the arm can make no action that was tried; for example")
+    assert re.search(r"for example angular_velocity \S+ deg/s  max_angle \S+ deg: the arm can't", said)  # as searched
+    assert "widen arm.limits.box" in said
+    assert problems[0].where == "calibration.actions"
+    assert "deployment into 'narrow'" in problems[1].message
+
+
+def test_an_arm_that_is_set_to_carry_less_than_the_liquid_is_refused():
+    plan = load_campaign(QUICKSTART)
+    assert plan.laboratory.arm is not None
+    weak = replace(plan, laboratory=replace(plan.laboratory, arm=replace(plan.laboratory.arm, payload=0.05)))
+    (problem,) = check_campaign(weak)
+    assert problem.where == "liquid.mass"
+    assert "set to carry 50 g (arm.payload), less than the water alone, 200 g" in problem.message

@@ -166,8 +166,14 @@ def _joint_speeds(s: Stretch) -> Iterator[str]:
         if speed > most * (1.0 + SLACK):
             yield (
                 f"{name} would turn at {math.degrees(speed):.0f} deg/s, {s.when(worst)}; "
-                f"{math.degrees(most):.0f} deg/s are allowed"
+                f"{math.degrees(most):.0f} deg/s are allowed: {_slower(s, 'joint_speed' if most < own else None)}"
             )
+
+
+def _slower(s: Stretch, limit: str | None) -> str:
+    """What to do about something too fast; `limit`: key of the laboratory's file that could allow it, if one can."""
+    lower = "angular_velocity or return_velocity" if s.name == "pour" else "approach_speed"
+    return f"lower {lower}" + ("" if limit is None else f", or raise arm.limits.{limit}")
 
 
 def _singular(s: Stretch) -> Iterator[str]:
@@ -202,13 +208,13 @@ def _speeds(s: Stretch, points: FloatArray) -> Iterator[str]:
     if speeds[worst] > s.spec.limits.tool_speed * (1.0 + SLACK):
         yield (
             f"tool or pourer would move at {speeds[worst]:.2f} m/s, {s.when(worst)}; "
-            f"{s.spec.limits.tool_speed:.2f} m/s are allowed"
+            f"{s.spec.limits.tool_speed:.2f} m/s are allowed: {_slower(s, 'tool_speed')}"
         )
     worst = _first_worst(s.turning)
     if s.turning[worst] > s.spec.limits.tilt_speed * (1.0 + 1e-4):
         yield (
             f"the pourer would turn at {math.degrees(s.turning[worst]):.0f} deg/s, {s.when(worst)}; "
-            f"{math.degrees(s.spec.limits.tilt_speed):.0f} deg/s are allowed"
+            f"{math.degrees(s.spec.limits.tilt_speed):.0f} deg/s are allowed: {_slower(s, 'tilt_speed')}"
         )
 
 
@@ -219,7 +225,8 @@ def _tilts(s: Stretch) -> Iterator[str]:
     if s.tilts[worst] > most * (1.0 + SLACK):
         yield (
             f"the pourer would lean {math.degrees(s.tilts[worst]):.1f} deg, {s.when(worst)}; "
-            f"{math.degrees(most):.1f} deg are allowed{' while it is full' if s.name == 'approach' else ''}"
+            f"{math.degrees(most):.1f} deg are allowed"
+            f"{' while it is full' if s.name == 'approach' else ': lower max_angle, or raise arm.limits.tilt'}"
         )
 
 
@@ -231,7 +238,7 @@ def _places(s: Stretch, points: FloatArray) -> Iterator[str]:
             for thing, where, value in _beyond(s, sign * np.eye(3)[k], sign * bound, points):
                 yield (
                     f"{thing} would leave the box at {axis} = {sign * value:.3f} m, {s.when(where)}; "
-                    f"at {word} {bound:.3f} m are allowed"
+                    f"at {word} {bound:.3f} m are allowed: move the receiver, or widen arm.limits.box"
                 )
     for number, plane in enumerate(limits.planes, 1):
         for thing, where, value in _beyond(s, np.array(plane.normal), plane.offset, points):
