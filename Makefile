@@ -1,12 +1,13 @@
 # Everything that a fresh machine needs is Python 3.11 to 3.13, git and make.
-#   make demo   sets up and runs the quickstart campaign on the virtual bench
-#   make test   sets up and runs all checks and tests
+#   make install   sets up, and nothing else
+#   make demo      sets up and runs the quickstart campaign on the virtual bench
+#   make test      sets up and runs all checks and tests
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint unit slow lock clean
+.PHONY: install demo test lint unit slow lock clean
 .DEFAULT_GOAL := demo
 
 $(READY): requirements.lock pyproject.toml
@@ -16,6 +17,8 @@ $(READY): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
+
+install: $(READY)
 
 demo: $(READY)
 	@bench=; $(BIN)/python -c 'import rtde_receive' 2>/dev/null || { bench="--laboratory configs/laboratories/twin.yaml"; \

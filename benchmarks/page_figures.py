@@ -9,7 +9,7 @@ from typing import Any
 from orchestrator.report import style
 
 COST, PASSES = "performance-cost.png", "performance-passes.png"
-MOMENTS = ("whole pour", "at rest", "in full flow")
+MOMENTS = ("whole pour", "in full flow")
 PASS_COLOURS = (
     *(style.MEASURED, style.PREDICTED, style.GOOD, style.BEST, style.FALLING, style.ESCAPED),
     *("#f0e442", "#555555", style.GREY, style.PALE),
@@ -53,7 +53,7 @@ def cost_figure(
 
 
 def passes_figure(path: Path, profile: Mapping[str, Any]) -> Path:
-    """Shares of the solver's passes as stacked bars, for the whole pour and its moments.
+    """Shares of the solver's passes as stacked bars, for the whole pour and its moment.
 
     Args:
         path: of the PNG.

@@ -140,16 +140,20 @@ def passes(record: Record | None, limit: Record | None) -> str:
         )
         for name in r[moments[0]]["share"]
     ]
+    if r["slower"] > 1.0:
+        clock = f"With the clock the pour takes {r['slower']:.2f} times as long"
+    else:
+        clock = "What the clock itself takes is within the noise of two pours"
     about = prose(
         f"""The solver's kernel with a clock built into it, around every pass, in one standard pour with
-        {r["particles"]:,} particles. With the clock the pour takes {r["slower"]:.2f} times as long; the passes make up
-        {100 * r["explained"]:.0f} % of what is then measured from outside."""
+        {r["particles"]:,} particles. {clock}; the passes make up {100 * r["explained"]:.0f} % of what is then measured
+        from outside."""
     )
     return f"""## {title}
 
 {about}
 
-{table(("pass", *moments, "calls a step"), rows, "lrrrr")}
+{table(("pass", *moments, "calls a step"), rows, "lrrr")}
 ![Share of each pass](images/{page_figures.PASSES})
 
 {_limit(r, limit)}{settings([record, limit] if limit else [record])}"""

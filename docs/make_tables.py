@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.config import arm_sections, campaign, cluster, laboratory, operator, vessel
+from orchestrator.config import arm_sections, campaign, cluster, laboratory, operator, study, vessel
 from orchestrator.config.quantities import Quantity
 from orchestrator.config.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.scenes import DEFAULTS, NEEDED
@@ -59,6 +59,12 @@ SECTIONS: dict[str, type[Section]] = {
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
     "pose-error": laboratory.PoseErrorSection,
+    "study": study.StudyFile,
+    "level": study.LevelSection,
+    "compared-calibrations": study.CalibrationsSection,
+    "compared-calibration": study.CalibrationArmSection,
+    "compared-deployments": study.DeploymentsSection,
+    "compared-deployment": study.DeploymentArmSection,
 }
 
 OF_SECTIONS = {
@@ -93,6 +99,13 @@ OF_SECTIONS = {
     "VesselFile": "[vessel](#vessels) or the path of its file",
     "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
     "LiquidFile": "[liquid](#liquid) or the path of its file",
+    "LevelSection": "[level](#studies)",
+    **{
+        model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"
+        for model in (study.CalibrationsSection, study.DeploymentsSection)
+    },
+    "CalibrationArmSection": "[mapping](#studies)",
+    "DeploymentArmSection": "[mapping](#studies)",
 }
 
 

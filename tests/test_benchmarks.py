@@ -202,6 +202,19 @@ def test_page_says_what_is_met_what_is_missed_and_what_is_not_measured(tmp_path:
     assert (tmp_path / "images" / "performance-cost.png").stat().st_size > 1000
 
 
+def test_a_clock_that_seems_to_save_time_is_called_noise() -> None:
+    import page_sections
+
+    moment = {"share": {"density": 1.0}, "calls_per_step": {"density": 1.3}}
+    result = {"particles": 2000, "whole pour": moment, "in full flow": moment, "explained": 0.9, "machine": MACHINE}
+    noise, cost = (
+        page_sections.passes({"command": "python profile", "result": {**result, "slower": slower}}, None)
+        for slower in (0.89, 1.25)
+    )
+    assert ("within the noise" in noise, "0.89" in noise) == (True, False)
+    assert ("within the noise" in cost, "1.25 times as long" in cost) == (False, True)
+
+
 def test_page_shows_a_result_of_any_shape() -> None:
     import make_page
 

@@ -64,7 +64,7 @@ def draw_figures(
         jobs["posterior"] = lambda: draw_posterior(directory / "posterior.png", posterior, space, theta)
     if evaluation is not None and (groups := discrepancy_groups(evaluation, baselines)):
         jobs["test discrepancy"] = lambda: draw_discrepancy(
-            directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the scale: {plan.name}"
+            directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the balance: {plan.name}"
         )
     if plan.deployment is not None:
         unit = deployment_unit(plan.deployment)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from rich.table import Table
 
-    from sim_engine.validation.result import CaseResult, Figure
+    from sim_engine.validation.result import CaseResult, Figure, Series
     from sim_engine.validation.suite import Case
 
 PAGE_NAME, DATA_NAME, IMAGES = "validation.md", "validation.json", "images"
@@ -25,6 +25,9 @@ PANELS_ABREAST = 3
 """More panels than these go into further rows."""
 
 AGAIN = "decant physics --full --write docs"
+
+REFERENCES = (("--", "o"), (":", "s"), ("-.", "^"), ((0, (6, 2)), "D"))
+"""Line style, or marker where there are few points, of several references in a panel."""
 
 COLOURS = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST, style.FALLING, style.ESCAPED)
 
@@ -111,16 +114,21 @@ def draw(figure: Figure, path: Path) -> Path:
 
 
 def _panel(axes: Axes, figure: Figure, number: int) -> None:
-    colours = iter(COLOURS * 4)
-    for series in (s for s in figure.series if s.panel == number):
+    here = [s for s in figure.series if s.panel == number]
+    measured = [s for s in here if s.kind == "measured"]
+    colours = dict(zip(map(id, measured), COLOURS * 4, strict=False))
+    of_subject = {_subject(s): colours[id(s)] for s in reversed(measured)}
+    looks = iter(REFERENCES * 4)
+    for series in here:
         if series.kind == "reference":
+            line, marker = next(looks)
             few = len(series.x) < 20 and len(series.x) > 2
             axes.plot(
-                series.x, series.y, color=style.INK, lw=1.0, ls="" if few else "--", marker="o" if few else None,
-                ms=4, mfc="white", label=series.name, zorder=3,
+                series.x, series.y, color=of_subject.get(_subject(series), style.INK), lw=1.2, ls="" if few else line,
+                marker=marker if few else None, ms=4, mfc="white", label=series.name, zorder=3,
             )  # fmt: skip
         else:
-            colour = next(colours)
+            colour = colours[id(series)]
             axes.plot(series.x, series.y, color=colour, lw=1.4, label=series.name)
             if series.spread:
                 low, high = ([y + side * s for y, s in zip(series.y, series.spread, strict=True)] for side in (-1, 1))
@@ -132,6 +140,11 @@ def _panel(axes: Axes, figure: Figure, number: int) -> None:
         axes.minorticks_off()
     style.dress(axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both")
     axes.legend(fontsize=8, framealpha=0.85, edgecolor="none")
+
+
+def _subject(series: Series) -> str:
+    """What a curve and its reference have in common: 'cone' of 'cone, 2,000 particles' and of 'cone, at rest'."""
+    return series.name.split(", ", maxsplit=1)[0]
 
 
 def case_record(case: Case, result: CaseResult, image: Path | None, fingerprint: str) -> dict[str, Any]:

@@ -91,7 +91,8 @@ class Series:
     Attributes:
         name: legend.
         x, y: SI.
-        kind: how it is drawn: 'measured' curves differ in colour, a 'reference' is black.
+        kind: how it is drawn: 'measured' curves differ in colour; a 'reference' is dashed, or points if it has few. It
+            has the colour of the curve whose name begins as its own up to a comma, and is black if none does.
         panel: figures of several panels: which one.
         spread: standard deviation at each point, drawn as a band; empty: none.
     """

@@ -309,7 +309,11 @@ def effects(records: Sequence[Mapping[str, Any]]) -> list[Effect]:
 
 
 def sensitivity_figure(found: list[Sensitivity], base: SimulationParameters) -> Figure:
-    """A panel for each parameter, a curve for each pour, with the standard deviation of its seeds as a band."""
+    """A panel for each parameter, a curve for each pour, with the standard deviation of its seeds as a band.
+
+    Args:
+        base: where each parameter is held while another is turned.
+    """
     infos = SimulationParameters.info()
     names = [name for name in infos if any(one.parameter == name for one in found)]
     curves = []
@@ -319,8 +323,8 @@ def sensitivity_figure(found: list[Sensitivity], base: SimulationParameters) -> 
         )
     top = max((mean for one in found for mean in one.means), default=1.0)
     for panel, name in enumerate(names):
-        default = float(getattr(base, name))
-        curves.append(Series("default", (default, default), (0.0, top), "reference", panel))
+        held = float(getattr(base, name))
+        curves.append(Series("held at", (held, held), (0.0, top), "reference", panel))
     units = [infos[name].unit for name in names]
     return Figure(
         tuple(name.replace("_", " ") for name in names),

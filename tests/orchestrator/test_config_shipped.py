@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -11,11 +12,12 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from actors.bench.planning import planner
 from orchestrator.config.check import check_campaign
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
 from orchestrator.config.schema import campaign_schema, laboratory_schema, schema_text, study_schema, vessel_schema
 from orchestrator.config.yaml_source import Document
-from sim_engine.action import DEG
+from sim_engine.action import DEG, Action
 from sim_engine.vessel.spec import MeshShape
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -73,6 +75,28 @@ def test_schema_refuses_what_an_editor_should_underline() -> None:
         good | {"actions": {"x_offset": ["80 mm"]}},
     ):
         assert not validator.is_valid(bad)
+
+
+def test_first_pours_of_a_real_arm_fit_the_limits_of_its_first_day(tmp_path: Path) -> None:
+    text = (CONFIGS / "laboratories" / "ur10-kern.yaml").read_text(encoding="utf-8")
+    page = (CONFIGS.parent / "docs" / "commissioning.md").read_text(encoding="utf-8")
+    for usual, first_day in (("tool_speed: 800 mm/s", "tool_speed: 250 mm/s"), ("130 deg/s", "45 deg/s")):
+        assert usual in text
+        assert first_day in page
+        text = text.replace(usual, first_day)
+    slow = tmp_path / "rig.yaml"
+    slow.write_text(text, encoding="utf-8")
+    plan = load_campaign(CONFIGS / "campaigns" / "first-pour.yaml", slow)
+    assert check_campaign(plan) == []
+    assert plan.deployment is not None
+    assert plan.laboratory.arm is not None
+    assert (plan.laboratory.mode, plan.deployment.strategy, plan.deployment.pours) == ("hardware", "D2", 3)
+    scene, plan_path = plan.deployment.scenes[0], planner(plan.laboratory.arm)
+    speeds, offsets = ([axis.lower, axis.upper] for axis in plan.deployment.actions.axes)
+    for speed, offset in itertools.product(speeds, offsets):
+        action = Action(**scene.fixed, angular_velocity=speed, x_offset=offset)
+        report = plan_path(scene, action).report  # refuses what the arm can't do
+        assert report.tool_speed <= 0.25
 
 
 def test_recorded_campaign_describes_the_scene_of_its_records() -> None:

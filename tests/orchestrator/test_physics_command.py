@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from orchestrator.cli import app
 from orchestrator.report import physics as report
+from orchestrator.report.style import INK, new_figure
 from sim_engine.validation import suite
 from sim_engine.validation.result import CaseResult, Figure, Measurement, Series, reported, within
 
@@ -130,6 +131,29 @@ def test_many_panels_go_into_rows_and_spreads_are_bands(tmp_path: Path) -> None:
     assert four.shape[0] > 1.8 * three.shape[0]
     plain, banded = picture(1), picture(1, (0.05, 0.05, 0.05))
     assert banded.mean() < plain.mean() - 0.003  # a band darkens
+
+
+def test_references_can_be_told_apart_and_have_their_curve_s_colour() -> None:
+    few, many = (1.0, 2.0, 3.0), tuple(float(i) for i in range(30))
+    curves = (
+        Series("cone, 2,000 particles", many, many),
+        Series("cone, 5,000 particles", many, many),
+        Series("cone, experiment", few, few, "reference"),
+        Series("jug, 2,000 particles", many, many),
+        Series("jug, experiment", few, few, "reference"),
+        Series("theory, C_d 1", many, many, "reference"),
+        Series("theory, C_d 0.61", many, many, "reference"),
+    )
+    axes = new_figure(size=(3, 2))[1]
+    report._panel(axes, Figure(("",), ("",), ("",), curves), 0)
+    drawn = {line.get_label(): line for line in axes.get_lines()}
+    for subject in ("cone", "jug"):
+        curve, points = drawn[f"{subject}, 2,000 particles"], drawn[f"{subject}, experiment"]
+        assert (points.get_color(), points.get_linestyle()) == (curve.get_color(), "None")
+    assert drawn["cone, experiment"].get_marker() != drawn["jug, experiment"].get_marker()
+    theories = [drawn[f"theory, C_d {c}"] for c in ("1", "0.61")]
+    assert {line.get_color() for line in theories} == {INK}
+    assert len({line.get_linestyle() for line in theories}) == 2
 
 
 def test_a_fault_of_the_solver_does_not_pass() -> None:

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from orchestrator.config.study import load_study
+from orchestrator.report.study.deployments import draw_deployments
+from orchestrator.report.study.drawing import look
 from orchestrator.report.study.effects import effect
 from orchestrator.report.study.gather import at_pour, gather, running_least
 from orchestrator.report.study.intervals import estimate
@@ -114,6 +116,48 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
     assert float(first["total_seconds"]) == 4 * 25 + 90
     needed = rows(tmp_path, "table-pours")[0]
     assert (float(needed["D2"]), float(needed["D3"])) == (3, 1), "D3 is at its first pour where D2 is at its last"
+
+
+def test_no_two_arms_of_a_figure_look_alike() -> None:
+    arms = ["D1-5", "D1-15", "D1-10", "D2", "D2-paper", "D3", "D3-paper"]
+    looks = [look(arm, arms) for arm in arms]
+    assert len({one.colour for one in looks}) == len(arms)
+    planned = [look(arm, arms) for arm in ("D1-5", "D1-10", "D1-15")]
+    assert len({one.hatch for one in planned}) == len({one.line for one in planned}) == 3, (
+        "in print without colours too"
+    )
+    brightness = [sum(bytes.fromhex(one.colour[1:])) for one in planned]
+    assert brightness == sorted(brightness, reverse=True), "darker with more iterations, whatever the order of the arms"
+    for name in ("C4", "D2", "D3"):
+        ours, theirs = look(name, [name, f"{name}-paper"]), look(f"{name}-paper", [name, f"{name}-paper"])
+        assert ours.colour != theirs.colour
+        assert (theirs.line, theirs.hatch) == ("--", "//")
+    assert look("D1-5", ["D1-5", "D2"]).hatch == "", "alone it needs none"
+
+
+def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: StudyPlan) -> None:
+    found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
+    for key in [key for key in found.losses if key.level == "small"]:
+        del found.losses[key]
+    for key in found.losses:
+        if key.arm == "D3":
+            found.losses[key] = [[0.004, 0.0, 0.0], [0.004, 0.0, 0.0]]
+    figure = next(one for one in draw_deployments(study, found) if one.number == "6")
+    for axes in figure.figure.axes:
+        assert axes.get_yscale() == "log"
+        (hybrid,) = [line for line in axes.get_lines() if line.get_label() == "D3"]
+        assert list(hybrid.get_ydata()) == pytest.approx([0.4, 0.01, 0.01])
+    assert "less than 0.01 %" in figure.caption
+    assert [row[5] for row in figure.rows if row[2] == "D3"][1] == 0.0, "the numbers are what was measured"
+
+
+def test_an_arm_that_its_first_panel_lacks_is_in_the_legend(study: StudyPlan) -> None:
+    found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
+    lacking = next(key for key in found.losses if key.arm == "D3")
+    found.losses[lacking] = []
+    for one in draw_deployments(study, found):
+        if one.number != "7":  # of one level only
+            assert "D3" in [text.get_text() for text in one.figure.legends[0].get_texts()], one.number
 
 
 def test_effects_are_differences_within_repetitions() -> None:

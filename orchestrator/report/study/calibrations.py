@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from orchestrator.report import style
-from orchestrator.report.study.drawing import Drawn, colour
+from orchestrator.report.study.drawing import Drawn, colour, look, strategy_of
 from orchestrator.report.study.gather import UNCALIBRATED, Calibrated, Gathered, mean, running_least
 from orchestrator.report.study.intervals import Estimate, estimate
 from orchestrator.study.plan import StudyPlan
@@ -71,7 +71,7 @@ def _against_simulations(known: Mapping[str, Calibrated]) -> Drawn:
         if len(points) == 1:
             axes.errorbar(spent, means, yerr=error(points[0][1]), fmt="s", color=colour(name), capsize=4, label=name)
         else:
-            axes.plot(spent, means, color=colour(name), label=name)
+            axes.plot(spent, means, look(name, list(known)).line, color=colour(name), label=name)
             low, high = [p[1].low for p in points], [p[1].high for p in points]
             axes.fill_between(spent, low, high, color=colour(name), alpha=0.2, linewidth=0)
     axes.set_xscale("log")
@@ -94,11 +94,11 @@ def _against_simulations(known: Mapping[str, Calibrated]) -> Drawn:
 def _curve(name: str, result: Mapping[str, Any], expected: list[list[float]]) -> list[tuple[int, float]]:
     """(simulations, best discrepancy so far)."""
     final = (int(result["simulations"]), float(result["predicted_discrepancy"]))
-    if name == "C3":
+    if strategy_of(name) == "C3":
         each = result["training_pours"]
         values = [float("nan") if t["discrepancy"] is None else t["discrepancy"] for t in result["trials"]]
         return [(each * (i + 1), value) for i, value in enumerate(running_least(values))]
-    if name.startswith("C4"):
+    if strategy_of(name) == "C4":
         best = running_least([max(value, 0.0) for _, value in expected])
         return [(int(spent), value) for (spent, _), value in zip(expected, best, strict=True)]
     return [final]
@@ -116,7 +116,7 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Calibrated]) -> Drawn:
         searched = one.results[0]["searched"]
         names = list(maps[0]["over"]) if maps else (searched * 2)[:2]
         settings = {"cmap": "viridis", "vmin": 0.0, "vmax": top}
-        if name in ("C1", "C2"):
+        if strategy_of(name) in ("C1", "C2"):
             tried: dict[tuple[float, float], list[float]] = {}
             for result in one.results:
                 for trial in result["trials"]:

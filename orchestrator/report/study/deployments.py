@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from orchestrator.report import style
 from orchestrator.report.study.calibrations import error
-from orchestrator.report.study.drawing import Drawn, colour, line
+from orchestrator.report.study.drawing import Drawn, colour, legend, log_axis, look
 from orchestrator.report.study.gather import Gathered, Key, at_pour, mean
 from orchestrator.report.study.intervals import Estimate, estimate
-from orchestrator.report.units import deployment_unit
+from orchestrator.report.units import LossUnit, deployment_unit
 from orchestrator.study.cells import deployment_simulations
 from orchestrator.study.plan import StudyPlan
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SECONDS_OF_SIMULATION = (0.1, 1.0, 25.0)
 SECONDS_OF_POUR = (5.0, 90.0, 600.0)
@@ -44,8 +50,17 @@ def checkpoints(study: StudyPlan, wanted: tuple[int, ...] = CHECKPOINTS) -> list
     return sorted({min(pour, most_pours(study)) for pour in wanted})
 
 
-def _bars(axes: object, place: float, width: float, one: Estimate, arm: str, label: str | None) -> None:
-    axes.bar(place, one.mean, width, color=colour(arm), yerr=error(one), capsize=3, label=label, alpha=0.9)  # type: ignore[attr-defined]
+def _bar(axes: Axes, place: float, width: float, one: Estimate, arm: str, arms: Sequence[str]) -> None:
+    shown = look(arm, arms)
+    axes.bar(
+        place, one.mean, width, color=shown.colour, hatch=shown.hatch, edgecolor="white", linewidth=0.0,
+        yerr=error(one), capsize=2, error_kw={"linewidth": 1.2}, label=arm,
+    )  # fmt: skip
+
+
+def least_shown(unit: LossUnit) -> float:
+    """What less is drawn at where axes are logarithmic: the last place that means something."""
+    return 10.0**-unit.decimals
 
 
 def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
@@ -59,10 +74,10 @@ def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
             for j, arm in enumerate(arms):
                 one = estimate(at_pour(found.best_so_far(Key(level, receiver, arm)), pour)).scaled(unit.factor)
                 rows.append([level, receiver, arm, pour, one.count, one.mean, one.low, one.high])
-                _bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
+                _bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
         axes.set_xticks(range(len(pours)), [str(pour) for pour in pours])
         style.dress(axes, title=f"{level} mismatch", x="pours", y=f"least {unit.label}" if level == levels[0] else "")
-    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    legend(figure, arms)
     return Drawn(
         "figure-5a",
         "5a",
@@ -86,10 +101,10 @@ def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
                 losses = found.losses.get(Key(level, receiver, arm), [])
                 one = estimate([mean(pours) for pours in losses]).scaled(unit.factor)
                 rows.append([level, receiver, arm, one.count, one.mean, one.low, one.high])
-                _bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
+                _bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
         axes.set_xticks(range(len(receivers)), receivers)
         style.dress(axes, title=f"{level} mismatch", y=f"mean {unit.label}" if level == levels[0] else "")
-    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    legend(figure, arms)
     return Drawn(
         "figure-5b",
         "5b",
@@ -106,6 +121,7 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
     from matplotlib.ticker import MaxNLocator
 
     unit, numbers = deployment_unit(study.deployments[0].plan), list(range(1, most_pours(study) + 1))
+    least = least_shown(unit)
     size = (1.2 + 3.4 * len(receivers), 0.8 + 2.8 * len(levels))
     figure, grid = style.new_figure(len(levels), len(receivers), size=size, squeeze=False, sharex=True, sharey=True)
     rows: list[list[object]] = []
@@ -118,28 +134,32 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
                     continue
                 points = [estimate(at_pour(curves, pour)).scaled(unit.factor) for pour in numbers]
                 rows += [[level, receiver, arm, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points)]  # noqa: B905
-                axes.plot(numbers, [e.mean for e in points], line(arm, arms), color=colour(arm), label=arm)
-                low, high = [e.low for e in points], [e.high for e in points]
-                axes.fill_between(numbers, low, high, color=colour(arm), alpha=0.15, linewidth=0)
+                shown = look(arm, arms)
+                middle, low, high = ([max(v, least) for v in values] for values in zip(*map(_ends, points)))  # noqa: B905
+                axes.plot(numbers, middle, shown.line, color=shown.colour, label=arm)
+                axes.fill_between(numbers, low, high, color=shown.colour, alpha=0.15, linewidth=0)
             x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if j == 0 else ""
             style.dress(axes, title=f"{receiver}, {level} mismatch", x=x, y=y, grid="both")
-            axes.set_ylim(bottom=0.0)
+            log_axis(axes.yaxis)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    legend(figure, arms)
     return Drawn(
         "figure-6",
         "6",
         "Least loss so far against real pours",
-        "Mean over repetitions with 95 % intervals. D1 is planned in simulation alone and poured once.",
+        "Mean over repetitions with 95 % intervals, on a logarithmic axis: less than "
+        f"{least:g} {unit.unit}, nothing too, is drawn there. D1 is planned in simulation alone and poured once.",
         figure,
         ("level", "receiver", "strategy", "pour", "repetitions", f"least_{unit.unit}", "low", "high"),
         rows,
     )
 
 
-def _prices(study: StudyPlan, found: Gathered) -> Drawn:
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+def _ends(one: Estimate) -> tuple[float, float, float]:
+    return one.mean, one.low, one.high
 
+
+def _prices(study: StudyPlan, found: Gathered) -> Drawn:
     levels, receivers, arms = places(study, found)
     level = study.compared if study.compared in levels else levels[0]
     unit = deployment_unit(study.deployments[0].plan)
@@ -154,30 +174,28 @@ def _prices(study: StudyPlan, found: Gathered) -> Drawn:
                 if not times:
                     continue
                 rows += [[level, simulation, pour, arm, t, unit.factor * v] for t, v in zip(times, values)]  # noqa: B905
-                shown = [max(unit.factor * value, 0.01) for value in values]
+                shown = [max(unit.factor * value, least_shown(unit)) for value in values]
                 if arm.startswith("D1"):
                     planned += list(zip(times, shown))  # noqa: B905
                 else:
-                    axes.plot(times, shown, ".-", color=colour(arm), label=arm, markersize=4)
+                    style_of = look(arm, arms)
+                    axes.plot(times, shown, style_of.line, marker=".", color=style_of.colour, label=arm, markersize=4)
             if planned:
                 planned.sort()
                 axes.plot(*np.transpose(planned), "s--", color=colour("D1"), label="D1", markersize=5)
-            axes.set_xscale("log")
-            axes.set_yscale("log")
             for axis in (axes.xaxis, axes.yaxis):
-                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                axis.set_major_formatter(FormatStrFormatter("%g"))
-                axis.set_minor_formatter(NullFormatter())
+                log_axis(axis)
             x, y = "total time [s]" if i == shape[0] - 1 else "", f"least {unit.label}" if j == 0 else ""
             style.dress(axes, title=f"{simulation:g} s a simulation, {pour:g} s a pour", x=x, y=y, grid="both")
-    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    legend(figure, ["D1", *arms])
     return Drawn(
         "figure-7",
         "7",
         "What pays off at which prices",
         f"Least loss so far, mean over repetitions and receivers ({level} mismatch), against the time that it would "
         "have taken at hypothesised prices. D3's simulations beside a pour cost time only where they take longer than "
-        "the pour. Calibration is not counted: D1 and D3 share it.",
+        "the pour. Calibration is not counted: D1 and D3 share it. "
+        f"Less than {least_shown(unit):g} {unit.unit} is drawn there.",
         figure,
         ("level", "seconds_per_simulation", "seconds_per_pour", "strategy", "total_seconds", f"least_{unit.unit}"),
         rows,

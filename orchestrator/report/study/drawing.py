@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from orchestrator.report import style
 
 if TYPE_CHECKING:
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 COLOURS = {
@@ -22,12 +23,37 @@ COLOURS = {
     "C4-paper": style.ESCAPED,
     "D1": style.PREDICTED,
     "D2": style.MEASURED,
-    "D2-paper": style.ESCAPED,
+    "D2-paper": style.FALLING,
     "D3": style.BEST,
     "D3-paper": style.GOOD,
 }
-LINES = ("-", "--", ":", "-.")
-"""Of several D1, the longest first."""
+PAPER = "-paper"
+"""End of the label of a strategy as the paper has it: hatched and dashed."""
+
+LINES = (":", "--", "-", "-.")
+HATCHES = ("..", "//", "", "xx")
+"""Of several D1, by iterations."""
+
+MOST_ABREAST = 8
+"""Entries of a legend's row."""
+
+PALEST, DARKEST = 0.45, -0.35
+"""Shades of several D1, from the fewest iterations to the most: share of white, or below zero of ink, in the colour."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one arm is drawn; no two of a figure share it, and none is told by its colour alone that has kin.
+
+    Attributes:
+        colour: of lines and bars.
+        line: style of its lines.
+        hatch: of its bars.
+    """
+
+    colour: str
+    line: str
+    hatch: str
 
 
 @dataclass
@@ -66,11 +92,60 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
 
 
 def colour(arm: str) -> str:
-    """Of a strategy; all D1 have one."""
-    return COLOURS.get(arm) or COLOURS[arm.split("-", maxsplit=1)[0]]
+    """Of a strategy; all D1 have one, and a label that is not known that of its strategy."""
+    return COLOURS.get(arm) or COLOURS[strategy_of(arm)]
 
 
-def line(arm: str, arms: Sequence[str]) -> str:
-    """Line style: several D1 are told apart by it."""
-    alike = [other for other in arms if colour(other) == colour(arm)]
-    return LINES[min(alike[::-1].index(arm), len(LINES) - 1)]
+def strategy_of(arm: str) -> str:
+    """The strategy of an arm's label: 'D1' of 'D1-15', 'D3' of 'D3-paper'."""
+    return arm.split("-", maxsplit=1)[0]
+
+
+def look(arm: str, arms: Sequence[str]) -> Look:
+    """How an arm is drawn beside others.
+
+    Args:
+        arm: its label.
+        arms: all of the figure, this one among them.
+    """
+    if arm.endswith(PAPER):
+        return Look(colour(arm), "--", "//")
+    kin = sorted((other for other in arms if _iterations(other) is not None), key=lambda other: _iterations(other) or 0)
+    if arm not in kin or len(kin) == 1:
+        return Look(colour(arm), "-", "")
+    place = kin.index(arm)
+    share = PALEST + (DARKEST - PALEST) * place / (len(kin) - 1)
+    return Look(_shade(colour(arm), share), LINES[place % len(LINES)], HATCHES[place % len(HATCHES)])
+
+
+def _iterations(arm: str) -> int | None:
+    strategy, _, number = arm.partition("-")
+    return int(number) if strategy == "D1" and number.isdigit() else None
+
+
+def _shade(colour: str, share: float) -> str:
+    """A colour with so much white in it, or ink where the share is negative."""
+    from matplotlib.colors import to_hex, to_rgb
+
+    (r, g, b), other = to_rgb(colour), to_rgb("white" if share > 0 else style.INK)
+    keep, add = 1 - abs(share), abs(share)
+    return to_hex((keep * r + add * other[0], keep * g + add * other[1], keep * b + add * other[2]))
+
+
+def log_axis(axis: Axis) -> None:
+    """A logarithmic axis whose ticks are numbers that people read: 0.5, 1, 2, 5, 10."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    axes = axis.axes
+    (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def legend(figure: Figure, arms: Sequence[str]) -> None:
+    """One legend for all panels below them, in the arms' order; an arm may be missing in some of the panels."""
+    handles = {name: h for axes in figure.axes for h, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    names = [arm for arm in arms if arm in handles]
+    columns = -(-len(names) // -(-len(names) // MOST_ABREAST))
+    figure.legend([handles[n] for n in names], names, loc="outside lower center", ncols=columns, frameon=False)
