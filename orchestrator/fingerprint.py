@@ -86,7 +86,7 @@ def deployment_as_begun(today: DeploymentPlan, before: Mapping[str, Any]) -> Dep
 
 
 def without_newest(section: dict[str, Any]) -> dict[str, Any]:
-    """A calibration's or deployment's JSON without those of the newest fields that change nothing, as it was written before them."""
+    """A calibration's or deployment's JSON as before the newest fields, as far as these change nothing."""
     unused = {name: _YOUNGER["deployment"][name] for name in _NEWEST}
     return {name: value for name, value in section.items() if name not in unused or value != unused[name]}
 

@@ -165,7 +165,8 @@ class StudyFile(Section):
     """In place of the campaign's parameters of the same names: a value fixes one, a range has it searched."""
 
     search: list[Text] | None = None
-    """Which of the campaign's searched parameters are searched; the others have the middle of what they may be."""
+    """Which of the campaign's searched parameters are searched; the others keep the default, or what comes nearest to it
+    within the campaign's range."""
 
     pours: PositiveCount | None = None
     """Calibration pours of a repetition, in place of the campaign's."""

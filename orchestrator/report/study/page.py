@@ -29,8 +29,9 @@ _RESAMPLED = (
     "A repetition resamples the pours: errors of grip and placement, the liquid's initial positions and the balance's "
     "noise; which of the calibration's actions are kept for testing; and the strategies' own seeds. Actions of the "
     "calibration pours are the same in every repetition, so that C1's grid is simulated once and scored for each. "
-    "C1 to C4 of a repetition share its pours; D1 and D3 simulate with the θ* that C4 found in it. Intervals are "
-    "percentile bootstraps over repetitions; with ten or fewer they are rather too narrow than too wide."
+    "C1 to C4 of a repetition share its pours; D1 and D3 simulate with the θ* that C4 found in it. Intervals of means "
+    "are Student's t over repetitions, those of differences Student's t of the repetitions' differences: they cover "
+    "95 % where repetitions scatter about normally, and those of shares end at 0 and 100 %."
 )
 
 
