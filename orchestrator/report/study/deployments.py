@@ -59,7 +59,8 @@ def checkpoints(study: StudyPlan, wanted: tuple[int, ...] = CHECKPOINTS) -> list
     return sorted({min(pour, most_pours(study)) for pour in wanted})
 
 
-def _bars(axes: object, place: float, width: float, one: Estimate, arm: str, label: str | None) -> None:
+def bars(axes: object, place: float, width: float, one: Estimate, arm: str, label: str | None) -> None:
+    """A bar with its interval."""
     axes.bar(place, one.mean, width, color=colour(arm), yerr=error(one), capsize=3, label=label, alpha=0.9)  # type: ignore[attr-defined]
 
 
@@ -74,7 +75,7 @@ def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
             for j, arm in enumerate(arms):
                 one = mean_loss(study, at_pour(found.best_so_far(Key(level, receiver, arm)), pour))
                 rows.append([level, receiver, arm, pour, one.count, one.mean, one.low, one.high])
-                _bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
+                bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
         axes.set_xticks(range(len(pours)), [str(pour) for pour in pours])
         style.dress(axes, title=f"{level} mismatch", x="pours", y=f"least {unit.label}" if level == levels[0] else "")
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
@@ -101,7 +102,7 @@ def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
                 losses = found.losses.get(Key(level, receiver, arm), [])
                 one = mean_loss(study, [mean(pours) for pours in losses])
                 rows.append([level, receiver, arm, one.count, one.mean, one.low, one.high])
-                _bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
+                bars(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arm if i == 0 else None)
         axes.set_xticks(range(len(receivers)), receivers)
         style.dress(axes, title=f"{level} mismatch", y=f"mean {unit.label}" if level == levels[0] else "")
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from orchestrator.report.study.deployments import checkpoints, loss_range, mean_loss, most_pours, places
 from orchestrator.report.study.effects import ALL, Effect, at_pour_of, effect, tests_of
+from orchestrator.report.study.finals import CAPTION, final_effects, final_rows
 from orchestrator.report.study.gather import UNCALIBRATED, Gathered, Key, at_pour, mean
 from orchestrator.report.study.intervals import SHARE, Estimate, estimate, statistic
 from orchestrator.report.units import deployment_unit
@@ -22,9 +23,9 @@ _PAIRED = (
     "Mean differences, paired by repetition, level and receiver [95 % t interval of these differences]; below 0 the "
     "first is better. C1 to C4 of a repetition share its weighed pours and the seeds that they are scored with. "
     "Deployments share the bench's systematic errors, and all but D2 the θ* of the repetition; the chance errors of "
-    "their pours are drawn for each. Probability: that chance alone gives such a difference (sign changes of the "
-    "repetitions' differences); '—' below five repetitions. Many rows are tested: one in twenty is below 0.05 by "
-    "chance."
+    "their pours are drawn for each, but final actions' pours share them one by one. Probability: that chance alone "
+    "gives such a difference (sign changes of the repetitions' differences); '—' below five repetitions. Many rows "
+    "are tested: one in twenty is below 0.05 by chance."
 )
 _NEEDED = (
     "The loss that both D2 and D3 reach: the larger of their mean least losses after the last pour. Pours until the "
@@ -63,7 +64,11 @@ def tables(study: StudyPlan, found: Gathered) -> list[Table]:
     made = []
     if found.calibrated:
         made.append(_calibrations(study, found))
-    if rows := [*_calibration_effects(study, found), *_deployment_effects(study, found)]:
+    if rows := [
+        *_calibration_effects(study, found),
+        *_deployment_effects(study, found),
+        *_final_effects(study, found),
+    ]:
         made.append(
             Table(
                 "table-effects",
@@ -73,6 +78,8 @@ def tables(study: StudyPlan, found: Gathered) -> list[Table]:
                 rows,
             )
         )
+    if found.finals:
+        made.append(Table("table-final", "The recommended action, poured again", CAPTION, *final_rows(study, found)))
     if found.losses:
         made.append(_deployments(study, found))
         if rows := _needed(study, found):
@@ -152,6 +159,16 @@ def _deployment_effects(study: StudyPlan, found: Gathered) -> list[list[str | in
                         of = f"least {unit.label} after {pour}"
                         name = some[0] if len(some) == 1 else ALL
                         rows.append(_effect_row(f"{first} − {second}", of, level, name, one, unit.factor))
+    return rows
+
+
+def _final_effects(study: StudyPlan, found: Gathered) -> list[list[str | int | float | Estimate]]:
+    if not found.finals:
+        return []
+    unit, rows = deployment_unit(study.deployments[0].plan), list[list[str | int | float | Estimate]]()
+    for compared, level, receivers, one in final_effects(study, found):
+        name = receivers[0] if len(receivers) == 1 else ALL
+        rows.append(_effect_row(compared, f"{unit.label} of the final action", level, name, one, unit.factor))
     return rows
 
 
