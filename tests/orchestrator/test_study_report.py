@@ -176,7 +176,7 @@ def test_half_a_study_shows_what_is_there(study: StudyPlan, tmp_path: Path) -> N
             run_folder(tmp_path, cell.id).mkdir(parents=True)
             write_result(tmp_path, cell.id, made_up(cell))
     page = write_report(study, tmp_path).read_text(encoding="utf-8")
-    assert "Unfinished: 4 of 41 cells" in page
+    assert "Unfinished: 6 of 41 cells" in page
     assert all(f'id="figure-{number}"' in page for number in FIGURES)
     only = rows(tmp_path, "figure-3b")[0]
     assert only["low"] == "nan", "one repetition has no interval"
