@@ -131,7 +131,14 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
 
 
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
-    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated)."""
+    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated).
+
+    Raises:
+        RunError: D2 or D3 are asked to plan under risk, or for a safe window.
+    """
+    for key, asked in (("risk", deployment.risk), ("window", deployment.tolerance)):
+        if asked is not None and deployment.strategy != "D1":
+            raise RunError(f"deployment.{key}: belongs to D1, not to {deployment.strategy}; remove it")
     # Only where simulations go on for as long as a pour takes does the clock decide what is asked for.
     free = deployment.strategy == "D3" and deployment.per_pour is None
     strategy = FreeHybrid if free and deployment.prices is not None else _DEPLOYMENTS[deployment.strategy]

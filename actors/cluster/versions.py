@@ -48,7 +48,7 @@ def versions() -> Versions:
     return Versions(
         python=sys.version.split()[0],
         decant=_installed("decant"),
-        simulator=_sources(Path(__file__).parents[2] / "sim_engine"),
+        simulator=sources(Path(__file__).parents[2] / "sim_engine"),
         taichi=_installed("taichi"),
         numpy=_installed("numpy"),
     )
@@ -61,7 +61,8 @@ def _installed(package: str) -> str:
         return "not installed"
 
 
-def _sources(folder: Path) -> str:
+def sources(folder: Path) -> str:
+    """Digest of a folder's Python sources."""
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
         if path.parent.name == "validation":

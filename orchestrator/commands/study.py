@@ -104,8 +104,15 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> Status:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+    from orchestrator.study.cells import cells_of
+    from orchestrator.study.code import warning
+    from orchestrator.study.folder import finished_results
     from orchestrator.study.runner import run_cells
 
+    cells = cells_of(plan)
+    finished = finished_results(folder, cells)
+    if len(finished) < len(cells) and (text := warning(finished)) is not None:
+        say(text)
     say(f"study {folder}, {jobs} at a time")
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}")]
     try:

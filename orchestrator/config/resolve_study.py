@@ -1,18 +1,28 @@
-"""From a study's strategies as written to their plans: which keys are whose, and what they may spend."""
+"""From levels and strategies of a study as written to its plans: benches, which keys are whose, what they may spend."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
+from actors.bench.spec import VirtualBenchSpec
+from actors.spec import LaboratorySpec
 from orchestrator.config.yaml_source import Place, Report
 from orchestrator.fingerprint import NEW_MODEL
 from orchestrator.plan import CalibrationName, CalibrationPlan, DeploymentName, DeploymentPlan, TrustPlan
-from orchestrator.study.plan import CalibrationArm, DeploymentArm
+from orchestrator.study.plan import CalibrationArm, DeploymentArm, Level
+from sim_engine.task import PoseError
 
 if TYPE_CHECKING:
     from orchestrator.config.sections import Section
+
+HARDWARE = (
+    "laboratory '{}' is hardware. An arm moves only for one run, after '--arm' and with a person beside it; the cells "
+    "of a study run one after the other in processes of their own, where nobody is asked. Pour there with 'decant "
+    "run', and name a virtual laboratory here"
+)
 
 CALIBRATION_KEYS = {
     "per_axis": ("C1",),
@@ -33,6 +43,61 @@ DEPLOYMENT_KEYS = {
     "per_pour": ("D3",),
     "mean": ("D2",),
 }
+
+
+def bench_of(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenchSpec | None:
+    """The bench that a study can pour on; None, with the reason in the report, where there is none."""
+    if laboratory.mode != "virtual":
+        report.add(at, HARDWARE.format(laboratory.name))
+    elif laboratory.arm is not None and laboratory.operator.answers != "virtual":
+        report.add(
+            at,
+            f"laboratory '{laboratory.name}' asks a person, and nobody is asked in a study; set 'operator: {{answers: "
+            "virtual}' in it",
+        )
+    elif laboratory.bench is None:
+        report.add(
+            at,
+            f"laboratory '{laboratory.name}' has no virtual bench to pour on; name one that has, for example "
+            "../laboratories/twin.yaml",
+        )
+    else:
+        # Numbers need not be waited for; an arm over wires needs its time.
+        wired = laboratory.arm is not None
+        return replace(laboratory.bench, time_scale=laboratory.bench.time_scale if wired else 0.0)
+    return None
+
+
+def written_levels(sections: Sequence[Section] | None, root: Place, report: Report) -> list[Any] | None:
+    """The levels of mismatch that are complete; None where none are asked for. What is wrong goes to the report."""
+    found: list[Any] = []
+    if sections is not None and not sections:
+        report.add(root.at("mismatch"), "is empty; name at least one level, or remove the key")
+    for i, level in enumerate(sections or ()):
+        if level.value("name") is None or level.value("liquid") is None:
+            continue  # reported as missing
+        if level.value("name") in [other.name for other in found]:
+            report.add(root.at("mismatch", i), f"a level '{level.value('name')}' stands above already")
+        found.append(level)
+    return found if sections is not None else None
+
+
+def levels_of(written: Sequence[Any] | None, laboratory: str, bench: VirtualBenchSpec) -> tuple[Level, ...]:
+    """The benches of all levels: as written, or the laboratory's own under its name."""
+    if written is None:
+        return (Level(laboratory, bench),)
+    return tuple(
+        Level(
+            level.name,
+            replace(
+                bench,
+                liquid=level.liquid.parameters(),
+                pose_error=PoseError(**level.pose_error.model_dump()),
+                pose_noise=PoseError(**level.pose_noise.model_dump()),
+            ),
+        )
+        for level in written
+    )
 
 
 def calibration_arms(
@@ -127,6 +192,9 @@ def deployment_arms(
             model="residual",
             trust=None,
             plain=False,
+            # Risk and window are D1's: with them the others would be planned as D1, too.
+            risk=base.risk if name == "D1" else None,
+            tolerance=base.tolerance if name == "D1" else None,
             mean="zero" if key == "D2_paper" else arm.mean or "constant",
             kappa=base.kappa if arm.kappa is None else arm.kappa,
             initial=base.initial if arm.initial is None else arm.initial,
@@ -134,6 +202,12 @@ def deployment_arms(
         if name == "D1":
             numbers = sorted(set(arm.iterations or [15]))
             repeats = arm.simulations_per_iteration or 2
+            if base.risk is not None and repeats < 2:
+                report.add(
+                    at.at("simulations_per_iteration"),
+                    "one simulation of each action is made as planned, so that with the campaign's 'risk' at least 2 "
+                    "are needed",
+                )
             arms += [
                 DeploymentArm(f"D1-{n}", replace(common, iterations=n, simulations_per_iteration=repeats), repetitions)
                 for n in numbers

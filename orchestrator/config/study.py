@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from orchestrator.config.campaign import Kappa
 from orchestrator.config.errors import ConfigError
@@ -18,16 +18,15 @@ from orchestrator.config.laboratory import (
 from orchestrator.config.load import load_campaign
 from orchestrator.config.motion import Parameters, ParametersBase
 from orchestrator.config.references import References
-from orchestrator.config.resolve_study import calibration_arms, deployment_arms
+from orchestrator.config.resolve_study import bench_of, calibration_arms, deployment_arms, levels_of, written_levels
 from orchestrator.config.sections import Count, Name, PathOr, PositiveCount, Section, Text
 from orchestrator.config.validate import validate
 from orchestrator.config.vessel import missing_file
 from orchestrator.config.yaml_source import Document, Place, Report
 from orchestrator.plan import CampaignPlan
-from orchestrator.study.plan import Level, StudyPlan
+from orchestrator.study.plan import StudyPlan
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
-from sim_engine.task import PoseError
 
 
 class LevelSection(Section):
@@ -152,7 +151,6 @@ class StudyFile(Section):
     required: ClassVar[dict[str, str]] = {
         "name": "paper",
         "campaign": "../campaigns/paper.yaml",
-        "mismatch": "[{name: moderate, liquid: {particles: 4000}}]",
     }
 
     name: Name | None = None
@@ -165,13 +163,14 @@ class StudyFile(Section):
     """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""
 
     laboratory: PathOr[LaboratoryFile] | None = None
-    """In place of the campaign's; a virtual one, with a bench."""
+    """In place of the campaign's; a virtual one, with a bench: of numbers, or over wires."""
 
     parameters: Parameters | None = None  # type: ignore[valid-type]
     """In place of the campaign's parameters of the same names: a value fixes one, a range has it searched."""
 
     search: list[Text] | None = None
-    """Which of the campaign's searched parameters are searched; the others have the middle of what they may be."""
+    """Which of the campaign's searched parameters are searched; the others keep the default, or what comes nearest to
+    it within the campaign's range."""
 
     pours: PositiveCount | None = None
     """Calibration pours of a repetition, in place of the campaign's."""
@@ -180,7 +179,8 @@ class StudyFile(Section):
     """How many of them are kept for testing."""
 
     mismatch: list[LevelSection] | None = None
-    """Levels of mismatch between bench and simulator."""
+    """Levels of mismatch between bench and simulator; unless given, one: the laboratory's bench as it is, under its
+    name."""
 
     compared: Text | None = None
     """Level at which C1 to C4 are compared; the first unless given. C4 is run at all levels, for D1 and D3."""
@@ -190,6 +190,10 @@ class StudyFile(Section):
 
     deployment: DeploymentsSection | None = None
     """The deployments."""
+
+    confirm: Count | None = None
+    """How often each deployment's recommended action is poured again at its end, on the same bench with fresh chance
+    errors; not at all unless given. May be raised later, as repetitions may."""
 
     directory: Text | None = None
     """Where the study's folder goes; 'runs' in the working directory unless given."""
@@ -214,7 +218,7 @@ def load_study(path: Path) -> StudyPlan:
 
 def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     base = _base(file, root, report)
-    levels = _levels(file, root, report)
+    written = written_levels(file.mismatch, root, report)
     if base is None:
         return None
     calibration = base.calibration
@@ -229,15 +233,12 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
             root.at("holdout") if file.holdout else root.at("campaign"),
             f"{holdout} of {count} pours for testing: a study needs at least one, and leaves two or more to fit",
         )
-    bench = base.laboratory.bench
-    if base.laboratory.mode != "virtual" or bench is None:
-        report.add(
-            root.at("laboratory" if file.laboratory is not None else "campaign"),
-            f"laboratory '{base.laboratory.name}' has no virtual bench, and a study sets what is hidden there; name "
-            "one that has, for example ../laboratories/twin.yaml",
-        )
+    at = root.at("laboratory" if file.laboratory is not None else "campaign")
+    bench = bench_of(base.laboratory, at, report)
+    if bench is None:
         return None
-    names = tuple(level.name or "" for level in file.mismatch or [])
+    levels = levels_of(written, base.laboratory.name, bench)
+    names = tuple(level.name for level in levels)
     compared = file.compared or (names[0] if names else "")
     if names and compared not in names:
         report.add(root.at("compared"), f"no such level; there are {', '.join(names)}")
@@ -247,6 +248,8 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         and not any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
     ):
         report.add(root, "there is nothing to compare; add a 'calibration' or a 'deployment' section", key=True)
+    if file.confirm and file.deployment is None and not report.is_broken(root.at("deployment")):
+        report.add(root.at("confirm"), "there is no deployment to confirm; add a 'deployment' section, or remove it")
     plan = replace(
         calibration,
         parameters=searched,
@@ -266,25 +269,13 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         seed=file.seed,
         source=root.document.path,
         base=replace(base, name=file.name, seed=file.seed, calibration=plan, deployment=None),
-        levels=tuple(
-            Level(
-                name,
-                replace(
-                    bench,
-                    liquid=liquid.parameters(),
-                    pose_error=PoseError(**error.model_dump()),
-                    pose_noise=PoseError(**noise.model_dump()),
-                    # Numbers need not be waited for; an arm over wires needs its time.
-                    time_scale=bench.time_scale if base.laboratory.arm is not None else 0.0,
-                ),
-            )
-            for name, liquid, error, noise in levels
-        ),
+        levels=levels,
         calibrations=calibrations,
         deployments=deployments,
         pour_count=count,
         holdout=holdout,
         compared=compared,
+        confirm=file.confirm or 0,
         directory=Path("runs").resolve() if file.directory is None else (root.directory / file.directory).resolve(),
     )
 
@@ -325,19 +316,6 @@ def _with_parameters(base: CampaignPlan, changes: ParametersBase, place: Place, 
         fixed_parameters={name: value for name, value in known.items() if name not in axes},
     )
     return replace(base, calibration=calibration)
-
-
-def _levels(file: StudyFile, root: Place, report: Report) -> list[tuple[str, Any, PoseErrorSection, PoseNoiseSection]]:
-    found: list[tuple[str, Any, PoseErrorSection, PoseNoiseSection]] = []
-    if file.mismatch == []:
-        report.add(root.at("mismatch"), "is empty; name at least one level")
-    for i, level in enumerate(file.mismatch or []):
-        if level.name is None or level.liquid is None:
-            continue  # reported as missing
-        if level.name in [name for name, *_ in found]:
-            report.add(root.at("mismatch", i), f"a level '{level.name}' stands above already")
-        found.append((level.name, level.liquid, level.pose_error, level.pose_noise))
-    return found
 
 
 def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) -> Space:

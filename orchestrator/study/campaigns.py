@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,16 @@ from orchestrator.stages import (
     deployment_stages,
     measured_pours,
     stage_seed,
+    with_posterior,
 )
+from orchestrator.strategies.costs import Costing
 from orchestrator.strategies.design import DesignedPours, draw_allowed, stratified
 from orchestrator.strategies.prior import region_of
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.scorecard import Scorecard
-from orchestrator.study.cells import GRID, Cell
+from orchestrator.study.cells import FINAL, GRID, Cell
 from orchestrator.study.plan import StudyPlan
-from orchestrator.study.strategies import AnsweredByTable, SimulatedTable
+from orchestrator.study.strategies import AnsweredByTable, FinalPour, SimulatedTable
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 
@@ -67,7 +69,9 @@ def campaign_of(
             plan = _with_pours(study, cell, plan, load)
             return plan, [StageDefinition(EVALUATION, lambda results, seed: _score_of_default(plan, seed))]
         case "deployment":
-            return _deployment(study, cell, plan, load)
+            return _deployment(study, cell, plan, cell.needs, load)
+        case "final":
+            return _final(study, cell, plan, load)
 
 
 def calibration_actions(study: StudyPlan) -> list[tuple[float, ...]]:
@@ -150,12 +154,25 @@ def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
 
 
 def _deployment(
-    study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load
+    study: StudyPlan, cell: Cell, plan: CampaignPlan, calibrations: Sequence[str], load: Load
 ) -> tuple[CampaignPlan, list[StageDefinition]]:
     arm = study.deployment(cell.arm).plan
     deployment = replace(arm, scenes=tuple(scene for scene in arm.scenes if scene.name == cell.receiver))
-    if cell.needs:
-        theta = SimulationParameters.model_validate(load(cell.needs[0])[CALIBRATION]["theta"])
-        plan = replace(plan, parameters=theta)
+    for calibration in calibrations:
+        found = load(calibration)
+        deployment = with_posterior(deployment, found)
+        plan = replace(plan, parameters=SimulationParameters.model_validate(found[CALIBRATION]["theta"]))
     plan = replace(plan, calibration=None, deployment=deployment)
     return plan, deployment_stages(plan, deployment)
+
+
+def _final(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load) -> tuple[CampaignPlan, list[StageDefinition]]:
+    """The deployment's laboratory and loss, and one pour of what it recommends."""
+    learnt, *calibrations = cell.needs
+    plan, stages = _deployment(study, cell, plan, calibrations, load)
+    assert plan.deployment is not None
+    values = load(learnt)[stages[0].name].get("action_si")
+    scene = plan.deployment.scenes[0]
+    action = None if values is None else scene.action(values)
+    costing = Costing.of(plan.deployment, scene, plan.parameters)
+    return plan, [StageDefinition(FINAL, lambda results, seed: FinalPour(costing, action, seed), pours=True)]

@@ -8,6 +8,7 @@ actions are those of the study, the same in every repetition: so C1's grid is si
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,9 +16,10 @@ from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from orchestrator.stages import stage_seed
 from orchestrator.study.plan import StudyPlan
 
-Kind = Literal["grid", "pours", "calibration", "uncalibrated", "deployment"]
+Kind = Literal["grid", "pours", "calibration", "uncalibrated", "deployment", "final"]
 
-GRID = "grid"
+GRID, FINAL = "grid", "final"
+"""Stages that only a study has."""
 
 PARTICLE_SECONDS = 0.0007
 """CPU seconds of a simulation by particle, for a first estimate; pours of a known study are timed instead."""
@@ -29,11 +31,14 @@ class Cell:
 
     Attributes:
         id: unique in the study, good as a folder's name.
-        kind: what is done: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment.
+        kind: what is done: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment,
+            one more pour of the action that a deployment recommends.
         level: of mismatch; '' for the grid, which knows no bench.
         arm: label of a calibration or deployment; '' otherwise.
         receiver: name of a deployment's scene.
         repetition: from 1; 0 for the grid.
+        again: number of a final action's pour, from 1; 0 of all others. Each has a cell of its own, so that more may be
+            added later.
         needs: ids of the cells whose results it is made from.
         simulations, pours: at most.
         seed: of its campaign.
@@ -49,6 +54,7 @@ class Cell:
     arm: str = ""
     receiver: str = ""
     repetition: int = 0
+    again: int = 0
 
 
 def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
@@ -58,12 +64,12 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
 
     def add(kind: Kind, simulations: int, pours: int, *needs: str, **place: str | int) -> str:
         parts = [str(place[key]) for key in ("level", "arm", "receiver") if place.get(key)]
-        number = place.get("repetition")
-        name = _name(kind, *parts, number=number)
+        numbers = [int(place[key]) for key in ("repetition", "again") if place.get(key)]
+        name = _name(kind, *parts, numbers=numbers)
         # Arms of a repetition share a seed: what they are scored by then differs by what they found alone.
         shared = [str(place[key]) for key in ("level", "receiver") if place.get(key)]
         family = "calibration" if kind == "uncalibrated" else kind
-        seed = stage_seed(study.seed, _name(family, *shared, number=number))
+        seed = stage_seed(study.seed, _name(family, *shared, numbers=numbers))
         cells.append(Cell(name, kind, needs, simulations, pours, seed, **place))  # type: ignore[arg-type]
         return name
 
@@ -82,26 +88,22 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
             for arm in arms:
                 known = arm.plan.strategy == "C1"
                 spent = 0 if known else calibration_simulations(arm.plan, train)
-                needs = (pours, GRID) if known else (pours,)
-                add("calibration", spent + study.pour_count, 0, *needs, **place, arm=arm.label)
+                made_of = (pours, GRID) if known else (pours,)
+                add("calibration", spent + study.pour_count, 0, *made_of, **place, arm=arm.label)
             for deployment in (a for a in study.deployments if number <= a.repetitions):
                 plan = deployment.plan
                 theta = f"calibration.{level.name}.C4.{number:02d}"
+                needs = (theta,) if plan.strategy != "D2" else ()
                 for scene in plan.scenes:
-                    add(
-                        "deployment",
-                        deployment_simulations(plan),
-                        plan.pours,
-                        *([theta] if plan.strategy != "D2" else []),
-                        **place,
-                        arm=deployment.label,
-                        receiver=scene.name,
-                    )
+                    there: dict[str, str | int] = {**place, "arm": deployment.label, "receiver": scene.name}
+                    learnt = add("deployment", deployment_simulations(plan), plan.pours, *needs, **there)
+                    for again in range(1, study.confirm + 1):
+                        add("final", 0, 1, learnt, *needs, **there, again=again)
     return tuple(cells)
 
 
-def _name(*parts: str, number: str | int | None) -> str:
-    return ".".join([*parts, *([] if number is None else [f"{int(number):02d}"])])
+def _name(*parts: str, numbers: Sequence[int]) -> str:
+    return ".".join([*parts, *(f"{number:02d}" for number in numbers)])
 
 
 def calibration_simulations(plan: CalibrationPlan, train: int) -> int:

@@ -35,7 +35,8 @@ def is_finished(folder: Path, cell: str) -> bool:
 
 
 def read_result(folder: Path, cell: str) -> dict[str, Any]:
-    """What came of a finished cell: `results` by stage, `simulations`, `pours`, `cpu_s`, `seconds`, `expected`.
+    """What came of a finished cell: `results` by stage, `simulations`, `pours`, `cpu_s`, `seconds`, `expected`,
+    `code`.
 
     Raises:
         StudyError: it isn't finished, or its file is damaged.

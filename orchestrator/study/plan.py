@@ -64,6 +64,7 @@ class StudyPlan:
         pour_count: calibration pours of a repetition.
         holdout: how many of them are kept for testing.
         compared: level at which C1 to C4 and the uncalibrated simulator are compared.
+        confirm: how often each deployment's recommended action is poured again.
         directory: in which the study has its folder.
     """
 
@@ -77,6 +78,7 @@ class StudyPlan:
     pour_count: int
     holdout: int
     compared: str
+    confirm: int = 0
     directory: Path = field(default_factory=lambda: Path("runs"))
 
     @property
@@ -98,7 +100,7 @@ class StudyPlan:
 
 
 def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
-    """JSON-ready copy of what decides what is asked for. Repetitions are left out: more may be added later.
+    """JSON-ready copy of what decides what is asked for. Repetitions and `confirm` are left out: they may be raised.
 
     Raises:
         OSError: a mesh file can't be read.

@@ -1,4 +1,4 @@
-"""What only a study asks for: simulations that many repetitions score, and a strategy that is answered by them."""
+"""What only a study asks for: simulations that many repetitions score, a strategy that they answer, final pours."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from orchestrator.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots
+from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Simulate, Simulated, Slots
+from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.one_pour import OnePour
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourOutcome
 
 Key = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, float | None], ...]]
@@ -136,6 +139,70 @@ class AnsweredByTable:
                 seed=request.seed,
             )
         )
+
+
+class FinalPour:
+    """Pour what a deployment recommends once more, with a seed that took no part in the choice.
+
+    The least loss that was measured is the luckiest of several pours; a single pour of another strategy had no such
+    choice. Pours of recommended actions can be compared.
+
+    What can't be made, or goes wrong, has the worst loss and counts as all spilled, as does a pour that hardly left the
+    cup; so does a deployment that recommends nothing. In a study the strategies of a repetition share the seed.
+    """
+
+    def __init__(self, costing: Costing, action: Action | None, seed: int) -> None:
+        """Plan.
+
+        Args:
+            costing: scene and loss of the deployment.
+            action: None: nothing was recommended, and nothing is poured.
+        """
+        self._costing = costing
+        self._action = action
+        self._pour = None if action is None else OnePour(costing.scene, action, seed)
+        self._row: dict[str, object] | None = None if action is not None else self._lost("nothing was recommended")
+        self.decisions: list[Decision] = [] if self._pour is None else self._pour.decisions
+
+    @property
+    def finished(self) -> bool:
+        """It was poured, or came to nothing."""
+        return self._row is not None
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The pour, once."""
+        return [] if self._pour is None else self._pour.ask(slots)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of it. Raises ValueError if it was not asked for."""
+        if self._pour is None or self._action is None:
+            raise ValueError(f"this pour was not asked for: {request}")
+        self._pour.tell(request, outcome)
+        match outcome:
+            case Poured(measurement) if is_sound(measurement.fractions):
+                loss = self._costing.total(self._costing.poured(measurement, self._action))
+                spillage = normalised_spillage(measurement.fractions)
+                self._row = {
+                    "loss": loss,
+                    "spillage": 1.0 if spillage is None else spillage,
+                    "reason": "" if spillage is not None else "hardly anything was poured",
+                }
+            case Poured():
+                self._row = self._lost("weighing: the balance gave no numbers")
+            case Failed(kind, reason):
+                self._row = self._lost(f"{kind}: {reason}")
+
+    def progress(self) -> tuple[int, int]:
+        """Pours done, pours in all."""
+        return int(self.finished), 1
+
+    def result(self) -> dict[str, object]:
+        """`loss`, `spillage` (r), `made` (whether anything was weighed) and why not; the action in SI."""
+        action = None if self._action is None else self._action.values()
+        return {"action_si": action, **({"made": True} | self._row if self._row is not None else {})}
+
+    def _lost(self, reason: str) -> dict[str, object]:
+        return {"loss": self._costing.worst, "spillage": 1.0, "made": False, "reason": reason}
 
 
 def _key(theta: Mapping[str, float], action: Mapping[str, float | None]) -> Key:

@@ -26,6 +26,7 @@ from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.stages import CALIBRATION
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import Cell, cells_of
+from orchestrator.study.code import CODE, code_now
 from orchestrator.study.folder import as_begun, read_result, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
 
@@ -62,6 +63,7 @@ def run_cell(
         "cpu_s": result.cpu_s,
         "seconds": result.seconds,
         "expected": _expected(directory) if cell.arm.startswith("C4") else [],
+        CODE: code_now(),
     }
     write_result(folder, cell.id, data)
     return data
@@ -105,6 +107,7 @@ def work(path: Path, make: Callable[[LaboratorySpec, bool], Laboratory] = labora
     # Libraries print to stdout, which is for answers alone: from here on they print to the log.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
+    code_now()  # of the sources that this process has read, before anybody changes them
     study = as_begun(load_study(path))
     cells = {cell.id: cell for cell in cells_of(study)}
     for name in named_cells():

@@ -25,7 +25,7 @@ def test_the_quick_study_runs_and_a_second_call_has_nothing_left_to_do(tmp_path:
         assert done.returncode == 0, done.stderr
         answers.append(json.loads(done.stdout.splitlines()[-1]))
     assert answers[0] == answers[1]
-    assert answers[0]["finished"] == answers[0]["cells"] == 29
+    assert answers[0]["finished"] == answers[0]["cells"] == 29 + 12
     page = Path(answers[0]["page"]).read_text(encoding="utf-8")
     assert "Unfinished" not in page
-    assert all(f'id="figure-{number}"' in page for number in ("3b", "3c", "4", "5a", "5b", "6", "7"))
+    assert all(f'id="figure-{number}"' in page for number in ("3b", "3c", "4", "5a", "5b", "6", "7", "final"))

@@ -16,13 +16,26 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from actors.cluster.versions import sources
 from orchestrator.config.check import touch
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.study import load_study
+from orchestrator.errors import RunError
+from orchestrator.requests import Failed, Poured, Slots
+from orchestrator.stages import deployment_stages
+from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.deployment_d1_risk import RobustPlanning
+from orchestrator.strategies.deployment_d2 import RealOnly
+from orchestrator.strategies.deployment_d3 import Hybrid
+from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import cells_of
+from orchestrator.study.code import code_now, warning
 from orchestrator.study.folder import RESULT, StudyError, as_begun, finished_results, is_finished, opened, run_folder
-from orchestrator.study.plan import StudyPlan
+from orchestrator.study.plan import StudyPlan, study_fingerprint
+from orchestrator.study.strategies import FinalPour
 from orchestrator.study.worker import run_cell
+from sim_engine.liquid import SimulationParameters
+from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.build import build_vessel
 from tests.orchestrator import toy_study
 from tests.orchestrator.toy import logical_record
@@ -50,7 +63,8 @@ def small(folder: Path, **changes: Any) -> StudyPlan:
     """The quick study with less of everything."""
     data = read("quick")
     data["deployment"]["D2"]["pours"] = data["deployment"]["D3"]["pours"] = 2
-    return load_study(written(folder, {**data, **changes}))
+    chosen = {key: value for key, value in {**data, **changes}.items() if value is not None}
+    return load_study(written(folder, chosen))
 
 
 # -- cells ----------------------------------------------------------------------------------------------------------
@@ -119,6 +133,62 @@ def test_no_mismatch_lets_the_cups_touch_in_calibration(name: str) -> None:
         assert touch(scene, nearest, pourer, receiver) is None, level.name
 
 
+def test_without_levels_a_study_pours_on_its_laboratory_as_it_is(tmp_path: Path) -> None:
+    changes = without(without(read("quick"), "mismatch"), "compared")
+    study = load_study(written(tmp_path, changes))
+    twin = study.base.laboratory.bench
+    assert [level.name for level in study.levels] == [study.compared] == ["twin"]
+    assert twin is not None
+    assert study.levels[0].bench == replace(twin, time_scale=0.0), "numbers are not waited for"
+    wired = {**changes, "laboratory": str(ROOT / "configs/laboratories/virtual.yaml")}
+    study = load_study(written(tmp_path / "wired", wired))
+    assert study.base.laboratory.arm is not None
+    assert study.levels[0].bench == study.base.laboratory.bench, "an arm over wires needs its time"
+
+
+def risky(folder: Path, **arm: Any) -> Path:
+    """The quick study of a campaign that plans under risk."""
+    campaign = YAML(typ="safe").load((ROOT / "configs/campaigns/quickstart.yaml").read_text(encoding="utf-8"))
+    for section, key in (("calibration", "receiver"), ("deployment", "receiver")):
+        campaign[section][key] = str((ROOT / "configs/campaigns" / campaign[section][key]).resolve())
+    for key in ("laboratory", "pourer"):
+        campaign[key] = str((ROOT / "configs/campaigns" / campaign[key]).resolve())
+    kept = {key: campaign["deployment"][key] for key in ("receiver", "motion", "actions")}
+    risk = {"measure": "expected", "pose_error": {"x": "3 mm"}, "theta": "posterior"}
+    campaign["deployment"] = {**kept, "strategy": "D1", "risk": risk, "window": {"tolerance": "2 %"}}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "campaign.yaml").write_text(json.dumps(campaign), encoding="utf-8")
+    data = read("quick")
+    data["deployment"]["D1"]["simulations_per_iteration"] = arm.get("simulations_per_iteration", 2)
+    return written(folder, {**data, "campaign": str(folder / "campaign.yaml")})
+
+
+def test_risk_of_the_campaign_is_that_of_d1_and_leaves_the_others_what_they_are(tmp_path: Path) -> None:
+    study = load_study(risky(tmp_path))
+    plans = {arm.label: arm.plan for arm in study.deployments}
+    assert plans["D1-2"].risk is not None
+    assert plans["D1-2"].tolerance == pytest.approx(0.02)
+    assert {plans[label].risk for label in ("D2", "D3")} == {plans[label].tolerance for label in ("D2", "D3")} == {None}
+    theta = study.base.parameters.model_dump()
+    rows = [{"cohesion": 0.01 * i} for i in range(3)]
+    known = {"calibration": {"theta": theta, "posterior": {"thetas": rows}}}
+    made = {}
+    for cell in cells_of(study):
+        if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":
+            plan, stages = campaign_of(study, cell, lambda name: known, tmp_path)
+            made[cell.arm] = stages[0].build({}, 1)
+            assert plan.deployment is not None
+            if plan.deployment.risk is not None:
+                assert [one.cohesion for one in plan.deployment.risk.thetas] == [0.0, 0.01, 0.02]
+    assert {arm: type(one) for arm, one in made.items()} == {"D1-2": RobustPlanning, "D2": RealOnly, "D3": Hybrid}
+    for arm in ("D2", "D3"):
+        wrong = replace(plans[arm], risk=plans["D1-2"].risk)
+        with pytest.raises(RunError, match=f"risk: belongs to D1, not to {arm}"):
+            deployment_stages(study.base, wrong)
+    with pytest.raises(ConfigError, match="at least 2 are needed"):
+        load_study(risky(tmp_path / "few", simulations_per_iteration=1))
+
+
 # -- files that can't be used ---------------------------------------------------------------------------------------
 
 
@@ -127,7 +197,12 @@ def without(data: dict[str, Any], key: str) -> dict[str, Any]:
 
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "no mismatch": (lambda d: without(d, "mismatch"), "key 'mismatch' is missing"),
+    "no mismatch left": (lambda d: {**without(d, "compared"), "mismatch": []}, "mismatch: is empty"),
+    "hardware": (
+        lambda d: {**d, "laboratory": str(ROOT / "configs/laboratories/ur10-kern.yaml")},
+        "laboratory 'ur10-kern' is hardware. An arm moves only for one run, after '--arm'",
+    ),
+    "nothing to confirm": (lambda d: without({**d, "confirm": 1}, "deployment"), "confirm: there is no deployment"),
     "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),
     "level twice": (lambda d: {**d, "mismatch": [d["mismatch"][0]] * 2}, "mismatch[1]: a level 'small'"),
     "not searched": (lambda d: {**d, "search": ["friction"]}, "search[0]: 'friction' is not searched"),
@@ -260,7 +335,7 @@ def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None
     blocked = run_folder(study.folder, "calibration.small.C4.01")
     blocked.mkdir(parents=True)
     (blocked / "journal.sqlite").write_bytes(b"no journal at all, but as long as one" * 40)
-    status = run_toy_study(study)
+    status = run_toy_study(replace(study, confirm=0))
     assert set(status.failed) == {"calibration.small.C4.01"}
     assert "not a journal" in status.failed["calibration.small.C4.01"]
     assert status.skipped == {"deployment.small.D3.deployment-narrow.01"}, "it needs the θ* that there is none of"
@@ -292,6 +367,88 @@ def test_settings_may_not_change_under_a_study_but_repetitions_may_be_added(tmp_
     more["C2"]["samples"] = 4
     with pytest.raises(StudyError, match="begun with other settings"), opened(small(tmp_path, calibration=more)):
         pass
+
+
+# -- final actions, and which code made a cell -----------------------------------------------------------------------
+
+
+def test_what_is_recommended_may_be_poured_again_later_and_changes_no_other_cell(tmp_path: Path) -> None:
+    quick = without(read("quick"), "confirm")
+    plain, twice = (
+        load_study(written(tmp_path / name, quick | more)) for name, more in (("a", {}), ("b", {"confirm": 2}))
+    )
+    assert study_fingerprint(plain) == study_fingerprint(twice)
+    cells = cells_of(twice)
+    final = [cell for cell in cells if cell.kind == "final"]
+    assert tuple(cell for cell in cells if cell.kind != "final") == cells_of(plain)
+    assert len(final) == 2 * sum(cell.kind == "deployment" for cell in cells)
+    assert {cell.id for cell in cells_of(replace(twice, confirm=1))} < {cell.id for cell in cells}
+    shared: dict[tuple[str, str, int, int], set[int]] = {}
+    for cell in final:
+        assert cell.needs[0] == f"deployment.{cell.level}.{cell.arm}.{cell.receiver}.{cell.repetition:02d}"
+        assert cell.pours == 1
+        shared.setdefault((cell.level, cell.receiver, cell.repetition, cell.again), set()).add(cell.seed)
+    assert all(len(seeds) == 1 for seeds in shared.values()), "strategies of a repetition have the same chance"
+    assert len(set.union(*shared.values())) == len(shared) == 2 * 1 * 2 * 2
+
+
+def test_a_final_pour_is_the_recommended_action_with_fresh_chance_and_its_code_is_noted(tmp_path: Path) -> None:
+    deployment = {"D2": {**read("quick")["deployment"]["D2"], "repetitions": 1}}
+    changes = {"deployment": deployment, "mismatch": read("quick")["mismatch"][:1], "confirm": 2}
+    study = small(tmp_path, **changes, calibration=None)
+    cells = cells_of(study)
+    assert [cell.kind for cell in cells] == ["deployment", "final", "final"]
+    learnt, *again = (run_cell(study, cell, study.folder, ToyLaboratory) for cell in cells)  # type: ignore[arg-type]
+    values = learnt["results"]["deployment:narrow"]["action_si"]
+    finals = [one["results"]["final"] for one in again]
+    action = study.deployments[0].plan.scenes[0].action(values)
+    hidden = study.levels[0].bench.liquid
+    least = toy_study.spilled(action, hidden, 0) - 0.01
+    for one in finals:
+        assert one["action_si"] == action.values()
+        assert one["made"]
+        assert least <= one["loss"] == one["spillage"] <= least + 0.02
+    measured = [pour["loss"] for pour in learnt["results"]["deployment:narrow"]["pours"]]
+    assert len({*measured, *(one["loss"] for one in finals)}) == len(measured) + 2, "a seed was used again"
+    assert [one["pours"] for one in again] == [1, 1]
+    assert learnt["code"] == code_now()
+
+
+def test_an_action_that_can_not_be_poured_and_none_at_all_have_the_worst_loss(tmp_path: Path) -> None:
+    plan = small(tmp_path).deployment("D2").plan
+    scene = plan.scenes[0]
+    costing = Costing.of(replace(plan, loss=replace(plan.loss, retained_weight=3.0)), scene, SimulationParameters())
+    none = FinalPour(costing, None, 1)
+    assert none.finished
+    assert (none.ask(Slots(1, 1)), none.result()["loss"], none.result()["made"]) == ([], 3.0, False)
+    action = scene.action(plan.actions.decode([0.5] * plan.actions.dimension))
+    for outcome in (
+        Failed("invalid_action", "cups touch"),
+        Failed("pour_failed", "cups touch"),
+        Poured(PourMeasurement(scene.liquid.mass, float("nan"), 0.0)),
+    ):
+        one = FinalPour(costing, action, 1)
+        (request,) = one.ask(Slots(1, 1))
+        assert not one.finished
+        assert one.ask(Slots(1, 1)) == []
+        one.tell(request, outcome)
+        assert one.finished
+        assert (one.result()["loss"], one.result()["spillage"], one.result()["made"]) == (3.0, 1.0, False)
+
+
+def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tmp_path: Path) -> None:
+    same = {"code": code_now()}
+    older = {"code": {**code_now(), "strategies": "0123456789ab"}}
+    assert warning({}) is None
+    assert warning({"a": same, "b": same}) is None
+    text = warning({"a": same, "b": older, "c": {}, "d": {}}) or ""
+    assert "1 finished by other code (strategies: changed since)" in text
+    assert "2 finished before versions were noted" in text
+    assert "\n" not in text
+    (tmp_path / "a.py").write_text("x = 1", encoding="utf-8")
+    before = sources(tmp_path)
+    (tmp_path / "a.py").write_text("x = 2", encoding="utf-8")
+    assert sources(tmp_path) != before
 
 
 def test_two_commands_can_not_run_one_study(tmp_path: Path) -> None:

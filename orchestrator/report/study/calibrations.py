@@ -10,7 +10,7 @@ import numpy as np
 from orchestrator.report import style
 from orchestrator.report.study.drawing import Drawn, colour, look, strategy_of
 from orchestrator.report.study.gather import UNCALIBRATED, Calibrated, Gathered, mean, running_least
-from orchestrator.report.study.intervals import Estimate, estimate
+from orchestrator.report.study.intervals import SHARE, Estimate, estimate
 from orchestrator.study.plan import StudyPlan
 
 
@@ -37,7 +37,7 @@ def _boxes(known: Mapping[str, Calibrated]) -> Drawn:
         pooled = [100 * value for test in one.test for value in test]
         axes.boxplot([pooled], positions=[place], widths=0.55, showfliers=False, medianprops={"color": style.INK})
         axes.plot(np.linspace(place - 0.12, place + 0.12, len(pooled)), pooled, ".", color=style.PALE, zorder=1)
-        average = estimate([mean(test) for test in one.test]).scaled(100)
+        average = estimate([mean(test) for test in one.test], SHARE).scaled(100)
         axes.errorbar([place], [average.mean], yerr=error(average), fmt="D", color=colour(name), capsize=4, zorder=4)
         quartiles = [float(q) for q in np.percentile(pooled, [25, 50, 75])]
         rows.append([name, average.count, len(pooled), average.mean, average.low, average.high, *quartiles])
@@ -49,7 +49,7 @@ def _boxes(known: Mapping[str, Calibrated]) -> Drawn:
         "3b",
         "Test discrepancy",
         "Every test pour of every repetition: quartiles, median, whiskers to 1.5 quartile ranges (grey: the pours). "
-        "Diamonds: mean over repetitions with its 95 % interval.",
+        "Diamonds: mean over repetitions with its 95 % t interval.",
         figure,
         ("strategy", "repetitions", "pours", "mean_percent", "low", "high", "quartile_1", "median", "quartile_3"),
         rows,
@@ -65,7 +65,9 @@ def _against_simulations(known: Mapping[str, Calibrated]) -> Drawn:
         if not curves:
             continue
         length = min(len(curve) for curve in curves)
-        points = [(curves[0][i][0], estimate([curve[i][1] for curve in curves]).scaled(100)) for i in range(length)]
+        points = [
+            (curves[0][i][0], estimate([curve[i][1] for curve in curves], SHARE).scaled(100)) for i in range(length)
+        ]
         rows += [[name, spent, e.count, e.mean, e.low, e.high] for spent, e in points]
         spent, means = [p[0] for p in points], [p[1].mean for p in points]
         if len(points) == 1:
@@ -84,7 +86,7 @@ def _against_simulations(known: Mapping[str, Calibrated]) -> Drawn:
         "Best discrepancy against simulations",
         "On training pours. C3: least mean discrepancy of the θ tried so far; C4: least that its surrogate had "
         "expected of a θ it chose, and at last of θ*; C1 and C2 choose all θ beforehand, and are one point. Bands "
-        "and bars: 95 % intervals.",
+        "and bars: 95 % t intervals over repetitions.",
         figure,
         ("strategy", "simulations", "repetitions", "best_percent", "low", "high"),
         rows,

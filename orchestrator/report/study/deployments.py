@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from orchestrator.report import style
 from orchestrator.report.study.calibrations import error
 from orchestrator.report.study.drawing import Drawn, colour, legend, log_axis, look
 from orchestrator.report.study.gather import Gathered, Key, at_pour, mean
-from orchestrator.report.study.intervals import Estimate, estimate
+from orchestrator.report.study.intervals import SHARE, Estimate, Range, estimate
 from orchestrator.report.units import LossUnit, deployment_unit
 from orchestrator.study.cells import deployment_simulations
 from orchestrator.study.plan import StudyPlan
@@ -40,6 +41,18 @@ def places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str], lis
     return levels, receivers, arms
 
 
+def loss_range(study: StudyPlan) -> Range:
+    """What a loss can be: a share, or anything from 0."""
+    plan = study.deployments[0].plan
+    masses = plan.objectives is not None or plan.loss.name in ("grams", "particles")
+    return (0.0, math.inf) if masses else (0.0, max(plan.loss.retained_weight, SHARE[1]))
+
+
+def mean_loss(study: StudyPlan, losses: Sequence[float]) -> Estimate:
+    """Of one loss a repetition, in the unit that people read."""
+    return estimate(losses, loss_range(study)).scaled(deployment_unit(study.deployments[0].plan).factor)
+
+
 def most_pours(study: StudyPlan) -> int:
     """Pours of the longest deployment."""
     return max(arm.plan.pours for arm in study.deployments)
@@ -50,7 +63,8 @@ def checkpoints(study: StudyPlan, wanted: tuple[int, ...] = CHECKPOINTS) -> list
     return sorted({min(pour, most_pours(study)) for pour in wanted})
 
 
-def _bar(axes: Axes, place: float, width: float, one: Estimate, arm: str, arms: Sequence[str]) -> None:
+def bar(axes: Axes, place: float, width: float, one: Estimate, arm: str, arms: Sequence[str]) -> None:
+    """A bar with its interval."""
     shown = look(arm, arms)
     axes.bar(
         place, one.mean, width, color=shown.colour, hatch=shown.hatch, edgecolor="white", linewidth=0.0,
@@ -72,9 +86,9 @@ def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
     for axes, level in zip(grid[0], levels, strict=True):
         for i, pour in enumerate(pours):
             for j, arm in enumerate(arms):
-                one = estimate(at_pour(found.best_so_far(Key(level, receiver, arm)), pour)).scaled(unit.factor)
+                one = mean_loss(study, at_pour(found.best_so_far(Key(level, receiver, arm)), pour))
                 rows.append([level, receiver, arm, pour, one.count, one.mean, one.low, one.high])
-                _bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
+                bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
         axes.set_xticks(range(len(pours)), [str(pour) for pour in pours])
         style.dress(axes, title=f"{level} mismatch", x="pours", y=f"least {unit.label}" if level == levels[0] else "")
     legend(figure, arms)
@@ -82,7 +96,7 @@ def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
         "figure-5a",
         "5a",
         f"Least loss after so many pours into '{receiver}'",
-        "Mean over repetitions of the least loss so far, with 95 % intervals. D1 pours once: its number stays.",
+        "Mean over repetitions of the least loss so far, with 95 % t intervals. D1 pours once: its number stays.",
         figure,
         ("level", "receiver", "strategy", "pours", "repetitions", f"least_{unit.unit}", "low", "high"),
         rows,
@@ -99,9 +113,9 @@ def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
         for i, receiver in enumerate(receivers):
             for j, arm in enumerate(arms):
                 losses = found.losses.get(Key(level, receiver, arm), [])
-                one = estimate([mean(pours) for pours in losses]).scaled(unit.factor)
+                one = mean_loss(study, [mean(pours) for pours in losses])
                 rows.append([level, receiver, arm, one.count, one.mean, one.low, one.high])
-                _bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
+                bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
         axes.set_xticks(range(len(receivers)), receivers)
         style.dress(axes, title=f"{level} mismatch", y=f"mean {unit.label}" if level == levels[0] else "")
     legend(figure, arms)
@@ -109,7 +123,7 @@ def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
         "figure-5b",
         "5b",
         "Mean loss of a pour",
-        "Over all pours of a repetition, exploring ones too; mean over repetitions with 95 % intervals.",
+        "Over all pours of a repetition, exploring ones too; mean over repetitions with 95 % t intervals.",
         figure,
         ("level", "receiver", "strategy", "repetitions", f"mean_{unit.unit}", "low", "high"),
         rows,
@@ -132,7 +146,7 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
                 curves = found.best_so_far(Key(level, receiver, arm))
                 if not curves:
                     continue
-                points = [estimate(at_pour(curves, pour)).scaled(unit.factor) for pour in numbers]
+                points = [mean_loss(study, at_pour(curves, pour)) for pour in numbers]
                 rows += [[level, receiver, arm, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points)]  # noqa: B905
                 shown = look(arm, arms)
                 middle, low, high = ([max(v, least) for v in values] for values in zip(*map(_ends, points)))  # noqa: B905
@@ -147,7 +161,7 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
         "figure-6",
         "6",
         "Least loss so far against real pours",
-        "Mean over repetitions with 95 % intervals, on a logarithmic axis: less than "
+        "Mean over repetitions with 95 % t intervals, on a logarithmic axis: less than "
         f"{least:g} {unit.unit}, nothing too, is drawn there. D1 is planned in simulation alone and poured once.",
         figure,
         ("level", "receiver", "strategy", "pour", "repetitions", f"least_{unit.unit}", "low", "high"),

@@ -62,7 +62,7 @@ class Drawn:
 
     Attributes:
         name: of its files.
-        number: of its counterpart in the paper.
+        number: of its counterpart in the paper; '' without one.
         title, caption: for people.
         header, rows: the numbers in it, as CSV.
     """

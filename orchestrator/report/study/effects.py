@@ -1,4 +1,9 @@
-"""What one strategy gains over another: differences within repetitions, which share seeds and θ*."""
+"""What one strategy gains over another: differences of a repetition, at the same level and into the same receiver.
+
+Beside these, a pair shares little. C1 to C4 have the repetition's weighed pours, and are scored with the same seeds.
+Deployments have the bench's systematic errors in common, and all but D2 the repetition's θ*; the chance of each pour
+comes from the strategy's own seeds. Only pours of final actions share it, one by one (`FinalPour`).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orchestrator.report.study.gather import Gathered, Key, mean
-from orchestrator.report.study.intervals import Estimate, estimate
+from orchestrator.report.study.intervals import ANYTHING, Estimate, Range, difference_of, estimate
 
 ALL = "all"
 """In place of a receiver: the mean over all of them, repetition by repetition."""
@@ -26,7 +31,7 @@ class Effect:
     """A difference of two strategies; below 0 the first is better.
 
     Attributes:
-        difference: mean over the repetitions that both have, with its interval.
+        difference: mean over the repetitions that both have, with the t interval of paired differences.
         better: repetitions in which the first is better.
         probability: two-sided, of a mean at least as far from 0 if signs were chance (all 2ⁿ sign changes are tried);
             None with fewer than `FEWEST` repetitions.
@@ -37,14 +42,17 @@ class Effect:
     probability: float | None
 
 
-def effect(first: Mapping[int, float], second: Mapping[int, float]) -> Effect:
+def effect(first: Mapping[int, float], second: Mapping[int, float], within: Range = ANYTHING) -> Effect:
     """Of values by repetition; repetitions that only one has, or that are NaN, are left out.
+
+    Args:
+        within: what a value can be.
 
     Source: Fisher's randomisation test of paired differences (The Design of Experiments, 1935, section 21).
     """
     both = [first[n] - second[n] for n in sorted(first.keys() & second.keys())]
     known = [difference for difference in both if not math.isnan(difference)]
-    return Effect(estimate(known), sum(d < 0.0 for d in known), _chance(known))
+    return Effect(estimate(known, difference_of(within)), sum(d < 0.0 for d in known), _chance(known))
 
 
 def _chance(differences: Sequence[float]) -> float | None:

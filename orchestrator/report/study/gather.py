@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from orchestrator.stages import CALIBRATION, EVALUATION
-from orchestrator.study.cells import Cell, cells_of
+from orchestrator.study.cells import FINAL, Cell, cells_of
 from orchestrator.study.plan import StudyPlan
 
 UNCALIBRATED = "uncalibrated"
@@ -43,6 +43,15 @@ class Key:
     arm: str
 
 
+@dataclass(frozen=True)
+class Final:
+    """A pour of a recommended action. What could not be made has the worst loss, and counts as all spilled."""
+
+    loss: float
+    spillage: float
+    made: bool
+
+
 @dataclass
 class Gathered:
     """Everything of a study that is finished.
@@ -51,6 +60,7 @@ class Gathered:
         calibrated: by label, `UNCALIBRATED` first where it is there.
         losses: loss of every pour in order, one list a repetition; NaN where a pour gave none.
         numbers: of these repetitions.
+        finals: pours of the recommended action, by repetition.
         cells, finished: how many.
         simulations, pours: that were made.
         cpu_s, seconds: of all cells.
@@ -59,6 +69,7 @@ class Gathered:
     calibrated: dict[str, Calibrated] = field(default_factory=dict)
     losses: dict[Key, list[list[float]]] = field(default_factory=dict)
     numbers: dict[Key, list[int]] = field(default_factory=dict)
+    finals: dict[Key, dict[int, list[Final]]] = field(default_factory=dict)
     cells: int = 0
     finished: int = 0
     simulations: int = 0
@@ -100,6 +111,11 @@ def gather(study: StudyPlan, results: Mapping[str, Mapping[str, Any]]) -> Gather
             key = Key(cell.level, receivers[cell.receiver], cell.arm)
             found.losses.setdefault(key, []).append(_losses(cell, data))
             found.numbers.setdefault(key, []).append(cell.repetition)
+        elif cell.kind == "final":
+            key = Key(cell.level, receivers[cell.receiver], cell.arm)
+            one = data["results"][FINAL]
+            pour = Final(float(one["loss"]), float(one["spillage"]), bool(one["made"]))
+            found.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
     found.calibrated = {name: found.calibrated[name] for name in order if name in found.calibrated}
     return found
 

@@ -1,4 +1,8 @@
-"""Means with 95 % bootstrap intervals. Pure functions of numbers; the same numbers give the same interval."""
+"""Means over repetitions with 95 % intervals. Pure functions of numbers; the same numbers give the same interval.
+
+Student's t for means and for mean differences: of normal numbers it covers 95 %, however few they are. The percentile
+bootstrap covers 83 % of five and 91 % of ten; it is kept for what is no mean.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,12 @@ from numpy.typing import NDArray
 
 RESAMPLES = 4_000
 COVERED = 0.95
+
+Range = tuple[float, float]
+"""Least and largest value that a quantity can have."""
+
+ANYTHING: Range = (-math.inf, math.inf)
+SHARE: Range = (0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -40,16 +50,40 @@ class Estimate:
         return f"{self.mean:.{decimals}f} [{self.low:.{decimals}f}, {self.high:.{decimals}f}]"
 
 
-def estimate(values: Sequence[float]) -> Estimate:
-    """Mean of one number a repetition, with the percentile bootstrap's interval; NaN are left out."""
-    known = [value for value in values if not math.isnan(value)]
-    return statistic([[value] for value in known], lambda rows: rows.mean(axis=(-2, -1)))
+def estimate(values: Sequence[float], within: Range = ANYTHING) -> Estimate:
+    """Mean of one number a repetition, with Student's t interval; NaN are left out.
+
+    Args:
+        within: what the quantity can be; the interval ends there, or at a mean that a balance's noise puts beyond.
+
+    Source: Student, The probable error of a mean, Biometrika 6, 1908.
+    Limitations: repetitions are taken for independent and their mean for normal. Where nearly all are alike and a few
+        far off, as with cups that touch now and then, five repetitions may show none of these, and the interval is too
+        narrow.
+    """
+    from scipy.special import stdtrit
+
+    known = np.array([value for value in values if not math.isnan(value)], dtype=np.float64)
+    count = len(known)
+    if count == 0:
+        return Estimate(math.nan, math.nan, math.nan, 0)
+    mean = float(known.mean())
+    if count < 2:
+        return Estimate(mean, math.nan, math.nan, count)
+    half = float(stdtrit(count - 1, (1 + COVERED) / 2) * known.std(ddof=1) / math.sqrt(count))
+    least, largest = min(within[0], mean), max(within[1], mean)
+    return Estimate(mean, max(mean - half, least), min(mean + half, largest), count)
+
+
+def difference_of(within: Range) -> Range:
+    """What a difference of two such quantities can be."""
+    return within[0] - within[1], within[1] - within[0]
 
 
 def statistic(
     repetitions: Sequence[Sequence[float]], of: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> Estimate:
-    """Any statistic of repetitions with its interval: whole repetitions are drawn, with replacement.
+    """What is no mean, with the percentile bootstrap's interval: whole repetitions are drawn, with replacement.
 
     Args:
         repetitions: (n, m) numbers.

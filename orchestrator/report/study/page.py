@@ -10,11 +10,13 @@ from pathlib import Path
 from orchestrator.report.study.calibrations import draw_calibrations
 from orchestrator.report.study.deployments import draw_deployments
 from orchestrator.report.study.drawing import Drawn, write_csv
+from orchestrator.report.study.finals import draw_finals
 from orchestrator.report.study.gather import Gathered, gather
 from orchestrator.report.study.intervals import Estimate
 from orchestrator.report.study.tables import Table, tables
 from orchestrator.report.units import deployment_unit
 from orchestrator.study.cells import cells_of
+from orchestrator.study.code import told
 from orchestrator.study.folder import finished_results, write_whole
 from orchestrator.study.plan import Level, StudyPlan
 
@@ -29,8 +31,9 @@ _RESAMPLED = (
     "A repetition resamples the pours: errors of grip and placement, the liquid's initial positions and the balance's "
     "noise; which of the calibration's actions are kept for testing; and the strategies' own seeds. Actions of the "
     "calibration pours are the same in every repetition, so that C1's grid is simulated once and scored for each. "
-    "C1 to C4 of a repetition share its pours; D1 and D3 simulate with the θ* that C4 found in it. Intervals are "
-    "percentile bootstraps over repetitions; with ten or fewer they are rather too narrow than too wide."
+    "C1 to C4 of a repetition share its pours; D1 and D3 simulate with the θ* that C4 found in it. Intervals of means "
+    "are Student's t over repetitions, those of differences Student's t of the repetitions' differences: they cover "
+    "95 % where repetitions scatter about normally, and those of shares end at 0 and 100 %."
 )
 
 _AS_IN_THE_PAPER = {
@@ -52,11 +55,16 @@ def write_report(study: StudyPlan, folder: Path) -> Path:
     Raises:
         StudyError: a result can't be read.
     """
-    found = gather(study, finished_results(folder, cells_of(study)))
+    results = finished_results(folder, cells_of(study))
+    found = gather(study, results)
     report = folder / REPORT
     report.mkdir(parents=True, exist_ok=True)
     drawn: list[Drawn] = []
-    drawers: tuple[Callable[[StudyPlan, Gathered], list[Drawn]], ...] = (draw_calibrations, draw_deployments)
+    drawers: tuple[Callable[[StudyPlan, Gathered], list[Drawn]], ...] = (
+        draw_calibrations,
+        draw_deployments,
+        draw_finals,
+    )
     for draw in drawers:
         drawn += draw(study, found)
     for one in drawn:
@@ -65,11 +73,13 @@ def write_report(study: StudyPlan, folder: Path) -> Path:
     for table in shown:
         write_csv(report / f"{table.name}.csv", *table.flat())
     page = report / PAGE
-    write_whole(page, _page(study, found, drawn, shown, report))
+    write_whole(page, _page(study, found, told(results), drawn, shown, report))
     return page
 
 
-def _page(study: StudyPlan, found: Gathered, drawn: Sequence[Drawn], shown: Sequence[Table], report: Path) -> str:
+def _page(
+    study: StudyPlan, found: Gathered, code: str, drawn: Sequence[Drawn], shown: Sequence[Table], report: Path
+) -> str:
     title = html.escape(f"Study {study.name}")
     parts = [
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
@@ -81,15 +91,15 @@ def _page(study: StudyPlan, found: Gathered, drawn: Sequence[Drawn], shown: Sequ
     for table in shown:
         parts.append(_table(table))
     for one in drawn:
+        counterpart = f"Counterpart of the paper's figure {one.number}. " if one.number else ""
         picture = base64.b64encode((report / f"{one.name}.svg").read_bytes()).decode("ascii")
         parts.append(
             f'<figure id="{one.name}"><h2>{html.escape(one.title)}</h2>'
             f'<img alt="{html.escape(one.title)}" src="data:image/svg+xml;base64,{picture}">'
-            f"<figcaption>{html.escape(one.caption)} Counterpart of the paper's figure {one.number}. Numbers: "
-            f"{one.name}.csv.</figcaption></figure>"
+            f"<figcaption>{html.escape(one.caption)} {counterpart}Numbers: {one.name}.csv.</figcaption></figure>"
         )
     parts.append(f"<h2>What a repetition is</h2><p>{html.escape(_RESAMPLED)}</p>")
-    parts.append("<h2>Settings</h2>" + "".join(f"<p>{html.escape(line)}</p>" for line in _settings(study)))
+    parts.append("<h2>Settings</h2>" + "".join(f"<p>{html.escape(line)}</p>" for line in [*_settings(study), code]))
     return "\n".join([*parts, "</body></html>\n"])
 
 
@@ -121,6 +131,8 @@ def _settings(study: StudyPlan) -> list[str]:
         }[plan.strategy]
         paper = _AS_IN_THE_PAPER.get(each.label, "")
         lines.append(f"{each.label}: {what}; {each.repetitions} repetitions into each receiver{paper}.")
+    if study.confirm and study.deployments:
+        lines.append(f"Each deployment's recommended action is poured {study.confirm} more times.")
     return [*lines, *(_level(level) for level in study.levels)]
 
 

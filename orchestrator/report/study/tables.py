@@ -9,14 +9,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestrator.report.study.deployments import checkpoints, most_pours, places
+from orchestrator.report.study.deployments import checkpoints, loss_range, mean_loss, most_pours, places
 from orchestrator.report.study.effects import ALL, Effect, at_pour_of, effect, tests_of
+from orchestrator.report.study.finals import CAPTION, final_effects, final_rows
 from orchestrator.report.study.gather import UNCALIBRATED, Gathered, Key, at_pour, mean
-from orchestrator.report.study.intervals import Estimate, estimate, statistic
+from orchestrator.report.study.intervals import SHARE, Estimate, estimate, statistic
 from orchestrator.report.units import deployment_unit
 from orchestrator.study.plan import StudyPlan
 
 TABLE_POURS = (1, 3, 15)
+
+_PAIRED = (
+    "Mean differences, paired by repetition, level and receiver [95 % t interval of these differences]; below 0 the "
+    "first is better. C1 to C4 of a repetition share its weighed pours and the seeds that they are scored with. "
+    "Deployments share the bench's systematic errors, and all but D2 the θ* of the repetition; the chance errors of "
+    "their pours are drawn for each, but final actions' pours share them one by one. Probability: that chance alone "
+    "gives such a difference (sign changes of the repetitions' differences); '—' below five repetitions. Many rows "
+    "are tested: one in twenty is below 0.05 by chance."
+)
+_NEEDED = (
+    "The loss that both D2 and D3 reach: the larger of their mean least losses after the last pour. Pours until the "
+    "mean of the least loss so far is there, with 95 % intervals: percentile bootstraps over the repetitions, too "
+    "narrow with ten or fewer; a resampled mean that never gets there counts as one pour more than there were."
+)
 
 
 @dataclass(frozen=True)
@@ -49,19 +64,22 @@ def tables(study: StudyPlan, found: Gathered) -> list[Table]:
     made = []
     if found.calibrated:
         made.append(_calibrations(study, found))
-    if rows := [*_calibration_effects(study, found), *_deployment_effects(study, found)]:
+    if rows := [
+        *_calibration_effects(study, found),
+        *_deployment_effects(study, found),
+        *_final_effects(study, found),
+    ]:
         made.append(
             Table(
                 "table-effects",
                 "Who gains how much",
-                "Differences of means over the repetitions that both have, which share pours, seeds and θ* [95 % "
-                "interval]; below 0 the first is better. Probability: that chance alone gives such a difference (sign "
-                "changes of the repetitions' differences); '—' below five repetitions. Many rows are tested: one in "
-                "twenty is below 0.05 by chance.",
+                _PAIRED,
                 ("compared", "of", "mismatch", "receiver", "repetitions", "difference", "better in", "probability"),
                 rows,
             )
         )
+    if found.finals:
+        made.append(Table("table-final", "The recommended action, poured again", CAPTION, *final_rows(study, found)))
     if found.losses:
         made.append(_deployments(study, found))
         if rows := _needed(study, found):
@@ -69,9 +87,7 @@ def tables(study: StudyPlan, found: Gathered) -> list[Table]:
                 Table(
                     "table-pours",
                     "Pours to the same loss",
-                    "The loss that both D2 and D3 reach: the larger of their mean least losses after the last pour. "
-                    "Pours until the mean of the least loss so far is there, with 95 % intervals over the repetitions; "
-                    "a resampled mean that never gets there counts as one pour more than there were.",
+                    _NEEDED,
                     ("mismatch", "receiver", "loss", "D2", "D3"),
                     rows,
                 )
@@ -92,16 +108,19 @@ def _calibrations(study: StudyPlan, found: Gathered) -> Table:
                 name,
                 spent,
                 len(one.test),
-                estimate(trained).scaled(100),
-                estimate(values).scaled(100),
+                estimate(trained, SHARE).scaled(100),
+                estimate(values, SHARE).scaled(100),
                 _thetas(one.results),
             ]
         )
     return Table(
         "table-calibration",
         "Discrepancy of the calibrated simulators",
-        f"Mean |measured − simulated| of the normalised spillage, mean over repetitions [95 % interval], at "
-        f"{study.compared} mismatch. Uncalibrated: searched parameters at their defaults.",
+        f"Mean |measured − simulated| of the normalised spillage, mean over repetitions [95 % t interval], at "
+        f"{study.compared} mismatch. Uncalibrated: searched parameters at their defaults. Repetitions weigh the same "
+        f"{study.pour_count} actions anew, and keep {study.holdout} of them for testing: test pours recur between "
+        "repetitions. C1's share one simulated grid, too: its interval has the chance of pours, and none of the grid's "
+        "simulations.",
         ("strategy", "simulations", "repetitions", "training pours [%]", "test pours [%]", "θ*, mean ± deviation"),
         rows,
     )
@@ -126,7 +145,7 @@ def _calibration_effects(study: StudyPlan, found: Gathered) -> list[list[str | i
     rows: list[list[str | int | float | Estimate]] = []
     for first, second in PAIRS:
         if first in found.calibrated and second in found.calibrated:
-            one = effect(tests_of(found, first), tests_of(found, second))
+            one = effect(tests_of(found, first), tests_of(found, second), SHARE)
             rows.append(_effect_row(f"{first} − {second}", "test discrepancy [%]", study.compared, "—", one, 100.0))
     return rows
 
@@ -143,11 +162,21 @@ def _deployment_effects(study: StudyPlan, found: Gathered) -> list[list[str | in
             for pour in checkpoints(study, TABLE_POURS):
                 for some in [[name] for name in receivers] + ([receivers] if len(receivers) > 1 else []):
                     values = [at_pour_of(found, level, some, arm, pour) for arm in (first, second)]
-                    one = effect(*values)
+                    one = effect(values[0], values[1], loss_range(study))
                     if one.difference.count:
                         of = f"least {unit.label} after {pour}"
                         name = some[0] if len(some) == 1 else ALL
                         rows.append(_effect_row(f"{first} − {second}", of, level, name, one, unit.factor))
+    return rows
+
+
+def _final_effects(study: StudyPlan, found: Gathered) -> list[list[str | int | float | Estimate]]:
+    if not found.finals:
+        return []
+    unit, rows = deployment_unit(study.deployments[0].plan), list[list[str | int | float | Estimate]]()
+    for compared, level, receivers, one in final_effects(study, found):
+        name = receivers[0] if len(receivers) == 1 else ALL
+        rows.append(_effect_row(compared, f"{unit.label} of the final action", level, name, one, unit.factor))
     return rows
 
 
@@ -176,12 +205,13 @@ def _deployments(study: StudyPlan, found: Gathered) -> Table:
             for arm in arms:
                 curves = found.best_so_far(Key(level, receiver, arm))
                 if curves:
-                    values = [estimate(at_pour(curves, pour)).scaled(unit.factor) for pour in pours]
+                    values = [mean_loss(study, at_pour(curves, pour)) for pour in pours]
                     rows.append([level, receiver, arm, len(curves), *values])
     return Table(
         "table-deployment",
         f"Least {unit.label} so far",
-        "Mean over repetitions [95 % interval]. D1 pours once: its number stays.",
+        "Mean over repetitions [95 % t interval]. D1 pours once: its number stays, while the least of several pours, "
+        "each with its chance, is partly luck.",
         ("mismatch", "receiver", "strategy", "repetitions", *(f"after {n} pour{'s' * (n > 1)}" for n in pours)),
         rows,
     )
