@@ -169,14 +169,14 @@ def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
     assert check_campaign(plan) == []
     assert plan.laboratory.arm is not None
     arm = plan.laboratory.arm
-    lower = replace(arm.limits, box_high=(arm.limits.box_high[0], arm.limits.box_high[1], 0.25))
-    low = replace(plan, laboratory=replace(plan.laboratory, arm=replace(arm, limits=lower)))
+    upright = replace(arm.limits, tilt=1.0)
+    low = replace(plan, laboratory=replace(plan.laboratory, arm=replace(arm, limits=upright)))
     problems = check_campaign(low)
     assert len(problems) == 2
     said = problems[0].message
     assert said.startswith("calibration: the arm can make no action that was tried; for example")
     assert re.search(r"for example angular_velocity \S+ deg/s  max_angle \S+ deg: the arm can't", said)  # as searched
-    assert "widen arm.limits.box" in said
+    assert "57.3 deg are allowed: lower max_angle, or raise arm.limits.tilt" in said
     assert problems[0].where == "calibration.actions"
     assert "deployment into 'narrow'" in problems[1].message
 
