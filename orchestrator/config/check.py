@@ -171,11 +171,11 @@ class _Checker:
         # The slowest to vary is the place: pours of one place and one largest tilt go through the same poses.
         seen = set()
         for action in recorded:
-            place = (action.x_offset, action.y_offset, action.height)
-            tilts = [a.max_angle for a in recorded if (a.x_offset, a.y_offset, a.height) == place]
-            if place in seen or action.max_angle < max(tilts):
+            at = (action.x_offset, action.y_offset, action.height)
+            tilts = [a.max_angle for a in recorded if (a.x_offset, a.y_offset, a.height) == at]
+            if at in seen or action.max_angle < max(tilts):
                 continue
-            seen.add(place)
+            seen.add(at)
             contact = touch(scene, action, *vessels)
             if contact is not None:
                 shown = action.display("x_offset", "height", "max_angle")
