@@ -331,11 +331,11 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
 def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial": 4}}, read("quick")["mismatch"][:1]
     deployment = {"D3": {**read("quick")["deployment"]["D3"], "pours": 1, "repetitions": 1}}
-    study = small(tmp_path, calibration=arms, deployment=deployment, mismatch=levels)
+    study = replace(small(tmp_path, calibration=arms, deployment=deployment, mismatch=levels), confirm=0)
     blocked = run_folder(study.folder, "calibration.small.C4.01")
     blocked.mkdir(parents=True)
     (blocked / "journal.sqlite").write_bytes(b"no journal at all, but as long as one" * 40)
-    status = run_toy_study(replace(study, confirm=0))
+    status = run_toy_study(study)
     assert set(status.failed) == {"calibration.small.C4.01"}
     assert "not a journal" in status.failed["calibration.small.C4.01"]
     assert status.skipped == {"deployment.small.D3.deployment-narrow.01"}, "it needs the θ* that there is none of"
