@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from dyna import AXES, SCENE
 from hybrid_models import SCATTER, WORLDS
 from machine import describe, pin, say, show
 from optimiser_problems import BY_NAME, Floats, World
@@ -27,22 +28,12 @@ from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simu
 from orchestrator.strategies.deployment import Deployment
 from orchestrator.strategies.deployment_d2 import RealOnly
 from orchestrator.strategies.deployment_d3 import Hybrid
-from sim_engine.action import DEG
-from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.space import Axis, Space
-from sim_engine.task import Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.space import Space
 
-SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
-SCENE = Scene(
-    "cup",
-    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
-    cylinder("cup", inner_radius=0.03, inner_height=0.08),
-    Liquid(mass=0.2),
-    fixed={"height": 0.03},
-)
+SPACE = Space(AXES[:2])
 SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
     **WORLDS,
     "twice": lambda world, u, _: min(2.0 * world.true(u), 1.0),

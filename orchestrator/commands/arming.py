@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import sys
 import termios
@@ -19,7 +18,7 @@ from actors.protocols import InvalidActionError
 from orchestrator.commands.common import BAD_INPUT, RefusalError, say
 from orchestrator.config.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
-from orchestrator.strategies.prior import region_of
+from orchestrator.strategies.prior import actions_all_over
 from sim_engine.action import Action
 from sim_engine.space import Space
 from sim_engine.task import Scene
@@ -101,14 +100,10 @@ def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> lis
 
 
 def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) -> list[tuple[Scene, Action]]:
-    corners = itertools.islice(itertools.product((0.0, 1.0), repeat=actions.dimension), CORNERS)
-    drawn = np.random.default_rng(0).random((INTERIOR, actions.dimension)).tolist()
-    found, region = [], region_of(actions, constraints)
-    for point in ([0.5] * actions.dimension, *map(list, corners), *drawn):
-        if region is not None and not region.allows(np.array([point]))[0]:
-            continue
+    found = []
+    for values in actions_all_over(actions, constraints, corners=CORNERS, drawn=INTERIOR):
         try:
-            found.append((scene, scene.action(actions.decode(point))))
+            found.append((scene, scene.action(values)))
         except ValueError:
             continue  # no such action
     return found

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,8 @@ from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from orchestrator.config.errors import ConfigError, Problem
 from orchestrator.config.yaml_source import Document, Loc
-from orchestrator.plan import CampaignPlan
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.strategies.prior import actions_all_over
 from sim_engine.action import Action
 from sim_engine.contact import describe_contact, first_contact
 from sim_engine.hydrostatics import level
@@ -27,8 +28,8 @@ from sim_engine.vessel.vessel import Vessel, check_holds
 POSE_SPACING = 3e-3
 """Largest way of any point of the pourer between two checked poses [m]: less than most walls."""
 
-RANDOM_ACTIONS = 16
-"""Tried beside the middle and the corners of an action space before saying that all of it touches."""
+CORNERS, DRAWN = 64, 16
+"""Actions of a space that are tried beside its middle before saying that all of it touches."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +91,16 @@ class _Checker:
                 self.add(places[name], f"{role.text}: {name} can't hold the {load}: {error}")
         return (pourer, receiver) if ok else None
 
-    def reachable(self, scene: Scene, actions: Space, role: _Role) -> None:
+    def reachable(self, plan: CalibrationPlan | DeploymentPlan, scene: Scene, role: _Role) -> None:
         """Some action of the space must pour, not touch, and be one that the arm can make."""
         vessels = self.scene(scene, role)
         self._payload(scene)
-        if vessels is None or self._never_pours(scene, actions, vessels[0], role):
+        actions = plan.actions
+        trials = actions_all_over(actions, plan.constraints, corners=CORNERS, drawn=DRAWN)
+        if vessels is None or self._never_pours(scene, trials, vessels[0], role):
             return
         first = beyond = ""
-        for chosen in _trials(actions):
+        for chosen in trials:
             try:
                 contact = touch(scene, scene.action(chosen), *vessels)
             except ValueError as error:  # an action out of bounds, or a motion that can't be made
@@ -130,10 +133,10 @@ class _Checker:
         )
         self.add((("liquid", "mass"), ("liquid",)), text)
 
-    def _never_pours(self, scene: Scene, actions: Space, pourer: Vessel, role: _Role) -> bool:
+    def _never_pours(self, scene: Scene, trials: Sequence[dict[str, float]], pourer: Vessel, role: _Role) -> bool:
         """Whether the liquid stays below the lip at the largest tilt of the space, which is told."""
         tilts = []
-        for chosen in _trials(actions):
+        for chosen in trials:
             try:
                 tilts.append(scene.action(chosen).max_angle)
             except ValueError:
@@ -209,7 +212,7 @@ def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Probl
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)
         if calibration.records is None:
-            checker.reachable(calibration.scene, calibration.actions, _Role("calibration", section))
+            checker.reachable(calibration, calibration.scene, _Role("calibration", section))
         else:
             pours, at = calibration.records.pours, ("calibration", "pours")
             checker.recorded(calibration.scene, [p.action for p in pours], _Role("calibration.pours", section), at)
@@ -221,7 +224,7 @@ def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Probl
         for i, scene in enumerate(plan.deployment.scenes):
             receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
-            checker.reachable(scene, plan.deployment.actions, role)
+            checker.reachable(plan.deployment, scene, role)
     whole = [p if isinstance(p, Problem) else Problem(plan.source, 0, 0, "", p) for p in checker.problems]
     return list(dict.fromkeys(whole))
 
@@ -257,10 +260,3 @@ def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str
     return describe_contact(
         contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
     )
-
-
-def _trials(actions: Space) -> list[dict[str, float]]:
-    middle = [0.5] * actions.dimension
-    corners = [list(c) for c in itertools.islice(itertools.product((0.0, 1.0), repeat=actions.dimension), 64)]
-    drawn = np.random.default_rng(0).random((RANDOM_ACTIONS, actions.dimension)).tolist()
-    return [actions.decode(point) for point in (middle, *corners, *drawn)]

@@ -58,18 +58,17 @@ def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver
     if not pours:
         raise ValueError("trust figure: no pour was compared with the simulations")
     figure, (left, right) = style.new_figure(1, 2, size=(8.2, 3.9))
-    z = np.array(trust["z_scores"])
     if trust["alarm"]:
         verdict = "the simulator is wrong here"
     else:
-        verdict = "better than simulated" if np.abs(z).mean() > trust["limit"] else "the simulator is borne out"
+        verdict = "better than simulated" if trust.get("better") else "the simulator is borne out"
     figure.suptitle(
         f"First pours against simulation: {receiver}: {verdict}", fontsize=12.5, color=style.INK, x=0.02, ha="left"
     )
     numbers = np.array([pour["number"] for pour in pours])
     _losses(left, numbers, pours, unit)
     style.dress(left, title="weighed and simulated", x="pour", y=unit.label)
-    limit = trust["limit"]
+    limit, z = trust["limit"], trust["z_scores"]
     right.bar(numbers, z, 0.5, color=[style.BEST if value > limit else style.GOOD for value in z])
     right.axhline(limit, color=style.INK, linewidth=1.0, linestyle="--", label=f"limit {limit:g}")
     mean = f"mean, better counts as 0: {trust['mean_z']:.1f}"

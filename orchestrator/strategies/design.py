@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 MAX_TRIES = 12
 """Actions tried in one stratum before it is given up as impossible."""
 
-
 MAX_DRAWS = 100
 """Points of a stratum of which none meets the constraints, before one from anywhere is taken."""
 

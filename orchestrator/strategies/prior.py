@@ -1,15 +1,17 @@
-"""The prior g over actions, where they meet the constraints: uniform, or along some dimensions normal; drawn evenly."""
+"""The prior g over actions, where they meet the constraints: uniform, or along some dimensions normal; drawn evenly.
+
+Whoever reads a campaign's file loads this; scipy is loaded by those who draw.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
-from scipy.stats import qmc
 
 from actors.optimizer.core.problem import Linear, Point
 from orchestrator.plan import NormalPrior
@@ -46,10 +48,34 @@ def actions_of_prior(
     if region is not None:
         drawn = region.draw(count, np.random.default_rng(seed), even=True, law=law)
         return tuple(tuple(map(float, row)) for row in drawn)
+    from scipy.stats import qmc
+
     sampler = qmc.Sobol(actions.dimension, scramble=True, rng=np.random.default_rng(seed))
     exponent = max(1, int(np.ceil(np.log2(max(count, 1)))))
     uniform = sampler.random_base2(exponent)[:count]
     return tuple(tuple(map(float, row)) for row in (uniform if law is None else law(uniform)))
+
+
+def actions_all_over(
+    actions: Space, constraints: Sequence[Linear], *, corners: int, drawn: int
+) -> list[dict[str, float]]:
+    """Allowed actions from everywhere, for checks: the middle, corners, some between. The same whenever asked.
+
+    Args:
+        corners: of the box, at most.
+        drawn: actions between.
+
+    Returns:
+        Values of the searched dimensions [SI].
+    """
+    rng, region = np.random.default_rng(0), region_of(actions, constraints)
+    ends = itertools.islice(itertools.product((0.0, 1.0), repeat=actions.dimension), corners)
+    points = np.array([[0.5] * actions.dimension, *ends])
+    if region is None:
+        between = rng.random((drawn, actions.dimension))
+    else:
+        points, between = points[region.allows(points)], region.draw(drawn, rng, even=False)
+    return [actions.decode(point) for point in (*points, *between)]
 
 
 def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
@@ -63,6 +89,8 @@ def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
 
 def _distributed(uniform: Array, actions: Space, prior: Sequence[NormalPrior]) -> Array:
     """Points (m, dimension) of the unit cube that are distributed as g is, from uniform ones."""
+    from scipy.special import ndtr, ndtri
+
     points = uniform.copy()
     for one in prior:
         i = actions.names.index(one.name)

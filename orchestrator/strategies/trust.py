@@ -96,8 +96,7 @@ class TrustCheck:
             if self._plan.policy != "ask":
                 self.settle(self._plan.policy)
         elif len(pours) == self._plan.pours:
-            far = sum(abs(one.z) for one in self.comparisons) / len(self.comparisons) > self._plan.limit
-            verdict = "pours are better than simulated" if far else "the simulator is borne out"
+            verdict = "pours are better than simulated" if self.better else "the simulator is borne out"
             self.decisions.append(Decision(f"{verdict}: {self._text}", {"mean_z": self.mean_z}))
 
     @property
@@ -109,6 +108,11 @@ class TrustCheck:
     def alarm(self) -> bool:
         """The simulator promised too much here."""
         return self.mean_z > self._plan.limit
+
+    @property
+    def better(self) -> bool:
+        """The simulator promised too little, by as much as would be an alarm the other way."""
+        return sum(max(-one.z, 0.0) for one in self.comparisons) > self._plan.limit * len(self.comparisons) > 0.0
 
     @property
     def question(self) -> Ask | None:
@@ -137,6 +141,7 @@ class TrustCheck:
         return {
             "z_scores": [one.z for one in self.comparisons],
             "alarm": self.alarm,
+            "better": self.better,
             "mean_z": self.mean_z,
             "limit": self._plan.limit,
             "policy": self._plan.policy,

@@ -68,17 +68,22 @@ angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,split
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    write(tmp_path, "lab.yaml", LABORATORY)
-    write(tmp_path, "beaker.yaml", VESSEL)
-    write(tmp_path, "cup.yaml", VESSEL.replace("beaker", "cup").replace("40", "32"))
-    write(tmp_path, "pours.csv", CSV)
-    return tmp_path
+    return write_good(tmp_path)
 
 
 def write(folder: Path, name: str, text: str) -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def write_good(folder: Path) -> Path:
+    """What the campaigns here refer to."""
+    write(folder, "lab.yaml", LABORATORY)
+    write(folder, "beaker.yaml", VESSEL)
+    write(folder, "cup.yaml", VESSEL.replace("beaker", "cup").replace("40", "32"))
+    write(folder, "pours.csv", CSV)
+    return folder
 
 
 def report(path: Path) -> str:

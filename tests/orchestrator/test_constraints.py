@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from actors.optimizer.core.problem import Data, Linear, SuggestProblem
 from actors.optimizer.core.propose import propose
+from orchestrator.config.check import check_campaign
 from orchestrator.config.constraints import constraint_as_file, parse_constraint
 from orchestrator.config.load import load_campaign
 from orchestrator.config.quantities import QuantityError
@@ -31,7 +32,7 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 
 from .play import ACTIONS, SCENE, THETA, Play, calibration_plan, deployment_plan
-from .test_bad_input import DEPLOYED, LABORATORY, VESSEL, report, write
+from .test_bad_input import DEPLOYED, report, write, write_good
 
 SPACE = Space(
     (
@@ -106,10 +107,7 @@ CONSTRAINED = DEPLOYED.replace("x_offset: 84 mm, ", "").replace(
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    write(tmp_path, "beaker.yaml", VESSEL)
-    write(tmp_path, "cup.yaml", VESSEL.replace("beaker", "cup").replace("40", "35"))
-    write(tmp_path, "lab.yaml", LABORATORY)
-    return tmp_path
+    return write_good(tmp_path)
 
 
 def test_both_sections_have_theirs_and_the_resolved_file_means_the_same(folder: Path) -> None:
@@ -140,6 +138,13 @@ def test_those_that_leave_nothing_are_refused(folder: Path) -> None:
     text = CONSTRAINED.replace("x_offset >= 100 mm", "x_offset >= 151 mm")
     message = "calibration.actions.constraints: leave next to nothing of the ranges beside them; loosen one"
     assert message in report(write(folder, "campaign.yaml", text))
+
+
+def test_a_space_whose_allowed_actions_all_touch_is_refused_by_the_check(folder: Path) -> None:
+    wide = CONSTRAINED.replace("[80 mm, 150 mm]", "[60 mm, 150 mm]")
+    assert check_campaign(load_campaign(write(folder, "campaign.yaml", wide))) == []
+    near = write(folder, "near.yaml", wide.replace("x_offset >= 100 mm", "x_offset <= 64 mm"))
+    assert any("touch at every action" in str(problem) for problem in check_campaign(load_campaign(near)))
 
 
 # -- in what is asked for ----------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ from orchestrator.study.plan import StudyPlan, study_fingerprint
 from orchestrator.study.worker import run_cell
 
 from .play import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, Play
-from .test_bad_input import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, report, write
+from .test_bad_input import CAMPAIGN, DEPLOYED, report, write, write_good
 from .test_study import read, written
 from .toy_study import ToyLaboratory
 from .toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
@@ -41,10 +41,7 @@ from .toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    write(tmp_path, "beaker.yaml", VESSEL)
-    write(tmp_path, "cup.yaml", VESSEL.replace("beaker", "cup").replace("40", "32"))
-    write(tmp_path, "lab.yaml", LABORATORY)
-    return tmp_path
+    return write_good(tmp_path)
 
 
 def campaign(folder: Path, keys: str) -> CampaignPlan:

@@ -22,7 +22,7 @@ from sim_engine.action import DEG
 from sim_engine.space import Axis, Space
 
 from .play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play
-from .test_bad_input import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, report, write
+from .test_bad_input import CAMPAIGN, DEPLOYED, report, write, write_good
 from .toys import calibration_spill, weighed
 
 SLOW = NormalPrior("angular_velocity", 30 * DEG, 10 * DEG)
@@ -35,10 +35,7 @@ WITH_PRIOR = CAMPAIGN.replace(RANGE, f"angular_velocity: {{range: [15 deg/s, 120
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    write(tmp_path, "beaker.yaml", VESSEL)
-    write(tmp_path, "cup.yaml", VESSEL.replace("beaker", "cup").replace("40", "32"))
-    write(tmp_path, "lab.yaml", LABORATORY)
-    return tmp_path
+    return write_good(tmp_path)
 
 
 # -- what is drawn -----------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +19,8 @@ from orchestrator.study.plan import StudyPlan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+Rows = list[tuple[int, str, list[float]]]
 
 SECONDS_OF_SIMULATION = (0.1, 1.0, 25.0)
 SECONDS_OF_POUR = (5.0, 90.0, 600.0)
@@ -63,13 +65,26 @@ def checkpoints(study: StudyPlan, wanted: tuple[int, ...] = CHECKPOINTS) -> list
     return sorted({min(pour, most_pours(study)) for pour in wanted})
 
 
-def bar(axes: Axes, place: float, width: float, one: Estimate, arm: str, arms: Sequence[str]) -> None:
-    """A bar with its interval."""
-    shown = look(arm, arms)
-    axes.bar(
-        place, one.mean, width, color=shown.colour, hatch=shown.hatch, edgecolor="white", linewidth=0.0,
-        yerr=error(one), capsize=2, error_kw={"linewidth": 1.2}, label=arm,
-    )  # fmt: skip
+def bars(axes: Axes, groups: Sequence[str], arms: Sequence[str], of: Callable[[int, str], Estimate]) -> Rows:
+    """A group of bars for each name, in it one for each arm, with their intervals.
+
+    Args:
+        of: an estimate by the number of its group and its arm.
+
+    Returns:
+        Group's number, arm, and numbers of each bar.
+    """
+    width, rows = 0.8 / len(arms), []
+    for i in range(len(groups)):
+        for j, arm in enumerate(arms):
+            one, shown = of(i, arm), look(arm, arms)
+            axes.bar(
+                i + (j + 0.5) * width - 0.4, one.mean, 0.92 * width, color=shown.colour, hatch=shown.hatch,
+                edgecolor="white", linewidth=0.0, yerr=error(one), capsize=2, error_kw={"linewidth": 1.2}, label=arm,
+            )  # fmt: skip
+            rows.append((i, arm, [one.count, one.mean, one.low, one.high]))
+    axes.set_xticks(range(len(groups)), groups)
+    return rows
 
 
 def least_shown(unit: LossUnit) -> float:
@@ -82,14 +97,13 @@ def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
     unit, receiver, pours = deployment_unit(study.deployments[0].plan), receivers[0], checkpoints(study)
     figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
     rows: list[list[object]] = []
-    width = 0.8 / len(arms)
     for axes, level in zip(grid[0], levels, strict=True):
-        for i, pour in enumerate(pours):
-            for j, arm in enumerate(arms):
-                one = mean_loss(study, at_pour(found.best_so_far(Key(level, receiver, arm)), pour))
-                rows.append([level, receiver, arm, pour, one.count, one.mean, one.low, one.high])
-                bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
-        axes.set_xticks(range(len(pours)), [str(pour) for pour in pours])
+
+        def after(i: int, arm: str, level: str = level) -> Estimate:
+            return mean_loss(study, at_pour(found.best_so_far(Key(level, receiver, arm)), pours[i]))
+
+        drawn = bars(axes, [str(pour) for pour in pours], arms, after)
+        rows += [[level, receiver, arm, pours[i], *numbers] for i, arm, numbers in drawn]
         style.dress(axes, title=f"{level} mismatch", x="pours", y=f"least {unit.label}" if level == levels[0] else "")
     legend(figure, arms)
     return Drawn(
@@ -108,15 +122,12 @@ def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
     unit = deployment_unit(study.deployments[0].plan)
     figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
     rows: list[list[object]] = []
-    width = 0.8 / len(arms)
     for axes, level in zip(grid[0], levels, strict=True):
-        for i, receiver in enumerate(receivers):
-            for j, arm in enumerate(arms):
-                losses = found.losses.get(Key(level, receiver, arm), [])
-                one = mean_loss(study, [mean(pours) for pours in losses])
-                rows.append([level, receiver, arm, one.count, one.mean, one.low, one.high])
-                bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
-        axes.set_xticks(range(len(receivers)), receivers)
+
+        def of_all(i: int, arm: str, level: str = level) -> Estimate:
+            return mean_loss(study, [mean(pours) for pours in found.losses.get(Key(level, receivers[i], arm), [])])
+
+        rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in bars(axes, receivers, arms, of_all)]
         style.dress(axes, title=f"{level} mismatch", y=f"mean {unit.label}" if level == levels[0] else "")
     legend(figure, arms)
     return Drawn(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from orchestrator.report import style
-from orchestrator.report.study.deployments import bar, loss_range, mean_loss, places
+from orchestrator.report.study.deployments import bars, loss_range, mean_loss, places
 from orchestrator.report.study.drawing import Drawn, legend
 from orchestrator.report.study.effects import Effect, effect
 from orchestrator.report.study.gather import Gathered, Key, mean
@@ -29,14 +29,12 @@ def draw_finals(study: StudyPlan, found: Gathered) -> list[Drawn]:
     unit = deployment_unit(study.deployments[0].plan)
     figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
     rows: list[list[object]] = []
-    width = 0.8 / len(arms)
     for axes, level in zip(grid[0], levels, strict=True):
-        for i, receiver in enumerate(receivers):
-            for j, arm in enumerate(arms):
-                one = mean_loss(study, list(final_losses(found, level, [receiver], arm).values()))
-                rows.append([level, receiver, arm, one.count, one.mean, one.low, one.high])
-                bar(axes, i + (j + 0.5) * width - 0.4, width * 0.92, one, arm, arms)
-        axes.set_xticks(range(len(receivers)), receivers)
+
+        def poured_again(i: int, arm: str, level: str = level) -> Estimate:
+            return mean_loss(study, list(final_losses(found, level, [receivers[i]], arm).values()))
+
+        rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in bars(axes, receivers, arms, poured_again)]
         style.dress(axes, title=f"{level} mismatch", y=f"{unit.label}" if level == levels[0] else "")
     legend(figure, arms)
     header = ("level", "receiver", "strategy", "repetitions", f"final_{unit.unit}", "low", "high")
