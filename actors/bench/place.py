@@ -23,7 +23,7 @@ class Site:
 
     async def addresses(self) -> Addresses:
         """Where controller and balance are."""
-        addresses: Addresses = await self.device.call("addresses", deadline=2.0 * DEADLINE)
+        addresses: Addresses = await self.device.call("addresses", deadline=4.0 * DEADLINE)
         return addresses
 
     async def prepare(self, seed: tuple[int, ...]) -> None:

@@ -16,7 +16,7 @@ from math import degrees
 from types import TracebackType
 from typing import Any
 
-START_TIME = 20.0
+START_TIME = 40.0
 """Longest wait for the process to be ready [s]."""
 
 

@@ -20,7 +20,7 @@ from actors.balance.virtual_serial.voice import VOICES
 from actors.protocols import LaboratoryError
 from actors.ray_warden import MARK
 
-PATIENCE = 10.0
+PATIENCE = 40.0
 """How long its process may take to start, or to answer [s]."""
 
 
