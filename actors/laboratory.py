@@ -60,6 +60,7 @@ def open_laboratory(
     need_bench: bool,
     make: Callable[[], Simulator] = pour_simulator,
     operator: Operator | None = None,
+    kept: InProcessSimulatorPool | None = None,
 ) -> Laboratory:
     """A laboratory, to be entered with `async with`; nothing starts before that.
 
@@ -68,6 +69,7 @@ def open_laboratory(
         need_bench: whether pours will be asked for.
         make: makes simulators, where they run.
         operator: who answers questions, where a person does.
+        kept: where all runs in this process: simulators that outlive the laboratory, in place of its own.
 
     Raises:
         LaboratoryError: a bench is needed and there is none, or nobody to stand beside it, or the mode is not known.
@@ -81,7 +83,7 @@ def open_laboratory(
             f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
         )
     if spec.in_process:
-        return InProcessLaboratory(spec if need_bench else None, make, operator)
+        return InProcessLaboratory(spec if need_bench else None, make, operator, kept)
     return RayLaboratory(spec, make, need_bench=need_bench, operator=operator)
 
 
@@ -104,6 +106,7 @@ class _Rooms:
 
     def __init__(self) -> None:
         self._pool: _ClosablePool | None = None
+        self._kept: _ClosablePool | None = None
         self._world: _ClosablePool | None = None
         self._devices: list[Device] = []
         self._wired: WiredRooms | None = None
@@ -156,7 +159,7 @@ class _Rooms:
         wired, self._wired = self._wired, None
         if wired is not None:
             await wired.close()
-        pools = [pool for pool in (self._pool, self._world) if pool is not None]
+        pools = [pool for pool in (self._pool, self._world) if pool is not None and pool is not self._kept]
         await asyncio.gather(
             *(pool.close() for pool in pools), *(device.close() for device in self._devices), return_exceptions=True
         )
@@ -174,6 +177,7 @@ class InProcessLaboratory(_Rooms):
         spec: of the bench; None where no pours are needed.
         make: makes the simulator.
         operator: a person, where one answers.
+        kept: simulators to use in place of its own; they stay open.
     """
 
     def __init__(
@@ -181,12 +185,13 @@ class InProcessLaboratory(_Rooms):
         spec: LaboratorySpec | None,
         make: Callable[[], Simulator] = pour_simulator,
         operator: Operator | None = None,
+        kept: InProcessSimulatorPool | None = None,
     ) -> None:
         super().__init__()
-        self._spec, self._make, self._operator = spec, make, operator
+        self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
 
     async def __aenter__(self) -> InProcessLaboratory:
-        self._pool = InProcessSimulatorPool(make=self._make)
+        self._pool = self._kept or InProcessSimulatorPool(make=self._make)
         proposer = LocalDevice("optimiser", Proposer)
         self._devices.append(proposer)
         self._optimizer = DeviceOptimizer(proposer)

@@ -200,7 +200,10 @@ def _skip(waiting: list[Cell], status: Status) -> None:
 def _end(workers: Iterable[Worker]) -> None:
     mine = list(workers)
     for worker in mine:
-        worker.process.terminate()
+        if worker.cell is None:
+            worker.close()  # it keeps what it has compiled
+        else:
+            worker.process.terminate()
     deadline = time.monotonic() + GRACE
     for worker in mine:
         try:

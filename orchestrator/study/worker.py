@@ -1,8 +1,8 @@
 """Cells in a process of their own, one after the other: `python -m orchestrator.study.worker STUDY.yaml`.
 
 Each line of its stdin names a cell, each line of its stdout is the JSON list [cell, what went wrong or null]. Starting
-Python, Taichi and its kernels takes longer than a small cell, so a worker is kept. It ends when its stdin does, in the
-middle of a cell too: the cell's journal says how far it came, and the next worker goes on from there.
+Python, Taichi and its kernels takes longer than a small cell, so a worker and its simulator are kept. It ends when its
+stdin does, amid a cell too: the cell's journal says how far it came, and the next worker goes on from there.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.protocols import Laboratory, LaboratoryError
+from actors.simulation.in_process import InProcessSimulatorPool
 from actors.spec import LaboratorySpec
 from orchestrator.campaign import run_campaign
 from orchestrator.errors import RunError
@@ -30,20 +31,25 @@ from orchestrator.study.code import CODE, code_now
 from orchestrator.study.folder import as_begun, read_result, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
 
+Make = Callable[[LaboratorySpec, bool], Laboratory]
+"""Makes the laboratory of a cell, with a bench or without."""
 
-def laboratory_in_process(spec: LaboratorySpec, need_bench: bool) -> Laboratory:
-    """Everything in threads of this process: cells run side by side, each on a core."""
+
+def in_this_process(simulators: InProcessSimulatorPool) -> Make:
+    """Makes laboratories in threads of this process: cells run side by side, each on a core.
+
+    Args:
+        simulators: that all of them use, one after the other.
+    """
     from actors.laboratory import open_laboratory
 
-    return open_laboratory(replace(spec, in_process=True), need_bench=need_bench)
+    def make(spec: LaboratorySpec, need_bench: bool) -> Laboratory:
+        return open_laboratory(replace(spec, in_process=True), need_bench=need_bench, kept=simulators)
+
+    return make
 
 
-def run_cell(
-    study: StudyPlan,
-    cell: Cell,
-    folder: Path,
-    make: Callable[[LaboratorySpec, bool], Laboratory] = laboratory_in_process,
-) -> dict[str, Any]:
+def run_cell(study: StudyPlan, cell: Cell, folder: Path, make: Make) -> dict[str, Any]:
     """Run a cell, or go on with it, and keep what came of it.
 
     Raises:
@@ -82,26 +88,36 @@ def _expected(directory: Path) -> list[list[float]]:
 
 
 def named_cells() -> Iterator[str]:
-    """The lines of stdin as they come; this process ends as soon as nobody holds the other end."""
-    names: queue.SimpleQueue[str] = queue.SimpleQueue()
+    """The lines of stdin as they come, until it ends; amid a cell this process ends with it."""
+    names: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    idle, over = threading.Event(), threading.Event()
 
     def listen() -> None:
         with os.fdopen(0, "r", encoding="utf-8", closefd=False) as lines:
             for line in lines:
                 names.put(line.strip())
-        os._exit(0 if idle.is_set() else 1)
+        over.set()
+        if not idle.is_set():
+            os._exit(1)
+        names.put(None)
 
-    idle = threading.Event()
     threading.Thread(target=listen, daemon=True).start()
     while True:
         idle.set()
         name = names.get()
         idle.clear()
+        if name is None or over.is_set():
+            return
         yield name
 
 
-def work(path: Path, make: Callable[[LaboratorySpec, bool], Laboratory] = laboratory_in_process) -> None:
-    """Run the cells that stdin names until it ends."""
+def work(path: Path, make: Make | None = None) -> None:
+    """Run the cells that stdin names until it ends.
+
+    Args:
+        path: of the study.
+        make: makes laboratories; by default in this process, around one simulator.
+    """
     from orchestrator.config.study import load_study
 
     # Libraries print to stdout, which is for answers alone: from here on they print to the log.
@@ -110,13 +126,15 @@ def work(path: Path, make: Callable[[LaboratorySpec, bool], Laboratory] = labora
     code_now()  # of the sources that this process has read, before anybody changes them
     study = as_begun(load_study(path))
     cells = {cell.id: cell for cell in cells_of(study)}
+    simulators = InProcessSimulatorPool()
     for name in named_cells():
         problem = None
         try:
-            run_cell(study, cells[name], study.folder, make)
+            run_cell(study, cells[name], study.folder, make or in_this_process(simulators))
         except (RunError, LaboratoryError) as error:
             problem = str(error)
         print(json.dumps([name, problem]), file=answers, flush=True)
+    asyncio.run(simulators.close())  # compiled kernels reach their cache
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.orchestrator.test_study import ROOT, read, written
+from tests.orchestrator.study_files import ROOT, read, written
 
 
 @pytest.mark.slow

@@ -31,8 +31,8 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 
+from .good_files import DEPLOYED, report, write, write_good
 from .play import ACTIONS, SCENE, THETA, Play, calibration_plan, deployment_plan
-from .test_bad_input import DEPLOYED, report, write, write_good
 
 SPACE = Space(
     (

@@ -32,9 +32,9 @@ from orchestrator.study.folder import finished_results, read_result
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 from orchestrator.study.worker import run_cell
 
+from .good_files import CAMPAIGN, DEPLOYED, report, write, write_good
 from .play import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, Play
-from .test_bad_input import CAMPAIGN, DEPLOYED, report, write, write_good
-from .test_study import read, written
+from .study_files import read, written
 from .toy_study import ToyLaboratory
 from .toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
 

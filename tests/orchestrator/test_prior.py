@@ -21,8 +21,8 @@ from orchestrator.strategies.prior import actions_of_prior
 from sim_engine.action import DEG
 from sim_engine.space import Axis, Space
 
+from .good_files import CAMPAIGN, DEPLOYED, report, write, write_good
 from .play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play
-from .test_bad_input import CAMPAIGN, DEPLOYED, report, write, write_good
 from .toys import calibration_spill, weighed
 
 SLOW = NormalPrior("angular_velocity", 30 * DEG, 10 * DEG)

@@ -23,7 +23,7 @@ from orchestrator.study.cells import Cell, cells_of
 from orchestrator.study.code import code_now, told
 from orchestrator.study.folder import run_folder, write_result
 from orchestrator.study.plan import StudyPlan
-from tests.orchestrator.test_study import read, written
+from tests.orchestrator.study_files import read, written
 
 FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7", "final")
 

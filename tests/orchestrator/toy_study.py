@@ -91,6 +91,7 @@ def run_toy_study(study: StudyPlan, **arguments: Any) -> Status:
 def main() -> int:
     if len(sys.argv) > 2:
         work(Path(sys.argv[1]), ToyLaboratory)  # type: ignore[arg-type]
+        return 0
     begun = time.monotonic()
     status = run_toy_study(load_study(Path(sys.argv[1])))
     print(f"{time.monotonic() - begun:.1f} s")
