@@ -91,9 +91,16 @@ def _tell_what_is_left(plan: StudyPlan, cells: tuple[Cell, ...], as_json: bool) 
             }
         )
         return
+    groups: dict[str, list[Cell]] = {}
     for cell in cells:
-        done = "finished" if cell not in left else f"{cell.simulations} simulations, {cell.pours} pours"
-        print(f"{cell.id}: {done}")
+        groups.setdefault(" ".join(filter(None, (cell.kind, cell.level, cell.arm))), []).append(cell)
+    missing = {cell.id for cell in left}
+    for name, members in groups.items():
+        todo = [cell for cell in members if cell.id in missing]
+        text = f"{len(members) - len(todo)} of {len(members)} finished"
+        if todo:
+            text += f", left: {sum(c.simulations for c in todo)} simulations, {sum(c.pours for c in todo)} pours"
+        print(f"{name:34} {text}")
     print(
         f"{len(cells)} cells, {len(left)} left: at most {simulations} simulations and {pours} pours, some "
         f"{hours:.2g} CPU hours (an estimate, good to a factor of two). Nothing was started."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from actors.cluster.versions import sources
 from actors.simulation.in_process import InProcessSimulatorPool
+from orchestrator.cli import app
 from orchestrator.config.study import load_study
 from orchestrator.requests import Failed, Poured, Slots
 from orchestrator.strategies.costs import Costing
@@ -252,3 +255,21 @@ def test_two_commands_can_not_run_one_study(tmp_path: Path) -> None:
     study = small(tmp_path)
     with opened(study), pytest.raises(StudyError, match="another process is running this study"), opened(study):
         pass
+
+
+def test_a_dry_run_tells_by_arm_what_is_left_and_begins_nothing(tmp_path: Path) -> None:
+    study = small(tmp_path, mismatch=read("quick")["mismatch"][:1])
+    assert study.source is not None
+    first = CliRunner().invoke(app, ["study", str(study.source), "--dry-run"])
+    assert first.exit_code == 0, first.output
+    assert not study.folder.exists()
+    cells = cells_of(study)
+    pours = [cell for cell in cells if cell.kind == "pours"]
+    rows = dict(re.findall(r"(?m)^(\S.*?\S)  +(.+)$", first.stdout))
+    each = study.pour_count
+    assert rows["pours small"] == f"0 of {len(pours)} finished, left: 0 simulations, {each * len(pours)} pours"
+    assert f"{len(cells)} cells, {len(cells)} left" in first.stdout
+    run_cell(study, pours[0], study.folder, ToyLaboratory)  # type: ignore[arg-type]
+    then = CliRunner().invoke(app, ["study", str(study.source), "--dry-run"]).stdout
+    assert f"pours small {' ' * 22} 1 of {len(pours)} finished" in then
+    assert f"{len(cells)} cells, {len(cells) - 1} left" in then

@@ -62,10 +62,10 @@ def test_cells_are_the_same_whenever_the_file_is_read_and_come_after_what_they_n
 
 
 def test_repetitions_levels_and_receivers_have_seeds_of_their_own_and_arms_share_them() -> None:
-    seeds: dict[tuple[str, str, str, int], set[int]] = {}
+    seeds: dict[tuple[str, str, str, int, int], set[int]] = {}
     for cell in cells_of(load_study(STUDIES / "paper.yaml")):
         kind = "calibration" if cell.kind == "uncalibrated" else cell.kind
-        seeds.setdefault((kind, cell.level, cell.receiver, cell.repetition), set()).add(cell.seed)
+        seeds.setdefault((kind, cell.level, cell.receiver, cell.repetition, cell.again), set()).add(cell.seed)
     assert all(len(found) == 1 for found in seeds.values())
     assert len(set.union(*seeds.values())) == len(seeds)
 
