@@ -103,13 +103,13 @@ def test_a_tool_move_to_joint_positions_ends_there(seen: Seen) -> None:
     [("moveJ", 2 * (0.5 / 1.4) ** 0.5), ("moveL", 0.1 / 0.25 + 0.25 / 1.2)],
 )
 def test_moves_take_as_long_as_their_trapezoids_say(robot: Robot, seen: Seen, move: str, expected: float) -> None:
-    began, ended = seen("moves")[f"{move} time"]
-    history = robot.controller.fault("history", since=began)
+    history = robot.controller.fault("history", since=seen("moves")[f"{move} time"])
     times, joints = np.array(history["times"]), np.array(history["joints"])
     # Joints follow their targets with a lag, so that the last micrometres take a moment longer.
-    moving = np.abs(np.diff(joints, axis=0)).max(axis=1) > 1e-5
-    taken = times[1:][moving & (times[1:] <= ended)]
-    assert taken[-1] - taken[0] == pytest.approx(expected, abs=0.05)
+    moving = times[1:][np.abs(np.diff(joints, axis=0)).max(axis=1) > 1e-5]
+    pauses = np.flatnonzero(np.diff(moving) > 0.02)
+    end = moving[pauses[0]] if len(pauses) else moving[-1]
+    assert end - moving[0] == pytest.approx(expected, abs=0.05)
 
 
 # ---- streams
@@ -315,6 +315,6 @@ def test_in_real_time_the_clock_is_right_and_packages_come_at_the_controller_s_r
     with VirtualController.start(address=next_address(), model=model_name) as controller:
         seen = observe("receiving", controller.address, seconds=1.5, frequency=rate)
         timing = controller.fault("state")["timing"]
-    assert seen["clock"] == pytest.approx(1.0, abs=0.1)
-    assert 0.5 * rate < seen["rate"] < 1.1 * rate  # the machine may be busy: some packages are seen together
+    assert seen["clock"] == pytest.approx(1.0, abs=0.2)
+    assert seen["step"] == pytest.approx(1.0 / rate, rel=1e-3)
     assert timing["cpu"] < 0.25

@@ -13,17 +13,18 @@ from shared import HOME, attempt, keep, until
 def moves(address: str) -> dict[str, Any]:
     control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     seen: dict[str, Any] = {"home": control.moveJ(HOME, 2.0, 4.0)}
-    first = receive.getTimestamp()
+    until(control.isSteady)
+    time.sleep(0.05)  # the receiving connection may be a package behind
+    seen["moveJ time"] = receive.getTimestamp()
     target = [0.5, -1.4, 1.6, -1.7, -1.4, 0.3]
     seen["moveJ"] = control.moveJ(target, 1.05, 1.4)
-    seen["moveJ time"] = [first, receive.getTimestamp()]
     until(control.isSteady)
     seen["moveJ target"], seen["moveJ reached"] = target, receive.getActualQ()
     pose = receive.getActualTCPPose()
     pose[2] += 0.1
-    first = receive.getTimestamp()
+    time.sleep(0.05)
+    seen["moveL time"] = receive.getTimestamp()
     seen["moveL"] = control.moveL(pose, 0.25, 1.2)
-    seen["moveL time"] = [first, receive.getTimestamp()]
     until(control.isSteady)
     seen["moveL target"], seen["moveL reached"] = list(pose), receive.getActualTCPPose()
     pose[1] += 0.05

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from typing import Any
 
@@ -167,10 +168,13 @@ def second(address: str) -> dict[str, Any]:
 
 
 def receiving(address: str, seconds: float = 2.0, frequency: float = 500.0) -> dict[str, Any]:
-    """How many packages arrive."""
+    """How closely packages follow each other in the controller's time, and how that runs beside ours."""
     receive = keep(RTDEReceiveInterface(address, frequency, ["timestamp", "actual_q"]))
     began, stamps = time.monotonic(), set()
     while time.monotonic() - began < seconds:
         stamps.add(receive.getTimestamp())
         time.sleep(0.0002)
-    return {"rate": len(stamps) / seconds, "clock": (max(stamps) - min(stamps)) / seconds}
+    times = sorted(stamps)
+    # A busy machine sees some packages together, but hardly all of them.
+    step = min(later - earlier for earlier, later in itertools.pairwise(times))
+    return {"step": step, "clock": (times[-1] - times[0]) / seconds}
