@@ -52,6 +52,8 @@ class PrivateRay:
             "RAY_AUTH_TOKEN_PATH": str(self.folder / "token"),
             "RAY_USAGE_STATS_ENABLED": "0",
             "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+            # Ray lets all its workers step back behind other programs (nice 15). Here simulators do so, an arm doesn't.
+            "RAY_worker_niceness": "0",
             # Makes Ray take 127.0.0.1 for the node's address and listen there only. On Windows and macOS that is its
             # habit; on Linux it would offer itself to the network.
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",

@@ -15,6 +15,9 @@ from actors.simulation.parcel import MeshParcel, unpack
 from actors.simulation.worker import SimulationWorker, Simulator
 from sim_engine.task import PourTask
 
+NICENESS = 15
+"""How far simulators step back behind the arm's driver, the optimiser and whatever else wants a core [nice]."""
+
 CONTROL = "control"
 """Concurrency group of calls that don't queue behind a job."""
 
@@ -47,6 +50,7 @@ class SimulatorProcess:
     since Ray would lose the calls that were queued and give no order to those it repeats."""
 
     def __init__(self, make: Callable[[], Simulator]) -> None:
+        os.nice(NICENESS)
         self._worker = SimulationWorker(make)
         self._recalled: set[int] = set()
 

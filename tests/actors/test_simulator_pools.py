@@ -13,7 +13,9 @@ import numpy as np
 import psutil
 import pytest
 
+from actors.arm.virtual_arm import VirtualArm
 from actors.cluster.versions import versions
+from actors.device import RayDevice
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.pool import RaySimulatorPool
@@ -125,6 +127,21 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
     busy, jobs = asyncio.run(play())
     assert jobs == 4
     assert busy == pytest.approx(0.9, abs=0.25)
+
+
+@pytest.mark.ray
+def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running, fake, task):
+    async def play():
+        arm = RayDevice("arm", VirtualArm, 0.0)
+        pool = RaySimulatorPool(2, make=fake())
+        try:
+            await pool.simulate(task())
+            return [os.getpriority(os.PRIO_PROCESS, pid) for pid in [await arm.pid(), *await pool.pids()]]
+        finally:
+            await asyncio.gather(pool.close(), arm.close())
+
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    assert asyncio.run(play()) == [own, *[min(own + 15, 19)] * 2]
 
 
 @pytest.mark.ray
