@@ -140,6 +140,7 @@ class Deployment(ABC):
                 trial.status, trial.reason = "refused", reason
             case Failed(kind, reason):
                 trial.status, trial.reason = "failed", f"{kind}: {reason}"
+                trial.mishap = kind == "pour_failed"
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
         penalised = self._plan.on_failed_pour == "penalise"
@@ -224,6 +225,11 @@ class Deployment(ABC):
         return self._plan.refusals == "avoid"
 
     @property
+    def _warned(self) -> bool:
+        """Pours that went wrong are warnings of more near them; in the paper they are pours that lost everything."""
+        return self._avoids and not self._plan.plain
+
+    @property
     def _refused(self) -> int:
         return sum(p.status == "refused" for p in self._pours)
 
@@ -296,6 +302,7 @@ class Deployment(ABC):
             constraints=self._plan.constraints,
             infeasible=tuple(trial.point for trial in trials if trial.refused),
             refused=tuple(p.point for p in self._pours if p.status == "refused") if self._avoids else (),
+            failed=tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
             noise=self._plan.noise,
             **changes,
         )

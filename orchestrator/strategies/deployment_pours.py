@@ -29,6 +29,7 @@ class PourTrial:
     Attributes:
         cost, vector: what enters the data, as one number and as objectives; None: nothing does.
         status: 'pouring', 'weighed', 'refused' (an invalid action: nothing was poured) or 'failed'.
+        mishap: it failed under way, as it may where the vessels touch after all.
     """
 
     number: int
@@ -39,6 +40,7 @@ class PourTrial:
     cost: float | None = None
     status: str = "pouring"
     reason: str = ""
+    mishap: bool = False
     measurement: PourMeasurement | None = None
     vector: Vector | None = None
 

@@ -62,6 +62,7 @@ def questions(draw):
         pouring=tuple(draw(st.lists(point, max_size=2))),
         effort=draw(st.sampled_from([None, Effort()])),
         infeasible=tuple(draw(st.lists(point, max_size=3))),
+        failed=tuple(draw(st.lists(point, max_size=3))),
         constraints=constraints,
         noise=draw(st.sampled_from(["constant", "varying"])),
     )
@@ -96,15 +97,16 @@ def test_who_answers_first_changes_nothing(question, shuffle):
         shuffle.shuffle(order)
         return Data(tuple(data.points[i] for i in order), tuple(data.costs[i] for i in order))
 
-    pending, refused = list(question.pending), list(question.infeasible)
-    shuffle.shuffle(pending)
-    shuffle.shuffle(refused)
+    pending, refused, failed = list(question.pending), list(question.infeasible), list(question.failed)
+    for places in (pending, refused, failed):
+        shuffle.shuffle(places)
     other = replace(
         question,
         data=shuffled(question.data),
         simulated=shuffled(question.simulated),
         pending=tuple(pending),
         infeasible=tuple(refused),
+        failed=tuple(failed),
     )
     first, second = propose(question), propose(other)
     assert first.points == second.points

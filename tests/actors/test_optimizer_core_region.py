@@ -112,6 +112,33 @@ def test_untold_the_same_campaign_would_ask_into_the_corner_for_ever():
     assert len(campaign(told=False, seed=0)[0]) > 15
 
 
+def shaky(seed, *, told):
+    """What a campaign recommends whose cost is least along an edge at which four requests of ten go wrong."""
+    rng = np.random.default_rng(seed)
+    data, failed = Data(), []
+    for step in range(15):
+        warnings = tuple(failed) if told else ()
+        (point,) = propose(SuggestProblem(PLANE, data, seed=100 * seed + step, failed=warnings)).points
+        cost = 0.02 + 0.3 * point[0] + 0.2 * (point[1] - 0.5) ** 2 + 0.002 * rng.standard_normal()
+        if point[0] < 0.08 and rng.random() < 0.4:
+            cost = 1.0
+            failed.append(point)
+        data = data.added(point, cost)
+    return propose(SuggestProblem(PLANE, data, count=0, failed=tuple(failed) if told else ())).best_point
+
+
+def test_what_goes_wrong_now_and_then_is_no_advice():
+    told, untold = (sum(shaky(seed, told=told)[0] < 0.08 for seed in range(8)) for told in (True, False))
+    assert told <= untold - 2
+
+
+def test_one_failure_far_away_changes_no_advice():
+    data = observed(lambda x, y: (x - 0.2) ** 2 + (y - 0.3) ** 2, places(12)).added((0.9, 0.9), 1.0)
+    plain = propose(SuggestProblem(PLANE, data, count=0))
+    told = propose(SuggestProblem(PLANE, data, count=0, failed=((0.9, 0.9),)))
+    assert told.best_point == plain.best_point
+
+
 def test_refusals_say_nothing_about_the_cost():
     data = observed(lambda x, y: x + y, places(10))
     ask = ((0.9, 0.9), (0.2, 0.3))

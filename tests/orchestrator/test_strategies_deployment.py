@@ -167,6 +167,24 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
     assert (row["status"], row["loss"]) == ("failed", entered)
 
 
+@pytest.mark.parametrize(
+    ("name", "changes", "warns"),
+    [("D2", {}, True), ("D3", {}, True), ("D2", {"plain": True}, False), ("D2", {"on_failed_pour": "ignore"}, False)],
+)
+def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_paper(name, changes, warns):
+    def second_touches_third_is_not_weighed(request):
+        number = request.number if isinstance(request, Pour) else 0
+        nothing = PourMeasurement(SCENE.liquid.mass, math.nan, 0.0)
+        return {2: Failed("pour_failed", "cups touch after all"), 3: Poured(nothing)}.get(number)
+
+    strategy = make(name, pours=5, refusals="avoid", **changes)
+    played = Play(narrow_cup, answer=second_touches_third_is_not_weighed)(strategy)
+    assert [pour["status"] for pour in strategy.result()["pours"]].count("failed") == 2
+    second = ACTIONS.encode(played.pours[1].action.values())
+    last = [request for request in played.asked if isinstance(request, Suggest)][-1].problem
+    assert [pytest.approx(point) for point in last.failed] == ([second] if warns else [])
+
+
 def test_touching_vessels_are_avoided_and_cost_no_pour():
     def touches_when_near(action, theta, rng):
         if action.x_offset < 0.10:

@@ -31,7 +31,7 @@ def lower_confidence_bound(surrogate: Surrogate, kappa: float) -> Score:
 def penalised(
     score: Score, surrogate: Surrogate, busy: Array, candidates: Array, feasibility: Feasibility | None = None
 ) -> Score:
-    """A score that also stays away from points whose answers are still out, and from where a refusal is likely.
+    """A score that also stays away from points whose answers are still out, and from likely refusals and failures.
 
     Around each busy point lies a ball in which, judging by the surrogate's steepest slope, the minimum can't be; the
     score is divided by the probability of being outside it, and by that of not being refused. No cost has to be

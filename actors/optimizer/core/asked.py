@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.optimizer.core.problem import Data, Point, SuggestProblem
-from actors.optimizer.core.region import Feasibility, Region
+from actors.optimizer.core.region import Feasibility, Kind, Region
 
 Array = NDArray[np.float64]
 
@@ -25,6 +25,7 @@ class Asked:
         busy: (b, dimension).
         infeasible: (i, dimension), refused of any kind of request.
         really_refused: (r, dimension), of real ones.
+        failed: (f, dimension), real ones that went wrong under way.
         pouring: (p, dimension).
     """
 
@@ -37,6 +38,7 @@ class Asked:
     busy: Array
     infeasible: Array
     really_refused: Array
+    failed: Array
     pouring: Array
 
     @classmethod
@@ -58,6 +60,7 @@ class Asked:
             region.snap(array(sorted(problem.pending), dimension)),
             region.snap(array(sorted(problem.infeasible), dimension)),
             region.snap(array(sorted(problem.refused), dimension)),
+            region.snap(array(sorted(problem.failed), dimension)),
             region.snap(array(sorted(problem.pouring), dimension)),
         )
 
@@ -72,10 +75,18 @@ class Asked:
         return np.concatenate([self.infeasible, self.really_refused])
 
     def feasibility(self) -> Feasibility | None:
-        """How likely requests are not refused; None while none was."""
-        kinds = [(self.seen, self.infeasible), (self.known, self.really_refused)]
-        told = [(fulfilled, refused) for fulfilled, refused in kinds if len(refused)]
+        """How likely requests are not refused and don't fail; None while none was or did."""
+        kinds = [
+            Kind(self.seen, self.infeasible),
+            Kind(self.known, self.really_refused),
+            Kind(self.known, self.failed, by_chance=True),
+        ]
+        told = [kind for kind in kinds if len(kind.refused)]
         return Feasibility(*told) if told else None
+
+    def reliability(self) -> Feasibility | None:
+        """How likely real requests don't fail; None while none did."""
+        return Feasibility(Kind(self.known, self.failed, by_chance=True)) if len(self.failed) else None
 
 
 def _sorted(data: Data, dimension: int) -> tuple[Array, Array]:

@@ -35,6 +35,7 @@ def check(problem: SuggestProblem) -> None:
     _check_points("pending", problem.pending, dimension)
     _check_points("infeasible", problem.infeasible, dimension)
     _check_points("refused", problem.refused, dimension)
+    _check_points("failed", problem.failed, dimension)
     _check_points("predict_at", problem.predict_at, dimension)
     _check_points("pouring", problem.pouring, dimension)
     for name, data in (("data", problem.data), ("simulated", problem.simulated)):

@@ -168,6 +168,9 @@ class SuggestProblem:
         infeasible: places where a request was refused. They say nothing about the cost; proposals keep away from places
             where another refusal is likely.
         refused: the same of real requests: what was only simulated does not say that a place can really be had.
+        failed: places of real requests that went wrong under way, where the vessels touched after all, say. They are
+            among `data` too, at what that costs. Proposals keep away from where that is likely again, and the best
+            point is one that is likely to be made.
         constraints: that every proposal meets.
         noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
         widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
@@ -194,6 +197,7 @@ class SuggestProblem:
     context: tuple[Point, ...] = ()
     infeasible: tuple[Point, ...] = ()
     refused: tuple[Point, ...] = ()
+    failed: tuple[Point, ...] = ()
     constraints: tuple[Linear, ...] = ()
     noise: NoiseName = "constant"
     widening: float = 1.0
@@ -248,8 +252,9 @@ class Suggestion:
         means: posterior means there; NaN-free; empty if no surrogate was fitted (too few data, or only drawn).
         deviations: posterior standard deviations of the noise-free cost there.
         best_point: minimiser of the posterior mean over the observed points (the simulated ones while nothing else was
-            observed) that were not refused, nor probably are; with a risk: over `predict_at`, for requests are not what
-            was observed; None without a surrogate.
+            observed) that were not refused, nor probably are; where requests failed, of what is expected when each
+            fails again as likely as it seems, at the cost of the dearest observation; with a risk: over `predict_at`,
+            for requests are not what was observed; None without a surrogate.
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
         hyperparameters: fitted values by name (for people and plots); 'noise' and 'signal' in the cost's unit.
@@ -258,7 +263,7 @@ class Suggestion:
         prediction_deviations: their standard deviations.
         seconds: CPU seconds it took.
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
-        feasibilities: probabilities that the proposals are not refused; empty while nothing was.
+        feasibilities: probabilities that the proposals are not refused and don't fail; empty while nothing was or did.
         posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
         risk: with a risk: what else is known at `SuggestProblem.predict_at`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _LABEL_PRIOR = HyperPrior(length=(0.3, 0.5), signal=(1.0, 0.3), noise=(0.1, 0.5))
+_CHANCE_PRIOR = HyperPrior(length=(0.7, 0.5), signal=(1.0, 0.3), noise=(0.7, 0.5))
 _SLACK = 1e-9
 _SAME = 1e-9
 _MOST_DRAWN = 2**15
@@ -90,6 +92,21 @@ class Region:
         return np.rint(values) if axis.integer else values
 
 
+@dataclass(frozen=True)
+class Kind:
+    """Requests of one kind.
+
+    Attributes:
+        fulfilled: places (n, dimension).
+        refused: places (k ≥ 1, dimension); what is among both counts as refused.
+        by_chance: the same request may be fulfilled one time and fail the next.
+    """
+
+    fulfilled: Array
+    refused: Array
+    by_chance: bool = False
+
+
 class Feasibility:
     """How likely a request at a place is not refused, from where some were and where others were not.
 
@@ -101,15 +118,10 @@ class Feasibility:
         al., Bayesian optimization with inequality constraints, ICML 2014.
     """
 
-    def __init__(self, *kinds: tuple[Array, Array]) -> None:
-        """Fit.
-
-        Args:
-            kinds: of each kind of request, where it was fulfilled (n, dimension) and where it was refused
-                (k ≥ 1, dimension); what is among both counts as refused.
-        """
-        self._processes = [_labelled(fulfilled, refused) for fulfilled, refused in kinds]
-        self._refused = np.concatenate([refused for _, refused in kinds])
+    def __init__(self, *kinds: Kind) -> None:
+        """Fit."""
+        self._processes = [_labelled(kind) for kind in kinds]
+        self._refused = np.concatenate([kind.refused for kind in kinds])
 
     def log_probability(self, points: Array) -> Array:
         """(m,) at points (m, dimension)."""
@@ -129,13 +141,15 @@ class Feasibility:
         return likely if likely.any() else (other if other.any() else np.ones(len(points), dtype=np.bool_))
 
 
-def _labelled(fulfilled: Array, refused: Array) -> GaussianProcess:
-    """GP of the label, from points (n, dimension) and (k, dimension)."""
+def _labelled(kind: Kind) -> GaussianProcess:
+    """GP of the label."""
+    fulfilled, refused = kind.fulfilled, kind.refused
     if len(fulfilled):
         fulfilled = fulfilled[cdist(fulfilled, refused).min(axis=1) > _SAME]
     points = np.concatenate([fulfilled, refused])
     labels = np.where(np.arange(len(points)) < len(fulfilled), 1.0, -1.0)
-    return GaussianProcess(labels, Covariance(points, _LABEL_PRIOR), mean=lambda x: np.ones(len(x)), scale=1.0)
+    prior = _CHANCE_PRIOR if kind.by_chance else _LABEL_PRIOR
+    return GaussianProcess(labels, Covariance(points, prior), mean=lambda x: np.ones(len(x)), scale=1.0)
 
 
 def _values(axis: Axis, units: Array) -> Array:
