@@ -74,7 +74,7 @@ def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver
     mean = f"mean, better counts as 0: {trust['mean_z']:.1f}"
     right.axhline(trust["mean_z"], color=style.MEASURED, linewidth=1.6, label=mean)
     right.axhline(0.0, color=style.INK, linewidth=0.8)
-    right.legend(fontsize=8.5, frameon=False)
+    _legend_above(right)
     right.set_xticks(numbers)
     style.dress(right, title="distance", x="pour", y="worse by, standard deviations")
     return style.save(figure, path)
@@ -92,7 +92,14 @@ def _losses(axes: Axes, numbers: Any, pours: list[dict[str, Any]], unit: LossUni
     axes.plot(numbers, weighed, "o", color=style.MEASURED, markersize=6.5, label="weighed", zorder=3)
     axes.set_ylim(bottom=0.0)
     axes.set_xticks(numbers)
-    axes.legend(fontsize=8.5, frameon=False)
+    _legend_above(axes)
+
+
+def _legend_above(axes: Axes) -> None:
+    """A legend with room of its own above what is drawn."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.22 * (high - low))
+    axes.legend(fontsize=8.5, frameon=False, loc="upper right")
 
 
 def _last(trust: Mapping[str, Any]) -> int:
