@@ -127,10 +127,11 @@ def work(path: Path, make: Make | None = None) -> None:
     study = as_begun(load_study(path))
     cells = {cell.id: cell for cell in cells_of(study)}
     simulators = InProcessSimulatorPool()
+    make = make or in_this_process(simulators)
     for name in named_cells():
         problem = None
         try:
-            run_cell(study, cells[name], study.folder, make or in_this_process(simulators))
+            run_cell(study, cells[name], study.folder, make)
         except (RunError, LaboratoryError) as error:
             problem = str(error)
         print(json.dumps([name, problem]), file=answers, flush=True)

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.orchestrator.good_files import write_good
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with what good campaigns refer to."""
+    monkeypatch.chdir(tmp_path)
+    return write_good(tmp_path)
 
 
 @pytest.fixture(scope="session")

@@ -12,14 +12,7 @@ from orchestrator.config.check import check_campaign
 from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign, load_laboratory, load_parameters, load_vessel
 
-from .good_files import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, write, write_good
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return write_good(tmp_path)
-
+from .good_files import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, write
 
 BAD_VESSELS = {
     "no shape": ("name: cup\n", "vessel.yaml:1:1: has no shape; add 'profile:'"),

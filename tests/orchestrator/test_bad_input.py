@@ -8,13 +8,7 @@ import pytest
 
 from orchestrator.config.load import load_campaign
 
-from .good_files import CAMPAIGN, CSV, DEPLOYED, RECORDED, report, write, write_good
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return write_good(tmp_path)
+from .good_files import CAMPAIGN, CSV, DEPLOYED, RECORDED, report, write
 
 
 def test_the_good_inputs_that_the_table_spoils_are_good(folder: Path) -> None:

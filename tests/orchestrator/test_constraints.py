@@ -31,7 +31,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 
-from .good_files import DEPLOYED, report, write, write_good
+from .good_files import DEPLOYED, report, write
 from .play import ACTIONS, SCENE, THETA, Play, calibration_plan, deployment_plan
 
 SPACE = Space(
@@ -103,11 +103,6 @@ CONSTRAINED = DEPLOYED.replace("x_offset: 84 mm, ", "").replace(
     "actions:\n    angular_velocity: [15 deg/s, 120 deg/s]\n    x_offset: [80 mm, 150 mm]\n"
     "    constraints: [x_offset >= 100 mm]",
 )
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return write_good(tmp_path)
 
 
 def test_both_sections_have_theirs_and_the_resolved_file_means_the_same(folder: Path) -> None:

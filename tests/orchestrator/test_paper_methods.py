@@ -32,16 +32,11 @@ from orchestrator.study.folder import finished_results, read_result
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 from orchestrator.study.worker import run_cell
 
-from .good_files import CAMPAIGN, DEPLOYED, report, write, write_good
+from .good_files import CAMPAIGN, DEPLOYED, report, write
 from .play import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, Play
 from .study_files import read, written
 from .toy_study import ToyLaboratory
 from .toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return write_good(tmp_path)
 
 
 def campaign(folder: Path, keys: str) -> CampaignPlan:

@@ -21,7 +21,7 @@ from orchestrator.strategies.prior import actions_of_prior
 from sim_engine.action import DEG
 from sim_engine.space import Axis, Space
 
-from .good_files import CAMPAIGN, DEPLOYED, report, write, write_good
+from .good_files import CAMPAIGN, DEPLOYED, report, write
 from .play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play
 from .toys import calibration_spill, weighed
 
@@ -31,11 +31,6 @@ SLOW = NormalPrior("angular_velocity", 30 * DEG, 10 * DEG)
 WRITTEN = "prior: {mean: 30 deg/s, deviation: 10 deg/s}"
 RANGE = "angular_velocity: [15 deg/s, 120 deg/s]"
 WITH_PRIOR = CAMPAIGN.replace(RANGE, f"angular_velocity: {{range: [15 deg/s, 120 deg/s], {WRITTEN}}}")
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return write_good(tmp_path)
 
 
 # -- what is drawn -----------------------------------------------------------------------------------------------------

@@ -23,6 +23,9 @@ from actors.ray_warden import MARK
 PATIENCE = 40.0
 """How long its process may take to start, or to answer [s]."""
 
+GRACE = 10.0
+"""How long it has to end by itself [s]."""
+
 
 class FarProcess:
     """A process at the far end of a pseudo-terminal.
@@ -89,7 +92,7 @@ class FarProcess:
                 if pipe is not None:
                     pipe.close()
         try:
-            self._process.wait(PATIENCE)
+            self._process.wait(GRACE)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

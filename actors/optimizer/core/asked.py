@@ -84,10 +84,6 @@ class Asked:
         told = [kind for kind in kinds if len(kind.refused)]
         return Feasibility(*told) if told else None
 
-    def reliability(self) -> Feasibility | None:
-        """How likely real requests don't fail; None while none did."""
-        return Feasibility(Kind(self.known, self.failed, by_chance=True)) if len(self.failed) else None
-
 
 def _sorted(data: Data, dimension: int) -> tuple[Array, Array]:
     """Points (n, dimension) and costs (n,), by their numbers."""

@@ -31,12 +31,11 @@ def describe(
         known = known[allowed]  # former data may lie beside what is allowed today
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
     at_known, known_deviations = model.surrogate.predict(known)
-    reliability = asked.reliability() if problem.risk is None else None
-    if reliability is None or not len(asked.costs):
-        best = int(np.argmin(at_known))
-    else:
-        made = np.exp(reliability.log_probability(known))
-        best = int(np.argmin(made * at_known + (1.0 - made) * asked.costs.max()))
+    expected = at_known
+    if problem.risk is None and feasibility is not None and len(asked.costs):
+        made = feasibility.made(known)
+        expected = made * at_known + (1.0 - made) * asked.costs.max()
+    best = int(np.argmin(expected))
     process = model.process
     description: dict[str, object] = {
         "means": tuple(map(float, means)),

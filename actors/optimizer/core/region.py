@@ -121,15 +121,16 @@ class Feasibility:
     def __init__(self, *kinds: Kind) -> None:
         """Fit."""
         self._processes = [_labelled(kind) for kind in kinds]
+        self._chancy = [process for process, kind in zip(self._processes, kinds, strict=True) if kind.by_chance]
         self._refused = np.concatenate([kind.refused for kind in kinds])
 
     def log_probability(self, points: Array) -> Array:
         """(m,) at points (m, dimension)."""
-        total = np.zeros(len(points))
-        for process in self._processes:
-            mean, deviation = process.predict(points)
-            total += log_ndtr(mean / np.hypot(deviation, process.noise))
-        return total
+        return _log_positive(self._processes, points)
+
+    def made(self, points: Array) -> Array:
+        """Probabilities (m,) at points (m, dimension) that what may fail by chance doesn't; 1 where nothing may."""
+        return np.exp(_log_positive(self._chancy, points))
 
     def likely(self, points: Array) -> Mask:
         """Which points (m, dimension) were not refused and more likely than not are not: (m,).
@@ -139,6 +140,15 @@ class Feasibility:
         other = cdist(points, self._refused).min(axis=1) > _SAME
         likely = other & (self.log_probability(points) > -math.log(2.0))
         return likely if likely.any() else (other if other.any() else np.ones(len(points), dtype=np.bool_))
+
+
+def _log_positive(processes: Sequence[GaussianProcess], points: Array) -> Array:
+    """Logarithms (m,) of the probability that all labels at points (m, dimension) are positive."""
+    total = np.zeros(len(points))
+    for process in processes:
+        mean, deviation = process.predict(points)
+        total += log_ndtr(mean / np.hypot(deviation, process.noise))
+    return total
 
 
 def _labelled(kind: Kind) -> GaussianProcess:
