@@ -34,16 +34,16 @@ from machine import ROOT, describe, run_self, say, show
 from standard_pour import check_particles
 
 from orchestrator.codec import digest
-from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign
+from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
 from orchestrator.flights import Flight, free_slots, next_to_tell
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.stages import CALIBRATION, calibration_stages, measured_pours, scenes_of, stage_seed
-from orchestrator.strategies.baselines import mean_predictor_discrepancy, regression_discrepancy
-from orchestrator.strategies.design import MeasuredPour
-from orchestrator.strategies.evaluation import Evaluation, ScoredPour
+from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
+from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
 from orchestrator.strategies.protocol import Strategy
 from sim_engine.cache import cache_directory
 from sim_engine.errors import InvalidSceneError

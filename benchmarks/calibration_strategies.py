@@ -40,12 +40,12 @@ from calibration_power import CAMPAIGN, SPLITS, Answers, Kept, known_values, pla
 from machine import describe, run_self, say, show
 from optimisers import interval
 
-from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign
+from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
 from orchestrator.plan import CalibrationName, CalibrationPlan, CampaignPlan
 from orchestrator.stages import CALIBRATION, calibration_stages, stage_seed
-from orchestrator.strategies.evaluation import Evaluation, random_parameters
+from orchestrator.strategies.calibration.evaluation import Evaluation, random_parameters
 from sim_engine.liquid import SimulationParameters
 
 PAPER = ("C1=2800", "C2=504", "C3=1652", "C4=108")

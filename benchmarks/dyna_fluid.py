@@ -28,7 +28,7 @@ from skipping_clock import run
 from actors.bench.world import World
 from actors.protocols import InvalidActionError, ProgressCallback, SimulationResult
 from orchestrator.campaign import run_campaign
-from orchestrator.config.study import load_study
+from orchestrator.config.study.sections import load_study
 from orchestrator.occupancy import Occupancy
 from orchestrator.plan import DeploymentPlan, OutputPlan, PricesPlan
 from orchestrator.study.plan import StudyPlan

@@ -26,9 +26,9 @@ from actors.optimizer.core.propose import propose
 from orchestrator.config.load import load_campaign, load_vessel
 from orchestrator.plan import DeploymentPlan, RiskPlan
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.costs import Costing
-from orchestrator.strategies.deployment_d1 import OneShotPlanning
-from orchestrator.strategies.deployment_d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from sim_engine.action import DEG, described
 from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import InvalidSceneError, PourSimulator

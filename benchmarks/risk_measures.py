@@ -4,7 +4,7 @@ Toy losses, cheap and known exactly, at the same number of simulations:
 
     python benchmarks/risk_measures.py [--seeds 5] [--simulations 48] [--toys cup cliff valleys] [--json]
 
-`joint` is `orchestrator.strategies.deployment_d1_risk`; `raw` forms the mean or CVaR of the m1 losses of each action,
+`joint` is `orchestrator.strategies.deployment.d1_risk`; `raw` forms the mean or CVaR of the m1 losses of each action,
 under the same m1 draws for all of them, and regresses that over actions; `plain` is D1, which knows of no errors.
 Regret: the true measure of the recommended action, less the least there is.
 """
@@ -26,8 +26,8 @@ from actors.optimizer.core.propose import propose
 from actors.optimizer.core.risk import conditional_value_at_risk, tail_weights
 from orchestrator.plan import DeploymentPlan, RiskPlan
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.deployment_d1 import OneShotPlanning
-from orchestrator.strategies.deployment_d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss

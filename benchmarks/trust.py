@@ -25,9 +25,9 @@ from optimiser_problems import BY_NAME, Floats, World
 from actors.optimizer.core.propose import propose
 from orchestrator.plan import DeploymentPlan, TrustPlan
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.deployment import Deployment
-from orchestrator.strategies.deployment_d2 import RealOnly
-from orchestrator.strategies.deployment_d3 import Hybrid
+from orchestrator.strategies.deployment.base import Deployment
+from orchestrator.strategies.deployment.d2 import RealOnly
+from orchestrator.strategies.deployment.d3 import Hybrid
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome

@@ -18,11 +18,15 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.config import arm_sections, campaign, cluster, laboratory, operator, study, vessel
-from orchestrator.config.quantities import Quantity
-from orchestrator.config.records import MASS_COLUMNS, SPLITS, column_name
-from orchestrator.config.scenes import DEFAULTS, NEEDED
-from orchestrator.config.sections import Section
+from orchestrator.config import vessel
+from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
+from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
+from orchestrator.config.campaign.sections import sections as campaign
+from orchestrator.config.laboratory.sections import arm_sections, cluster, operator
+from orchestrator.config.laboratory.sections import sections as laboratory
+from orchestrator.config.study.sections import sections as study
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import Section
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
 from sim_engine.action import ACTION_DIMENSIONS
@@ -267,7 +271,7 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
 
 
 def _shown(value: float, quantity: Quantity) -> str:
-    from orchestrator.config.quantities import format_quantity
+    from orchestrator.config.yaml.quantities import format_quantity
 
     return format_quantity(float(value), quantity.unit, quantity.display).split(" ", 1)[0]
 

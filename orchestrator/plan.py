@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
-from orchestrator.strategies.objectives import Objectives
+from orchestrator.strategies.deployment.objectives import Objectives
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, Loss

@@ -12,24 +12,24 @@ import numpy as np
 from orchestrator.errors import RunError
 from orchestrator.flights import Order
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
-from orchestrator.strategies.calibration import Calibration
-from orchestrator.strategies.calibration_c1 import UniformGrid
-from orchestrator.strategies.calibration_c2 import StratifiedSampling
-from orchestrator.strategies.calibration_c3 import BayesianCalibration
-from orchestrator.strategies.calibration_c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.costs import Costing
-from orchestrator.strategies.deployment import Deployment
-from orchestrator.strategies.deployment_d1 import OneShotPlanning
-from orchestrator.strategies.deployment_d1_risk import RobustPlanning
-from orchestrator.strategies.deployment_d2 import RealOnly
-from orchestrator.strategies.deployment_d3 import Hybrid
-from orchestrator.strategies.deployment_free import FreeHybrid
-from orchestrator.strategies.design import DesignedPours, MeasuredPour
-from orchestrator.strategies.evaluation import ScoredPour, random_parameters
+from orchestrator.strategies.calibration.base import Calibration
+from orchestrator.strategies.calibration.c1 import UniformGrid
+from orchestrator.strategies.calibration.c2 import StratifiedSampling
+from orchestrator.strategies.calibration.c3 import BayesianCalibration
+from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour
+from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
+from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.deployment.base import Deployment
+from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.d2 import RealOnly
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.d3_free import FreeHybrid
+from orchestrator.strategies.deployment.risk import Disturbances
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
-from orchestrator.strategies.risk import Disturbances
-from orchestrator.strategies.scorecard import Scorecard
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 

@@ -24,11 +24,11 @@ IN_REAL_TIME = (
     "actors/test_virtual_bench",
     "actors/virtual_ur/",
     "end_to_end/",
-    "orchestrator/test_arming",
-    "orchestrator/test_doctor",
-    "orchestrator/test_jog",
-    "orchestrator/test_pour_command",
-    "orchestrator/test_study.py",
+    "orchestrator/commands/test_arming",
+    "orchestrator/commands/test_doctor",
+    "orchestrator/commands/test_jog",
+    "orchestrator/commands/test_pour_command",
+    "orchestrator/study/test_study.py",
 )
 """Tests with processes that keep deadlines of milliseconds, such as an arm's watchdog."""
 

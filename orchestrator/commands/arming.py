@@ -16,9 +16,9 @@ from actors.arm.spec import UrArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
 from orchestrator.commands.common import BAD_INPUT, RefusalError, say
-from orchestrator.config.errors import shown_path
+from orchestrator.config.yaml.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
-from orchestrator.strategies.prior import actions_all_over
+from orchestrator.strategies.calibration.prior import actions_all_over
 from sim_engine.action import Action
 from sim_engine.space import Space
 from sim_engine.task import Scene

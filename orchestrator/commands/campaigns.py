@@ -191,8 +191,8 @@ def plan_pour(
 
 def _drawn(plan: CampaignPlan, parameters: Path | None, thetas: int) -> tuple[SimulationParameters, ...]:
     """θ of the posterior that a prediction takes turns with."""
-    from orchestrator.config.errors import ConfigError
     from orchestrator.config.load import load_posterior
+    from orchestrator.config.yaml.errors import ConfigError
 
     if thetas == 0:
         return ()
@@ -212,8 +212,8 @@ def planning_plan(
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
-    from orchestrator.config.errors import ConfigError
     from orchestrator.config.load import load_parameters, load_posterior, load_vessel
+    from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.stages import POSTERIOR_DRAWS
 
     deployment, theta = plan.deployment, plan.parameters

@@ -61,8 +61,8 @@ def read_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
     Raises:
         RefusalError: with all problems of its files, exit code 2.
     """
-    from orchestrator.config.errors import ConfigError
     from orchestrator.config.load import load_campaign
+    from orchestrator.config.yaml.errors import ConfigError
 
     try:
         return load_campaign(path, laboratory)
@@ -76,7 +76,7 @@ def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> No
     Raises:
         RefusalError: with everything that is wrong, exit code 2.
     """
-    from orchestrator.config.check import check_campaign
+    from orchestrator.config.campaign.check import check_campaign
 
     problems = check_campaign(plan, as_written=as_written)
     if problems:

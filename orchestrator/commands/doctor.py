@@ -77,8 +77,8 @@ def read_laboratory(path: Path) -> LaboratorySpec:
     Raises:
         RefusalError: with all its problems, exit code 2.
     """
-    from orchestrator.config.errors import ConfigError
     from orchestrator.config.load import load_laboratory
+    from orchestrator.config.yaml.errors import ConfigError
 
     try:
         return load_laboratory(path)

@@ -121,9 +121,9 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
         RefusalError: it can't be made (exit code 2).
     """
     from actors.protocols import InvalidActionError
-    from orchestrator.config.assignments import assigned_action
-    from orchestrator.config.check import check_vessels
-    from orchestrator.config.errors import shown_path
+    from orchestrator.config.campaign.assignments import assigned_action
+    from orchestrator.config.campaign.check import check_vessels
+    from orchestrator.config.yaml.errors import shown_path
 
     plan = read_campaign(path)
     scene, space = scene_to_simulate(plan, scene_name)

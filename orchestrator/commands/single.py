@@ -46,10 +46,10 @@ def simulate(
     backend: Backend = "cpu",
 ) -> None:
     """One pour in the simulator of this process, with several seeds: their mean and spread are the prediction."""
-    from orchestrator.config.assignments import assigned_action
-    from orchestrator.config.check import check_vessels
-    from orchestrator.config.errors import ConfigError, shown_path
+    from orchestrator.config.campaign.assignments import assigned_action
+    from orchestrator.config.campaign.check import check_vessels
     from orchestrator.config.load import load_parameters, load_vessel
+    from orchestrator.config.yaml.errors import ConfigError, shown_path
     from sim_engine.backend import BackendError, require_backend
     from sim_engine.pour import InvalidSceneError, PourSimulator
     from sim_engine.spread import spreads
@@ -199,12 +199,12 @@ def _show(task: Any, run: Any, rrd: Path | None, png: Path | None) -> None:
 
 def validate(paths: list[Path]) -> None:
     """Check files; every problem of every file, exit code 2 if there is one."""
-    from orchestrator.config.check import check_campaign
-    from orchestrator.config.errors import ConfigError
-    from orchestrator.config.kinds import kind_of
+    from orchestrator.config.campaign.check import check_campaign
     from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-    from orchestrator.config.study import load_study
-    from orchestrator.config.yaml_source import Document
+    from orchestrator.config.study.sections import load_study
+    from orchestrator.config.yaml.errors import ConfigError
+    from orchestrator.config.yaml.kinds import kind_of
+    from orchestrator.config.yaml.source import Document
     from orchestrator.study.cells import cells_of
     from sim_engine.vessel.build import build_vessel
     from sim_engine.vessel.errors import VesselError

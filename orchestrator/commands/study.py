@@ -60,8 +60,8 @@ def read_study(path: Path) -> StudyPlan:
     from dataclasses import replace
 
     from orchestrator.commands.common import check_campaign_can_run
-    from orchestrator.config.errors import ConfigError
-    from orchestrator.config.study import load_study
+    from orchestrator.config.study.sections import load_study
+    from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.study.folder import as_begun
 
     try:
@@ -157,7 +157,7 @@ def _duration(seconds: float) -> str:
 
 
 def _report(plan: StudyPlan, folder: Path) -> Path:
-    from orchestrator.report.study.page import write_report
+    from orchestrator.study.report.page import write_report
 
     page = write_report(plan, folder)
     say(f"figures, tables and a page: {page}")

@@ -12,19 +12,19 @@ from typing import Annotated, Any
 from pydantic import create_model
 
 from actors.spec import LaboratorySpec
-from orchestrator.config.campaign import CampaignFile
-from orchestrator.config.errors import ConfigError, Problem
-from orchestrator.config.kinds import wrong_kind
-from orchestrator.config.laboratory import LaboratoryFile, resolve_laboratory
+from orchestrator.config.campaign.resolve import resolve_campaign
+from orchestrator.config.campaign.resolved import campaign_as_file
+from orchestrator.config.campaign.sections import CampaignFile
+from orchestrator.config.laboratory.sections import LaboratoryFile, resolve_laboratory
 from orchestrator.config.motion import parameter_quantity
-from orchestrator.config.quantities import Quantity
-from orchestrator.config.references import References
-from orchestrator.config.resolve import resolve_campaign
-from orchestrator.config.resolved import campaign_as_file
-from orchestrator.config.sections import Section
-from orchestrator.config.validate import validate
 from orchestrator.config.vessel import MESH_SUFFIXES, VesselFile, resolve_vessel
-from orchestrator.config.yaml_source import Document, Place, Report
+from orchestrator.config.yaml.errors import ConfigError, Problem
+from orchestrator.config.yaml.kinds import wrong_kind
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.references import References
+from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.source import Document, Place, Report
+from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
 from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.spec import VesselSpec

@@ -10,9 +10,9 @@ from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag, create_mod
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from actors.optimizer.core.problem import Linear
-from orchestrator.config.constraints import constraint_as_file
-from orchestrator.config.quantities import Quantity, format_quantity
-from orchestrator.config.sections import Section, Text
+from orchestrator.config.campaign.constraints import constraint_as_file
+from orchestrator.config.yaml.quantities import Quantity, format_quantity
+from orchestrator.config.yaml.sections import Section, Text
 from orchestrator.plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquid import SimulationParameters

@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from orchestrator.config.campaign import CampaignFile
-from orchestrator.config.laboratory import LaboratoryFile
-from orchestrator.config.sections import SchemaGenerator, Section
-from orchestrator.config.study import StudyFile
+from orchestrator.config.campaign.sections import CampaignFile
+from orchestrator.config.laboratory.sections import LaboratoryFile
+from orchestrator.config.study.sections import StudyFile
 from orchestrator.config.vessel import VesselFile
+from orchestrator.config.yaml.sections import SchemaGenerator, Section
 
 
 def campaign_schema() -> dict[str, Any]:

@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from orchestrator.config.errors import did_you_mean
-from orchestrator.config.quantities import Quantity, format_quantity, parse_quantity
-from orchestrator.config.sections import Name, Number, Section, Text
-from orchestrator.config.yaml_source import Place, Report
+from orchestrator.config.yaml.errors import did_you_mean
+from orchestrator.config.yaml.quantities import Quantity, format_quantity, parse_quantity
+from orchestrator.config.yaml.sections import Name, Number, Section, Text
+from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import Liquid
 from sim_engine.vessel.spec import LengthUnit, MeshShape, ProfileShape, VesselSpec
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from orchestrator.plan import CampaignPlan, DeploymentPlan
 from orchestrator.requests import Pour, Prediction
-from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.deployment.costs import Costing
 from sim_engine.losses import Loss, normalised_spillage
 from sim_engine.outcome import PourMeasurement
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
-from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters

@@ -23,11 +23,11 @@ from orchestrator.stages import (
     stage_seed,
     with_posterior,
 )
-from orchestrator.strategies.costs import Costing
-from orchestrator.strategies.design import DesignedPours, draw_allowed, stratified
-from orchestrator.strategies.prior import region_of
+from orchestrator.strategies.calibration.design import DesignedPours, draw_allowed, stratified
+from orchestrator.strategies.calibration.prior import region_of
+from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.scorecard import Scorecard
 from orchestrator.study.cells import FINAL, GRID, Cell
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.strategies import AnsweredByTable, FinalPour, SimulatedTable

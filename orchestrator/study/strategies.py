@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Simulate, Simulated, Slots
-from orchestrator.strategies.costs import Costing
+from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.one_pour import OnePour
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.seeds import SeedStream

@@ -118,7 +118,7 @@ def work(path: Path, make: Make | None = None) -> None:
         path: of the study.
         make: makes laboratories; by default in this process, around one simulator.
     """
-    from orchestrator.config.study import load_study
+    from orchestrator.config.study.sections import load_study
 
     # Libraries print to stdout, which is for answers alone: from here on they print to the log.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.check import check_campaign
+from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.load import load_campaign
 from orchestrator.plan import CampaignPlan
 from orchestrator.stages import stages_of

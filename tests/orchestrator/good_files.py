@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.errors import ConfigError
 from orchestrator.config.load import load_campaign
+from orchestrator.config.yaml.errors import ConfigError
 
 CAMPAIGN = """\
 name: test

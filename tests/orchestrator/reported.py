@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from orchestrator.strategies.calibration_c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.deployment_d3 import Hybrid
-from orchestrator.strategies.design import MeasuredPour
-from orchestrator.strategies.evaluation import Evaluation, ScoredPour, random_parameters
+from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
+from orchestrator.strategies.deployment.d3 import Hybrid
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from tests.orchestrator import watched

@@ -8,7 +8,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from orchestrator.config.study import load_study
+from orchestrator.config.study.sections import load_study
 from orchestrator.study.plan import StudyPlan
 
 ROOT = Path(__file__).parents[2]

@@ -16,9 +16,9 @@ from orchestrator.report.summary import summarise, summary_table
 from orchestrator.report.units import loss_unit
 from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
 from orchestrator.stages import deployment_stages, prediction_stages
-from orchestrator.strategies.costs import Costing
-from orchestrator.strategies.deployment_d1 import OneShotPlanning
-from orchestrator.strategies.deployment_d3 import Hybrid
+from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from orchestrator.tally import Tally

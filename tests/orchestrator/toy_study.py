@@ -14,7 +14,7 @@ import numpy as np
 from actors.optimizer.core.propose import propose
 from actors.protocols import SimulationResult
 from actors.spec import LaboratorySpec
-from orchestrator.config.study import load_study
+from orchestrator.config.study.sections import load_study
 from orchestrator.study.folder import opened
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.runner import Status, run_cells

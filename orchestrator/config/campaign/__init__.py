@@ -1,0 +1,1 @@
+"""Campaigns as written in files, and the plans that are made of them."""

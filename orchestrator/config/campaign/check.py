@@ -1,0 +1,262 @@
+"""What a campaign file can't show by itself: whether its vessels exist as solids, hold the liquid, and stay clear."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from actors.arm.spec import UrArmSpec
+from actors.protocols import InvalidActionError
+from orchestrator.config.yaml.errors import ConfigError, Problem
+from orchestrator.config.yaml.source import Document, Loc
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.strategies.calibration.prior import actions_all_over
+from sim_engine.action import Action
+from sim_engine.contact import describe_contact, first_contact
+from sim_engine.hydrostatics import level
+from sim_engine.motion import plan_motion
+from sim_engine.space import Space
+from sim_engine.task import Scene
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.errors import VesselError
+from sim_engine.vessel.spec import MeshShape, VesselSpec
+from sim_engine.vessel.vessel import Vessel, check_holds
+
+POSE_SPACING = 3e-3
+"""Largest way of any point of the pourer between two checked poses [m]: less than most walls."""
+
+CORNERS, DRAWN = 64, 16
+"""Actions of a space that are tried beside its middle before saying that all of it touches."""
+
+
+@dataclass(frozen=True)
+class _Role:
+    """A scene's part in a campaign.
+
+    Attributes:
+        text: for messages.
+        section: of the file, which overrides what stands at its top.
+        receiver: where the receiver may be named, the most particular place first.
+    """
+
+    text: str
+    section: Loc = ()
+    receiver: tuple[Loc, ...] = ()
+
+    def places(self, *keys: Loc) -> tuple[Loc, ...]:
+        """Where keys may stand, the most particular place first; the section itself where they don't."""
+        return (*(self.section + key for key in keys), *keys, self.section)
+
+
+@dataclass
+class _Checker:
+    arm: UrArmSpec | None = None
+    document: Document | None = None
+    problems: list[Problem | str] = field(default_factory=list)
+    vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
+
+    def add(self, places: tuple[Loc, ...], text: str) -> None:
+        """Note a problem at the first of some places that the campaign's file has."""
+        document = self.document
+        found = None if document is None else next((loc for loc in places if loc in document.marks), None)
+        self.problems.append(text if document is None or found is None else document.problem(found, text))
+
+    def vessel(self, spec: VesselSpec, places: tuple[Loc, ...]) -> Vessel | None:
+        if spec not in self.vessels:
+            try:
+                self.vessels[spec] = build_vessel(spec)
+            except (VesselError, OSError) as error:
+                where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
+                self.add(places, f"vessel '{spec.name}'{where}: {error}")
+                self.vessels[spec] = None
+        return self.vessels[spec]
+
+    def scene(self, scene: Scene, role: _Role) -> tuple[Vessel, Vessel] | None:
+        """The scene's vessels, if both exist and hold the liquid."""
+        places = {"pourer": role.places(("pourer",)), "receiver": (*role.receiver, *role.places(("receiver",)))}
+        pourer = self.vessel(scene.pourer, places["pourer"])
+        receiver = self.vessel(scene.receiver, places["receiver"])
+        if pourer is None or receiver is None:
+            return None
+        ok = True
+        for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
+            try:
+                check_holds(vessel, scene.liquid.volume)
+            except VesselError as error:
+                ok = False
+                load = f"{scene.liquid.name} ({scene.liquid.mass * 1e3:g} g)"
+                self.add(places[name], f"{role.text}: {name} can't hold the {load}: {error}")
+        return (pourer, receiver) if ok else None
+
+    def reachable(self, plan: CalibrationPlan | DeploymentPlan, scene: Scene, role: _Role) -> None:
+        """Some action of the space must pour, not touch, and be one that the arm can make."""
+        vessels = self.scene(scene, role)
+        self._payload(scene)
+        actions = plan.actions
+        trials = actions_all_over(actions, plan.constraints, corners=CORNERS, drawn=DRAWN)
+        if vessels is None or self._never_pours(scene, trials, vessels[0], role):
+            return
+        first = beyond = ""
+        for chosen in trials:
+            try:
+                contact = touch(scene, scene.action(chosen), *vessels)
+            except ValueError as error:  # an action out of bounds, or a motion that can't be made
+                contact = str(error)
+            if contact is None:
+                problem = self._for_the_arm(scene, scene.action(chosen), actions, *vessels)
+                if not problem:
+                    return
+                beyond = beyond or problem
+            else:
+                first = first or contact
+        if beyond:
+            text = f"{role.text}: the arm can make no action that was tried; for example {beyond}"
+            self.add(role.places(("actions",)), text)
+            return
+        text = (
+            f"{role.text}: the vessels touch at every action that was tried; for example {first}. "
+            f"A larger x_offset or height would clear them"
+        )
+        self.add(role.places(("actions",)), text)
+
+    def _payload(self, scene: Scene) -> None:
+        """What the arm believes to carry can't weigh less than the liquid alone."""
+        if self.arm is None or self.arm.payload >= scene.liquid.mass:
+            return
+        text = (
+            f"the arm is set to carry {self.arm.payload * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
+            f"alone, {scene.liquid.mass * 1e3:g} g; the payload is gripper and filled pourer, in the laboratory's file "
+            "and on the pendant"
+        )
+        self.add((("liquid", "mass"), ("liquid",)), text)
+
+    def _never_pours(self, scene: Scene, trials: Sequence[dict[str, float]], pourer: Vessel, role: _Role) -> bool:
+        """Whether the liquid stays below the lip at the largest tilt of the space, which is told."""
+        tilts = []
+        for chosen in trials:
+            try:
+                tilts.append(scene.action(chosen).max_angle)
+            except ValueError:
+                continue  # no such action, which `touch` will tell
+        volume = scene.liquid.volume
+        if not tilts or level(pourer, volume, max(tilts)) > 0.0:
+            return False
+        steps = np.radians(np.arange(math.ceil(math.degrees(max(tilts))), 181))
+        lip = next((math.degrees(tilt) for tilt in steps if level(pourer, volume, float(tilt)) > 0.0), None)
+        when = "never reaches the lip" if lip is None else f"reaches the lip at {lip:.0f} deg; raise max_angle"
+        text = (
+            f"{role.text}: no action that was tried pours anything: max_angle is at most "
+            f"{math.degrees(max(tilts)):.4g} deg, and the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g) {when}"
+        )
+        self.add(role.places(("actions", "max_angle"), ("motion", "max_angle")), text)
+        return True
+
+    def _for_the_arm(self, scene: Scene, action: Action, actions: Space, pourer: Vessel, receiver: Vessel) -> str:
+        """Why the laboratory's arm, if it has one, can't make it; '' if it can."""
+        if self.arm is None:
+            return ""
+        from actors.arm.path.plan import plan_path
+
+        try:
+            plan_path(plan_motion(scene, action, pourer, receiver), self.arm, pourer, receiver)
+        except InvalidActionError as error:
+            return f"{action.display(*actions.names)}: {error}"
+        return ""
+
+    def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
+        """Weighed pours have been poured: if their vessels touch, the scene is described wrongly."""
+        vessels = self.scene(scene, role)
+        if vessels is None:
+            return
+        # The slowest to vary is the place: pours of one place and one largest tilt go through the same poses.
+        seen = set()
+        for action in recorded:
+            at = (action.x_offset, action.y_offset, action.height)
+            tilts = [a.max_angle for a in recorded if (a.x_offset, a.y_offset, a.height) == at]
+            if at in seen or action.max_angle < max(tilts):
+                continue
+            seen.add(at)
+            contact = touch(scene, action, *vessels)
+            if contact is not None:
+                shown = action.display("x_offset", "height", "max_angle")
+                text = (
+                    f"{role.text}: a recorded pour ({shown}) could not have been made: {contact}. Is the scene right?"
+                )
+                self.add((place, role.section), text)
+                return
+
+
+def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Problem]:
+    """Build the vessels of a campaign and try its actions.
+
+    Checked for every scene: both vessels can be built and hold the liquid; some action of the space tilts far enough
+    for the liquid to leave, and one lets the vessels stay clear of each other and can be made by the laboratory's arm
+    (middle, corners and a few drawn at random are tried); recorded pours stay clear.
+
+    Args:
+        plan: of the campaign.
+        as_written: whether its vessels are those of its file; places in it would else mislead.
+
+    Returns:
+        What is wrong, with its place as far as the campaign's file has one; empty when the campaign can start.
+    """
+    try:
+        document = Document.read(plan.source) if as_written else None
+    except ConfigError:
+        document = None  # a plan that was never a file
+    checker = _Checker(plan.laboratory.arm, document)
+    at: Loc
+    if plan.calibration is not None:
+        calibration, section = plan.calibration, ("calibration",)
+        if calibration.records is None:
+            checker.reachable(calibration, calibration.scene, _Role("calibration", section))
+        else:
+            pours, at = calibration.records.pours, ("calibration", "pours")
+            checker.recorded(calibration.scene, [p.action for p in pours], _Role("calibration.pours", section), at)
+        if calibration.transfer is not None:
+            transfer, at = calibration.transfer, ("calibration", "pours", "transfer")
+            role = _Role("calibration.pours.transfer", section, ((*at, "receiver"),))
+            checker.recorded(transfer.scene, [p.action for p in transfer.pours], role, at)
+    if plan.deployment is not None:
+        for i, scene in enumerate(plan.deployment.scenes):
+            receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
+            role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
+            checker.reachable(plan.deployment, scene, role)
+    whole = [p if isinstance(p, Problem) else Problem(plan.source, 0, 0, "", p) for p in checker.problems]
+    return list(dict.fromkeys(whole))
+
+
+def check_vessels(scene: Scene) -> list[str]:
+    """Build the vessels of one scene.
+
+    Returns:
+        What is wrong (a vessel that is none, or can't hold the load), one text each.
+    """
+    checker = _Checker()
+    checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"))
+    return [str(problem) for problem in checker.problems]
+
+
+def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:
+    """Where the vessels touch during an action, in words; None when they stay clear.
+
+    Raises:
+        ValueError: the motion can't be made.
+    """
+    motion = plan_motion(scene, action, pourer, receiver)
+    reach = 2.0 * pourer.bounding_sphere[1]
+    count = max(2, int(np.ceil(action.max_angle * reach / POSE_SPACING)) + 1)
+    # Poses depend on the tilt alone: evenly spaced tilts on the way there are all that there is to see.
+    tilting = motion.phases[0].end
+    fine = np.linspace(0.0, tilting, 20 * count)
+    times = np.interp(np.linspace(0.0, action.max_angle, count), motion.tilt(fine), fine)
+    contact = first_contact(pourer, receiver, motion.sample(times))
+    if contact is None:
+        return None
+    tilt = float(motion.tilt(times[contact.index : contact.index + 1])[0])
+    return describe_contact(
+        contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
+    )

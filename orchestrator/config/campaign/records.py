@@ -1,0 +1,234 @@
+"""Weighed pours from CSV files; every error names the file, the line and the column."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from orchestrator.config.yaml.errors import Problem, did_you_mean
+from orchestrator.plan import RecordedPour
+from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
+
+MASS_COLUMNS = ("poured_g", "spilled_g", "retained_g")
+SPLITS = ("train", "test", "transfer")
+LIP_COLUMN = "lip_to_receiver_axis_mm"
+
+MASS_TOLERANCE = 0.01
+"""Largest relative difference between poured + retained and the load; spills and drips make a weighing no better."""
+
+
+def column_name(dimension: Dimension) -> str:
+    """Column of an action dimension: its name and unit, e.g. 'angular_velocity_deg_s'."""
+    return f"{dimension.name}_{dimension.display_unit.replace('/', '_').replace('^', '')}"
+
+
+DIMENSION_COLUMNS = {column_name(dimension): dimension for dimension in ACTION_DIMENSIONS.values()}
+
+
+@dataclass
+class Table:
+    """A CSV file of weighed pours.
+
+    Attributes:
+        rows: action dimensions [SI], masses [kg] and split of every good line.
+        dimensions: action dimensions that have a column.
+        problems: everything found wrong.
+    """
+
+    rows: list[Row] = field(default_factory=list)
+    dimensions: tuple[str, ...] = ()
+    problems: list[Problem] = field(default_factory=list)
+
+    def varying(self) -> set[str]:
+        """Dimensions that have more than one value."""
+        return {name for name in self.dimensions if len({row.action[name] for row in self.rows}) > 1}
+
+    def constants(self) -> dict[str, float]:
+        """Dimensions that have the same value in all pours."""
+        return {name: self.rows[0].action[name] for name in self.dimensions if name not in self.varying()}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line: action dimensions [SI], masses [kg]."""
+
+    line: int
+    action: dict[str, float]
+    poured: float
+    spilled: float
+    retained: float
+    split: str
+
+    def pour(self, fixed: Mapping[str, float | None]) -> RecordedPour:
+        """The record, with the dimensions that have no column.
+
+        Raises:
+            ValueError: the action is not complete or out of bounds.
+        """
+        action = Action.compose(fixed, self.action)
+        return RecordedPour(action, self.poured, self.spilled, self.retained, self.split)
+
+
+def read_records(
+    path: Path,
+    *,
+    loaded: float,
+    lip_radius: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    split: str | None = None,
+) -> Table:
+    """Read weighed pours.
+
+    Columns: `poured_g`, `spilled_g`, `retained_g`, `split` (train, test or transfer), and one per action dimension that
+    varies, named after it and its unit (`angular_velocity_deg_s`, `max_angle_deg`, `x_offset_mm` …). In place of
+    `x_offset_mm` there may be `lip_to_receiver_axis_mm`, the distance from the pourer's inner lip to the receiver's
+    axis: `lip_radius` is added to it.
+
+    Args:
+        path: the CSV file, UTF-8, comma-separated, with a header.
+        loaded: mass in the pourer before each pour [kg].
+        lip_radius: the pourer's inner radius at the lip [m].
+        columns: names that the file has in place of the above, {above: in the file}.
+        split: of all pours where the file has no such column; it must have one unless given.
+
+    Returns:
+        The table; its `problems` say what is wrong with the file.
+    """
+    table = Table()
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        table.problems.append(Problem(path, 0, 0, "", f"is not text in UTF-8 (byte {error.start}); save it as UTF-8"))
+        return table
+    except OSError as error:
+        table.problems.append(Problem(path, 0, 0, "", f"can't be read: {error.strerror}"))
+        return table
+    if not text.strip():
+        table.problems.append(Problem(path, 0, 0, "", "is empty; it needs a header and a line for each pour"))
+        return table
+    lines = text.splitlines()
+    reader = csv.reader(io.StringIO(text))
+    header = [cell.strip() for cell in next(reader, [])]
+    names = {theirs: ours for ours, theirs in (columns or {}).items()}
+    header = [names.get(cell, cell) for cell in header]
+    _check_header(table, path, header, lines[0] if lines else "", lip_radius, needs_split=split is None)
+    if table.problems:
+        return table
+    table.dimensions = tuple(
+        name
+        for name, dimension in ACTION_DIMENSIONS.items()
+        if column_name(dimension) in header or (name == "x_offset" and LIP_COLUMN in header)
+    )
+    for cells in reader:
+        if any(cell.strip() for cell in cells):
+            row = _read_row(
+                table, path, header, cells, reader.line_num, lines[reader.line_num - 1], loaded, lip_radius, split
+            )
+            if row is not None:
+                table.rows.append(row)
+    if not table.rows and not table.problems:
+        table.problems.append(Problem(path, 1, 1, "", "has no pours; add a line for each below the header"))
+    return table
+
+
+def _check_header(
+    table: Table, path: Path, header: list[str], line: str, lip_radius: float | None, *, needs_split: bool
+) -> None:
+    known = (*DIMENSION_COLUMNS, LIP_COLUMN, *MASS_COLUMNS, "split")
+
+    def add(name: str, message: str) -> None:
+        column = line.find(name) + 1 if name and name in line else 1
+        table.problems.append(Problem(path, 1, column, name, message, line))
+
+    for name in header:
+        if name not in known:
+            guess = did_you_mean(name, known)
+            hint = f"did you mean '{guess}'?" if guess else f"known columns: {', '.join(known)}"
+            add(name, f"unknown column; {hint}")
+        elif header.count(name) > 1:
+            add(name, "stands twice in the header; keep one")
+    for name in (*MASS_COLUMNS, *(["split"] if needs_split else [])):
+        if name not in header:
+            add("", f"column '{name}' is missing")
+    if not any(name in DIMENSION_COLUMNS or name == LIP_COLUMN for name in header):
+        add("", "no column of an action dimension, such as 'angular_velocity_deg_s'")
+    if LIP_COLUMN in header:
+        if "x_offset_mm" in header:
+            add(LIP_COLUMN, "says the same as 'x_offset_mm'; keep one of them")
+        if lip_radius is None:
+            add(LIP_COLUMN, "needs 'lip_radius' beside 'from' in the campaign, the pourer's inner radius at the lip")
+
+
+def _read_row(
+    table: Table,
+    path: Path,
+    header: list[str],
+    cells: list[str],
+    number: int,
+    line: str,
+    loaded: float,
+    lip_radius: float | None,
+    usual_split: str | None,
+) -> Row | None:
+    before = len(table.problems)
+
+    def add(name: str, message: str) -> None:
+        # The caret stands under the cell: cells are unquoted numbers in all but the oddest files.
+        index = header.index(name) if name in header else 0
+        column = sum(len(cell) + 1 for cell in cells[:index]) + 1
+        table.problems.append(Problem(path, number, column, name, message, line))
+
+    if len(cells) != len(header):
+        add("", f"has {len(cells)} cells, the header {len(header)}")
+        return None
+    values: dict[str, float] = {}
+    for name, cell in zip(header, cells, strict=True):
+        if name == "split":
+            continue
+        try:
+            values[name] = float(cell)
+            if not math.isfinite(values[name]):
+                raise ValueError
+        except ValueError:
+            add(name, f"{cell.strip()!r} is not a number" if cell.strip() else "is empty; every pour needs a value")
+    split = cells[header.index("split")].strip() if "split" in header else str(usual_split)
+    if split not in SPLITS:
+        add("split", f"{split!r} is not known; should be one of {', '.join(SPLITS)}")
+    action: dict[str, float] = {}
+    for name, value in values.items():
+        dimension = ACTION_DIMENSIONS["x_offset"] if name == LIP_COLUMN else DIMENSION_COLUMNS.get(name)
+        if dimension is None:
+            continue
+        # Rounded to a picometre, so that 44 mm + 40 mm is 84 mm.
+        si = round(value * 1e-3 + (lip_radius or 0.0), 12) if name == LIP_COLUMN else value * dimension.factor
+        if not dimension.lower <= si <= dimension.upper:
+            k = dimension.factor
+            bounds = f"{dimension.lower / k:g} … {dimension.upper / k:g} {dimension.display_unit}"
+            add(name, f"{value:g} makes {dimension.name} {si / k:g}, outside {bounds}")
+        action[dimension.name] = si
+    if all(name in values for name in MASS_COLUMNS):
+        _check_masses([values[name] for name in MASS_COLUMNS], loaded * 1e3, add)
+    if len(table.problems) > before:
+        return None
+    poured, spilled, retained = (values[name] * 1e-3 for name in MASS_COLUMNS)
+    return Row(number, action, poured, spilled, retained, split)
+
+
+def _check_masses(masses: list[float], loaded: float, add: Callable[[str, str], None]) -> None:
+    poured, spilled, retained = masses
+    slack = MASS_TOLERANCE * loaded
+    for name, mass in zip(MASS_COLUMNS, masses, strict=True):
+        if mass < -slack:
+            add(name, f"{mass:g} g is less than nothing")
+    if abs(poured + retained - loaded) > slack:
+        add(
+            "poured_g",
+            f"poured {poured:g} g + retained {retained:g} g = {poured + retained:g} g, "
+            f"but {loaded:g} g were loaded (the campaign's liquid.mass)",
+        )
+    if spilled > poured + slack:
+        add("spilled_g", f"spilled {spilled:g} g, more than the {poured:g} g that were poured")

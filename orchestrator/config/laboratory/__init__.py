@@ -1,0 +1,1 @@
+"""Laboratories as written in files: simulators, arm, balance, operator, cluster."""

@@ -1,0 +1,194 @@
+"""A laboratory's arm and its cell: from what is written in its file to what planner and driver need, and back."""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import re
+from typing import Any
+
+from actors.arm.path.kinematics import MODELS
+from actors.arm.spec import ArmLimits, Cell, Plane, Pose, UrArmSpec, Vector
+from orchestrator.config.laboratory.arm_sections import (
+    JOINTS,
+    ArmSection,
+    CellSection,
+    LimitsSection,
+    PlaneSection,
+    PointSection,
+)
+from orchestrator.config.yaml.quantities import format_quantity
+from orchestrator.config.yaml.source import Place, Report
+
+__all__ = ["ArmSection", "CellSection", "arm_as_file", "resolve_arm"]
+
+_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+_HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\.?")
+
+
+def resolve_arm(
+    arm: ArmSection, cell: CellSection | None, place: Place, report: Report, *, mode: str
+) -> UrArmSpec | None:
+    """The arm of a laboratory's file; what is wrong goes to the report, and then there is none.
+
+    Args:
+        arm: as written under `arm`.
+        cell: as written under `cell`; None where there is no such key, which is a problem.
+        place: of the mapping in which both keys stand.
+        report: takes problems.
+        mode: of the laboratory, 'virtual' or 'hardware'.
+    """
+    before = len(report.problems)
+    at = place.at("arm")
+    _check_address(arm, at, report, mode)
+    if arm.model is not None and arm.rate > MODELS[arm.model].frequency:
+        fastest = MODELS[arm.model].frequency
+        report.add(at.at("rate"), f"a {arm.model} answers at most {fastest} times a second; write '{fastest} Hz'")
+    if cell is None and not report.is_broken(place.at("cell")):
+        report.add(at, "an arm needs to know what stands where; add 'cell: {receiver: …, direction: …}' beside it")
+    home = None if arm.home is None else [arm.home.value(name) for name in JOINTS]
+    limits = None if arm.limits is None else _limits(arm.limits, at.at("limits"), report)
+    receiver = None if cell is None else _point(cell.receiver)
+    needed = (arm.model, arm.tool, arm.payload, arm.grip, limits, receiver)
+    if None in needed or home is None or None in home or cell is None or cell.direction is None:
+        return None  # reported already, as missing or as wrong
+    assert arm.model is not None
+    assert arm.tool is not None
+    assert arm.payload is not None
+    assert arm.grip is not None
+    assert limits is not None
+    assert receiver is not None
+    spec = UrArmSpec(
+        model=arm.model,
+        limits=limits,
+        cell=Cell(receiver=receiver, direction=cell.direction, table=cell.table),
+        home=(home[0], home[1], home[2], home[3], home[4], home[5]),
+        address=arm.address or "",
+        tool=Pose(**arm.tool.model_dump()),
+        payload=arm.payload,
+        payload_centre=(arm.payload_centre.x, arm.payload_centre.y, arm.payload_centre.z),
+        grip=Pose(**arm.grip.model_dump()),
+        approach_speed=arm.approach_speed,
+        approach_acceleration=arm.approach_acceleration,
+        untilt_speed=arm.untilt_speed,
+        announcement=arm.announcement,
+        rate=arm.rate,
+    )
+    if len(report.problems) > before:
+        return None
+    from actors.arm.path.limits import check_limits  # brings scipy along
+
+    for problem in check_limits(spec):
+        key, _, text = problem.partition(": ")
+        owner = place if key.startswith("cell.") else at
+        report.add(owner.at(*key.split(".")), text)
+    return spec if len(report.problems) == before else None
+
+
+def _check_address(arm: ArmSection, at: Place, report: Report, mode: str) -> None:
+    if mode != "hardware":
+        if arm.address is not None:
+            report.add(at.at("address"), "a virtual arm has no address: remove it, or write 'mode: hardware'")
+    elif arm.address is None:
+        if not report.is_broken(at.at("address")):
+            report.add(at, "an arm of hardware needs its controller's 'address', for example 'address: 192.168.0.10'")
+    elif not _is_address(arm.address):
+        report.add(
+            at.at("address"),
+            f"{arm.address!r} is neither an IPv4 address nor a host name; write for example '192.168.0.10', no port",
+        )
+
+
+def _is_address(text: str) -> bool:
+    if re.fullmatch(r"[\d.]+", text):  # all digits and dots can only be meant as an address
+        try:
+            ipaddress.IPv4Address(text)
+        except ValueError:
+            return False
+        return True
+    return _HOST.fullmatch(text) is not None
+
+
+def _limits(section: LimitsSection, place: Place, report: Report) -> ArmLimits | None:
+    low = None if section.box is None else _point(section.box.low)
+    high = None if section.box is None else _point(section.box.high)
+    planes = [_plane(p, place.at("planes", i), report) for i, p in enumerate(section.planes)]
+    if low is None or high is None or None in planes:
+        return None
+    return ArmLimits(
+        box_low=low,
+        box_high=high,
+        planes=tuple(plane for plane in planes if plane is not None),
+        joint_speed=section.joint_speed,
+        tool_speed=section.tool_speed,
+        tilt=section.tilt,
+        tilt_speed=section.tilt_speed,
+        singularity=section.singularity,
+        clearance=section.clearance,
+    )
+
+
+def _plane(section: PlaneSection, place: Place, report: Report) -> Plane | None:
+    if section.normal is None or section.offset is None:
+        return None
+    length = math.sqrt(sum(v * v for v in section.normal))
+    if length < 1e-6:
+        report.add(place.at("normal"), "has no direction; write for example [0, 1, 0]")
+        return None
+    # a normal that was normalised once stays as it is to the last bit, so that a written-out file means the same
+    length = 1.0 if abs(length - 1.0) < 1e-12 else length
+    x, y, z = section.normal
+    return Plane((x / length, y / length, z / length), section.offset)
+
+
+def _point(section: PointSection | None) -> Vector | None:
+    if section is None or section.x is None or section.y is None or section.z is None:
+        return None
+    return (section.x, section.y, section.z)
+
+
+def arm_as_file(spec: UrArmSpec) -> dict[str, Any]:
+    """Arm and cell as a laboratory's file would have them, JSON-ready: the keys 'arm' and 'cell'."""
+    limits = spec.limits
+    arm: dict[str, Any] = {
+        "model": spec.model,
+        **({"address": spec.address} if spec.address else {}),
+        "tool": _pose_as_file(spec.tool),
+        "payload": format_quantity(spec.payload, "kg", "kg"),
+        "payload_centre": _point_as_file(spec.payload_centre),
+        "grip": _pose_as_file(spec.grip),
+        "home": {name: format_quantity(q, "rad", "deg") for name, q in zip(JOINTS, spec.home, strict=True)},
+        "limits": {
+            "box": {"low": _point_as_file(limits.box_low), "high": _point_as_file(limits.box_high)},
+            "planes": [
+                {"normal": list(plane.normal), "offset": format_quantity(plane.offset, "m", "mm")}
+                for plane in limits.planes
+            ],
+            "joint_speed": format_quantity(limits.joint_speed, "rad/s", "deg/s"),
+            "tool_speed": format_quantity(limits.tool_speed, "m/s", "mm/s"),
+            "tilt": format_quantity(limits.tilt, "rad", "deg"),
+            "tilt_speed": format_quantity(limits.tilt_speed, "rad/s", "deg/s"),
+            "singularity": limits.singularity,
+            "clearance": format_quantity(limits.clearance, "m", "mm"),
+        },
+        "approach_speed": format_quantity(spec.approach_speed, "rad/s", "deg/s"),
+        "approach_acceleration": format_quantity(spec.approach_acceleration, "rad/s^2", "deg/s^2"),
+        "untilt_speed": format_quantity(spec.untilt_speed, "rad/s", "deg/s"),
+        "announcement": format_quantity(spec.announcement, "s", "s"),
+        "rate": format_quantity(spec.rate, "1/s", "Hz"),
+    }
+    cell = {
+        "receiver": _point_as_file(spec.cell.receiver),
+        "direction": format_quantity(spec.cell.direction, "rad", "deg"),
+        "table": format_quantity(spec.cell.table, "m", "mm"),
+    }
+    return {"arm": arm, "cell": cell}
+
+
+def _point_as_file(point: Vector) -> dict[str, str]:
+    return {name: format_quantity(v, "m", "mm") for name, v in zip("xyz", point, strict=True)}
+
+
+def _pose_as_file(pose: Pose) -> dict[str, str]:
+    table = _point_as_file((pose.x, pose.y, pose.z))
+    return table | {name: format_quantity(getattr(pose, name), "rad", "rad") for name in ("rx", "ry", "rz")}

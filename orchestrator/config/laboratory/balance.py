@@ -1,0 +1,237 @@
+"""A laboratory's balance as written in files: where it stands, its serial line, and when its weights count."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from actors.balance.placement import Placement
+from actors.balance.settling import SettlingRule
+from actors.balance.spec import AUTO, BalanceSpec, SerialBalanceSpec, parse_format
+from actors.balance.virtual_serial.scale import ScaleSettings
+from orchestrator.config.yaml.quantities import Quantity, format_quantity
+from orchestrator.config.yaml.sections import PositiveCount, Section, Text
+from orchestrator.config.yaml.source import Place, Report
+
+_RULE = SettlingRule()
+_SHEET = ScaleSettings()
+_SERIAL = SerialBalanceSpec(port="")
+_BALANCE = BalanceSpec(Placement.TRAY, None)
+
+Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1)]
+PositiveMass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1, positive=True)]
+Duration = Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0)]
+PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=True)]
+
+USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
+"""Speeds that balances can be set to [bits per second]."""
+
+VIRTUAL_DIALECT = "kcp"
+"""Spoken by a virtual balance unless another dialect is named."""
+
+
+class SettlingSection(Section):
+    """When a weight counts."""
+
+    readings: Annotated[int, Field(strict=True, ge=2, le=100)] = _RULE.readings
+    """Stable readings in a row that are needed."""
+
+    span: Duration = _RULE.span
+    """From the first to the last of them."""
+
+    steps: Annotated[float, Quantity("1", "1", 0.0, 100.0)] = _RULE.steps
+    """How far they may lie apart, in steps of the display."""
+
+    deadline: PositiveDuration = _RULE.deadline
+    """When a weight that has not settled is given up."""
+
+
+class VirtualScaleSection(Section):
+    """What the data sheet of a virtual balance says."""
+
+    resolution: PositiveMass = _SHEET.resolution
+    """Step of the display."""
+
+    capacity: Annotated[float, Quantity("kg", "6.2 kg", 0.0, 1000.0, positive=True)] = _SHEET.capacity
+    """Heaviest load."""
+
+    noise: Mass = _SHEET.noise
+    """Standard deviation of weighing the same thing again."""
+
+    drift: Annotated[float, Quantity("kg/s", "0.01 g/s", -0.01, 0.01)] = _SHEET.drift
+    """Creep of the zero."""
+
+    settling_time: Duration = _SHEET.settling_time
+    """Until a change is shown to within a hundredth of it."""
+
+
+class BalanceDeviceSection(Section):
+    """The balance: where it stands, and how it is reached."""
+
+    placement: Literal["tray", "receiver", "everything", "manual"] = "tray"
+    """What it stands under: 'tray' reads the spill, 'receiver' what was received, 'everything' what was poured; with 'manual' the operator types all weights."""  # noqa: E501
+
+    port: Text | None = None
+    """Its serial port; names under /dev/serial/by-id/ stay when it is plugged in again."""
+
+    virtual: VirtualScaleSection | None = None
+    """A balance that is not there, in place of a port."""
+
+    dialect: Literal["auto", "kcp", "kern-swt", "mt-sics", "sbi"] = AUTO  # type: ignore[assignment]
+    """How it talks; 'auto' finds out."""
+
+    baud: PositiveCount | None = None
+    """Bits per second; found out unless given."""
+
+    format: Text | None = None
+    """Bits, parity and stop bits, e.g. 8N1 ('7E1' in quotes, or YAML takes it for a number); found out unless given."""
+
+    handshake: Literal["none", "software", "hardware"] = _SERIAL.handshake
+    """Whether the balance may stop the line: by characters (Xon/Xoff), by wires (CTS), or not."""
+
+    step: PositiveMass | None = None
+    """Step of its display, where that is not one of the last digit."""
+
+    repeatability: Mass = _SERIAL.repeatability
+    """Standard deviation of weighing the same thing again, from its data sheet."""
+
+    settling: SettlingSection = SettlingSection()
+    """When a weight counts."""
+
+    interval: Annotated[float, Quantity("s", "0.15 s", 0.02, 5.0)] = _SERIAL.interval
+    """From one question to the next."""
+
+    answer_time: PositiveDuration = _SERIAL.answer_time
+    """Longest wait for an answer."""
+
+    reconnect_time: Duration = _SERIAL.reconnect_time
+    """How long a port that vanished is waited for."""
+
+    pourer: Literal["here", "elsewhere"] = "here"
+    """Where the pourer is weighed: on this balance, or on another one and typed."""
+
+    load_tolerance: PositiveMass = _BALANCE.load_tolerance
+    """How far a load may lie from the one that the campaign asks for."""
+
+
+_OF_THE_LINE = ("port", "virtual", "dialect", "baud", "format", "handshake", "interval", "answer_time",
+                "reconnect_time", "settling", "pourer")  # fmt: skip
+
+
+def resolve_balance(section: BalanceDeviceSection, place: Place, report: Report, *, mode: str) -> BalanceSpec | None:
+    """The balance of a file; what is wrong goes to the report, and then there is none.
+
+    Args:
+        section: as written.
+        place: where it stands.
+        report: takes problems.
+        mode: of the laboratory, 'virtual' or 'hardware'.
+    """
+    before = len(report.problems)
+    if section.placement == "manual":
+        _check_manual(section, place, report)
+    else:
+        _check_line(section, place, report, mode)
+    if section.settling.deadline <= section.settling.span:
+        report.add(place.at("settling"), "nothing can settle: 'deadline' should be longer than 'span'")
+    if len(report.problems) > before:
+        return None
+    return BalanceSpec(
+        placement=Placement(section.placement),
+        serial=None if section.placement == "manual" else _serial(section),
+        virtual=None if section.virtual is None else ScaleSettings(**section.virtual.model_dump()),
+        pourer_elsewhere=section.pourer == "elsewhere",
+        load_tolerance=section.load_tolerance,
+    )
+
+
+def _check_manual(section: BalanceDeviceSection, place: Place, report: Report) -> None:
+    for key in _OF_THE_LINE:
+        if key in section.model_fields_set:
+            report.add(place.at(key), "is not used with placement 'manual', where the operator types all weights")
+
+
+def _check_line(section: BalanceDeviceSection, place: Place, report: Report, mode: str) -> None:
+    if section.port is not None and section.virtual is not None:
+        report.add(place.at("virtual"), "a balance has a 'port' or is 'virtual', not both")
+    elif mode == "hardware" and section.virtual is not None:
+        report.add(place.at("virtual"), "a laboratory of hardware weighs on a balance that is there; give its 'port'")
+    elif mode != "hardware" and section.port is not None:
+        report.add(place.at("port"), "a virtual laboratory has no port; write 'virtual: {}', or 'mode: hardware'")
+    elif section.port is None and section.virtual is None and not report.is_broken(place.at("port")):
+        example = "port: /dev/serial/by-id/usb-…" if mode == "hardware" else "virtual: {resolution: 0.1 g}"
+        report.add(place, f"placement '{section.placement}' reads the balance; add '{example}', or type: 'manual'")
+    if section.baud is not None and section.baud not in USUAL_BAUDS:
+        usual = ", ".join(str(baud) for baud in USUAL_BAUDS)
+        report.add(place.at("baud"), f"no balance talks at {section.baud} baud; should be one of {usual}")
+    if section.step is not None:
+        _check_step(section.step, section.load_tolerance, place.at("step"), report)
+    if section.virtual is not None:
+        at = place.at("virtual", "resolution")
+        _check_step(section.virtual.resolution, section.load_tolerance, at, report)
+    if section.format is not None:
+        try:
+            parse_format(section.format)
+        except ValueError as error:
+            report.add(place.at("format"), str(error))
+
+
+def _check_step(step: float, tolerance: float, place: Place, report: Report) -> None:
+    if step > tolerance:
+        report.add(
+            place,
+            f"a display in steps of {1e3 * step:g} g can't tell whether a load lies within load_tolerance, "
+            f"{1e3 * tolerance:g} g; weigh on a finer balance, or raise load_tolerance",
+        )
+
+
+def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:
+    named = section.dialect if section.virtual is None or section.dialect != AUTO else VIRTUAL_DIALECT
+    return SerialBalanceSpec(
+        port=section.port or "",
+        dialect=named,
+        baud=section.baud,
+        format=section.format,
+        handshake=section.handshake,
+        settling=SettlingRule(**section.settling.model_dump()),
+        step=section.step,
+        repeatability=section.repeatability,
+        interval=section.interval,
+        answer_time=section.answer_time,
+        reconnect_time=section.reconnect_time,
+    )
+
+
+def balance_as_file(spec: BalanceSpec) -> dict[str, Any]:
+    """The balance as a file would have it, JSON-ready."""
+    table: dict[str, Any] = {"placement": str(spec.placement)}
+    if spec.serial is not None:
+        s, rule = spec.serial, spec.serial.settling
+        table |= {} if spec.virtual is not None else {"port": s.port}
+        table |= {"dialect": s.dialect, "handshake": s.handshake}
+        table |= {key: value for key, value in (("baud", s.baud), ("format", s.format)) if value is not None}
+        table |= {} if s.step is None else {"step": format_quantity(s.step, "kg", "g")}
+        table |= {
+            "repeatability": format_quantity(s.repeatability, "kg", "g"),
+            "settling": {
+                "readings": rule.readings,
+                "span": format_quantity(rule.span, "s", "s"),
+                "steps": rule.steps,
+                "deadline": format_quantity(rule.deadline, "s", "s"),
+            },
+            "interval": format_quantity(s.interval, "s", "s"),
+            "answer_time": format_quantity(s.answer_time, "s", "s"),
+            "reconnect_time": format_quantity(s.reconnect_time, "s", "s"),
+            "pourer": "elsewhere" if spec.pourer_elsewhere else "here",
+        }
+    if spec.virtual is not None:
+        v = spec.virtual
+        table["virtual"] = {
+            "resolution": format_quantity(v.resolution, "kg", "g"),
+            "capacity": format_quantity(v.capacity, "kg", "kg"),
+            "noise": format_quantity(v.noise, "kg", "g"),
+            "drift": format_quantity(v.drift, "kg/s", "g/s"),
+            "settling_time": format_quantity(v.settling_time, "s", "s"),
+        }
+    return table | {"load_tolerance": format_quantity(spec.load_tolerance, "kg", "g")}

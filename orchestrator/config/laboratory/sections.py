@@ -1,0 +1,329 @@
+"""Laboratories as written in files. The hidden θ of a virtual bench lives here, and calibration never reads it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, create_model
+
+from actors.arm.spec import UrArmSpec
+from actors.balance.spec import BalanceSpec
+from actors.bench.spec import VirtualBenchSpec
+from actors.operator import OperatorSpec
+from actors.spec import LaboratorySpec
+from orchestrator.config.laboratory.arm import ArmSection, CellSection, arm_as_file, resolve_arm
+from orchestrator.config.laboratory.balance import BalanceDeviceSection, balance_as_file, resolve_balance
+from orchestrator.config.laboratory.cluster import RaySection, ray_as_file, resolve_ray
+from orchestrator.config.laboratory.operator import OperatorSection, operator_as_file, resolve_operator
+from orchestrator.config.motion import parameter_quantity, value_as_file
+from orchestrator.config.yaml.quantities import Quantity, format_quantity
+from orchestrator.config.yaml.sections import Count, Name, Section, Switch
+from orchestrator.config.yaml.source import Place, Report
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import PoseError
+
+_DEFAULT = VirtualBenchSpec(liquid=SimulationParameters())
+
+Offset = Annotated[float, Quantity("m", "1 mm", -0.05, 0.05)]
+Tilt = Annotated[float, Quantity("rad", "1 deg", -0.2, 0.2)]
+Duration = Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)]
+Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1)]
+Factor = Annotated[float, Quantity("1", "1.02", 0.5, 1.5)]
+Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
+
+
+class PoseErrorSection(Section):
+    """How the real placement differs from the intended one."""
+
+    x: Offset = 0.0
+    """The receiver stands that much further from the pourer."""
+
+    y: Offset = 0.0
+    """… and that much sideways."""
+
+    tilt: Tilt = 0.0
+    """The pourer is held that much more tilted than commanded."""
+
+    speed_factor: Factor = 1.0
+    """Executed over commanded angular velocity."""
+
+
+class PoseNoiseSection(Section):
+    """Standard deviations of the same from pour to pour."""
+
+    x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
+    """Of the distance."""
+
+    y: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
+    """Of the sideways placement."""
+
+    tilt: Annotated[float, Quantity("rad", "0.3 deg", 0.0, 0.2)] = 0.0
+    """Of the tilt."""
+
+    speed_factor: Spread = 0.0
+    """Of executed over commanded angular velocity."""
+
+
+class BalanceSection(Section):
+    """The virtual balance."""
+
+    resolution: Mass = _DEFAULT.balance_resolution
+    """Smallest step of the display."""
+
+    noise: Mass = _DEFAULT.balance_noise
+    """Standard deviation of a reading."""
+
+    drift: Annotated[float, Quantity("kg/s", "0.01 g/s", -0.01, 0.01)] = _DEFAULT.balance_drift
+    """Creep of the zero."""
+
+    settling_time: Duration = _DEFAULT.settling_time
+    """Time constant until a reading is stable."""
+
+
+class HiddenLiquidBase(Section):
+    """θ of the 'real' liquid between the virtual arm and the virtual balance. Hidden: calibration never reads it."""
+
+    def parameters(self) -> SimulationParameters:
+        """The hidden θ; what is not given has its default."""
+        return SimulationParameters.from_values(
+            {name: v for name in self.written_keys() if (v := self.value(name)) is not None}
+        )
+
+
+def hidden_liquid_model() -> type[HiddenLiquidBase]:
+    """The section with one key per simulation parameter."""
+    fields: Any = {
+        name: (Annotated[float, parameter_quantity(name)] | None, Field(default=None, description=info.meaning or None))
+        for name, info in SimulationParameters.info().items()
+    }
+    model: type[HiddenLiquidBase] = create_model(
+        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, **fields
+    )
+    return model
+
+
+HiddenLiquid: Any = hidden_liquid_model()
+
+
+class BenchSection(Section):
+    """What is hidden on a virtual bench: a liquid that is not the simulator's, errors, and how fast time runs."""
+
+    required: ClassVar[dict[str, str]] = {"liquid": "{particles: 4000, cohesion: 0.05 N/m}"}
+
+    liquid: HiddenLiquid | None = None
+    """Hidden θ of the 'real' liquid; calibration never reads it."""
+
+    pose_error: PoseErrorSection = PoseErrorSection()
+    """Systematic error of grip and placement."""
+
+    pose_noise: PoseNoiseSection = PoseNoiseSection()
+    """Its scatter, drawn anew for each pour."""
+
+    balance: BalanceSection = BalanceSection()
+    """The balance of a bench of numbers; a laboratory with an arm has its own section for it."""
+
+    time_scale: Annotated[float, Quantity("1", "30", 0.0, 1e6)] = _DEFAULT.time_scale
+    """Bench seconds per wall second; 0 waits for nothing (not with an arm)."""
+
+    operator_time: Duration = _DEFAULT.operator_time
+    """Refilling, placing, wiping between two pours, in bench time; with an arm see 'operator'."""
+
+
+class LaboratoryFile(Section):
+    """Where a campaign runs."""
+
+    required: ClassVar[dict[str, str]] = {"name": "virtual"}
+
+    name: Name | None = None
+    """Its name in journals and banners."""
+
+    mode: Literal["virtual", "hardware"] = "virtual"
+    """What it is made of: 'virtual' moves nothing, 'hardware' moves an arm."""
+
+    simulators: Count = 0
+    """Simulators in the pool; 0: one per core, of this machine or of the cluster."""
+
+    in_process: Switch = False
+    """Run everything in one process (slow, for finding errors)."""
+
+    object_store: Annotated[float, Quantity("MB", "160 MB", 80.0, 100_000.0)] = 160.0
+    """Shared memory for simulators' results, without a cluster."""
+
+    ray: RaySection | None = None
+    """The Ray cluster to run on; unless given, a private Ray on this machine."""
+
+    arm: ArmSection | None = None
+    """The arm that holds the pourer, reached over its controller's own wires, virtual or not."""
+
+    cell: CellSection | None = None
+    """What stands where around the arm."""
+
+    balance: BalanceDeviceSection | None = None
+    """The balance beside the arm."""
+
+    operator: OperatorSection = OperatorSection()
+    """The person beside the arm."""
+
+    bench: BenchSection | None = None
+    """What is hidden on a virtual bench; without it and without an arm, the laboratory simulates and plans."""
+
+
+def resolve_laboratory(section: LaboratoryFile, place: Place, report: Report) -> LaboratorySpec | None:
+    """The laboratory of a file; what is wrong goes to the report, and then there is none.
+
+    Args:
+        section: as written.
+        place: where it stands.
+        report: takes problems.
+    """
+    before = len(report.problems)
+    if section.mode == "hardware":
+        _check_hardware(section, place, report)
+    _check_wires(section, place, report)
+    operator = resolve_operator(section.operator, place.at("operator"), report, mode=section.mode)
+    arm = None if section.arm is None else resolve_arm(section.arm, section.cell, place, report, mode=section.mode)
+    balance = None
+    if section.arm is not None and section.balance is not None:
+        balance = resolve_balance(section.balance, place.at("balance"), report, mode=section.mode)
+    if section.name is None or operator is None or len(report.problems) > before:
+        return None
+    if (section.arm is None) is not (arm is None) or (section.bench is not None and section.bench.liquid is None):
+        return None  # reported already, as missing
+    bench = None if section.bench is None else _bench(section.bench)
+    if arm is not None and bench is not None:
+        arm, balance = replace(arm, time_scale=bench.time_scale), _paced(balance, bench.time_scale)
+    return LaboratorySpec(
+        name=section.name,
+        simulators=section.simulators,
+        bench=bench,
+        mode=section.mode,
+        in_process=section.in_process,
+        object_store_mb=round(section.object_store),
+        ray=resolve_ray(section.ray),
+        arm=arm,
+        balance=balance,
+        operator=operator if arm is not None else OperatorSpec(answers="virtual"),
+    )
+
+
+def _check_hardware(section: LaboratoryFile, place: Place, report: Report) -> None:
+    if section.bench is not None:
+        report.add(
+            place.at("bench"),
+            "is what a virtual bench hides, and how fast its time runs; hardware hides its own, and its time is the "
+            "clock's. Remove the section, or write 'mode: virtual'",
+        )
+    if section.arm is None and not report.is_broken(place.at("arm")):
+        report.add(place, "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section", key=True)
+
+
+def _check_wires(section: LaboratoryFile, place: Place, report: Report) -> None:
+    """What belongs to an arm, and what with one belongs elsewhere."""
+    if section.arm is None:
+        if report.is_broken(place.at("arm")):
+            return
+        for key in ("cell", "balance", "operator"):
+            if key in section.model_fields_set:
+                meant = "; a bench of numbers has 'bench: {balance: …, operator_time: …}'" if key != "cell" else ""
+                report.add(place.at(key), f"belongs to an arm, and there is none; add 'arm', or remove it{meant}")
+        return
+    if section.balance is None and not report.is_broken(place.at("balance")):
+        report.add(
+            place, "an arm that pours needs a balance; add 'balance: {placement: tray, …}', or 'placement: manual'"
+        )
+    if section.mode == "hardware":
+        return
+    if section.bench is None:
+        if not report.is_broken(place.at("bench")):
+            report.add(place, "a virtual arm pours a hidden liquid; add 'bench: {liquid: {…}}', or 'mode: hardware'")
+        return
+    at, bench = place.at("bench"), section.bench
+    for key, other in (("balance", "the section 'balance'"), ("operator_time", "'time' in the section 'operator'")):
+        if key in bench.model_fields_set:
+            report.add(at.at(key), f"is of a bench without wires; with an arm write it into {other}")
+    if bench.pose_error.speed_factor != 1.0 or bench.pose_noise.speed_factor != 0.0:
+        key = "pose_error" if bench.pose_error.speed_factor != 1.0 else "pose_noise"
+        report.add(
+            at.at(key, "speed_factor"),
+            "an arm over its wires moves as fast as it is told; its own lag is in what it reads back. Remove the key",
+        )
+    if bench.time_scale < 1.0:
+        report.add(at.at("time_scale"), "an arm takes its time: 1 or more, and at most some 50")
+
+
+def _bench(b: BenchSection) -> VirtualBenchSpec:
+    assert b.liquid is not None
+    return VirtualBenchSpec(
+        liquid=b.liquid.parameters(),
+        pose_error=PoseError(**b.pose_error.model_dump()),
+        pose_noise=PoseError(**b.pose_noise.model_dump()),
+        time_scale=b.time_scale,
+        operator_time=b.operator_time,
+        balance_resolution=b.balance.resolution,
+        balance_noise=b.balance.noise,
+        balance_drift=b.balance.drift,
+        settling_time=b.balance.settling_time,
+    )
+
+
+def _paced(balance: BalanceSpec | None, time_scale: float) -> BalanceSpec | None:
+    """A virtual balance in the bench's time."""
+    if balance is None or balance.serial is None:
+        return balance
+    return replace(balance, serial=replace(balance.serial, time_scale=time_scale))
+
+
+def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
+    """The laboratory as a file would have it, JSON-ready."""
+    table: dict[str, object] = {
+        "name": spec.name,
+        "mode": spec.mode,
+        "simulators": spec.simulators,
+        "in_process": spec.in_process,
+        "object_store": f"{spec.object_store_mb} MB",
+        **({} if spec.ray is None else {"ray": ray_as_file(spec.ray)}),
+        **_wires_as_file(spec.arm, spec),
+    }
+    if spec.bench is None:
+        return table
+    b = spec.bench
+    info = SimulationParameters.info()
+    liquid = b.liquid.model_dump()
+    bench: dict[str, object] = {
+        "liquid": {n: value_as_file(v, info[n].unit, info[n].unit, whole=info[n].integer) for n, v in liquid.items()},
+        "pose_error": pose_as_file(b.pose_error),
+        "pose_noise": pose_as_file(b.pose_noise),
+        "time_scale": b.time_scale,
+    }
+    if spec.arm is None:
+        bench |= {
+            "balance": {
+                "resolution": format_quantity(b.balance_resolution, "kg", "g"),
+                "noise": format_quantity(b.balance_noise, "kg", "g"),
+                "drift": format_quantity(b.balance_drift, "kg/s", "g/s"),
+                "settling_time": format_quantity(b.settling_time, "s", "s"),
+            },
+            "operator_time": format_quantity(b.operator_time, "s", "s"),
+        }
+    return table | {"bench": bench}
+
+
+def _wires_as_file(arm: UrArmSpec | None, spec: LaboratorySpec) -> dict[str, object]:
+    if arm is None:
+        return {}
+    return {
+        **arm_as_file(arm),
+        **({} if spec.balance is None else {"balance": balance_as_file(spec.balance)}),
+        "operator": operator_as_file(spec.operator, mode=spec.mode),
+    }
+
+
+def pose_as_file(pose: PoseError) -> dict[str, object]:
+    """Errors of execution, or their standard deviations, as files have them."""
+    return {
+        "x": format_quantity(pose.x, "m", "mm"),
+        "y": format_quantity(pose.y, "m", "mm"),
+        "tilt": format_quantity(pose.tilt, "rad", "deg"),
+        "speed_factor": pose.speed_factor,
+    }

@@ -1,0 +1,111 @@
+"""Values that may stand in a file of their own: vessels, liquids, laboratories. Each file is read once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from orchestrator.config.laboratory.sections import LaboratoryFile, resolve_laboratory
+from orchestrator.config.vessel import (
+    MESH_SUFFIXES,
+    LiquidFile,
+    VesselFile,
+    missing_file,
+    resolve_liquid,
+    resolve_vessel,
+)
+from orchestrator.config.yaml.errors import ConfigError, shown_path
+from orchestrator.config.yaml.kinds import wrong_kind
+from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.source import Document, Place, Report
+from orchestrator.config.yaml.validate import validate
+from sim_engine.liquid import Liquid
+from sim_engine.vessel.spec import VesselSpec
+
+S = TypeVar("S", bound=Section)
+
+YAML_SUFFIXES = (".yaml", ".yml", ".json")
+
+KINDS: dict[type[Section], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
+"""Kinds of whole files that can be told apart by their keys."""
+
+
+@dataclass
+class References:
+    """Follows paths from files to files; problems in any of them go to the report with their own place."""
+
+    report: Report
+    _read: dict[tuple[Path, type[Section]], tuple[Section, Place] | None] = field(default_factory=dict)
+    _vessels: dict[tuple[Path, Any], VesselSpec | None] = field(default_factory=dict)
+
+    def section(self, value: Any, place: Place, model: type[S]) -> tuple[S, Place] | None:
+        """The section behind a path, or the inline one, with its place; None where there is none to look at."""
+        if isinstance(value, model):
+            return value, place
+        if not isinstance(value, str):
+            return None
+        path = (place.directory / value).resolve()
+        if path.suffix.lower() in MESH_SUFFIXES and model is VesselFile:
+            self.report.add(
+                place, f"is a mesh; write {{name: {path.stem}, mesh: {value}, unit: mm}} with the unit that it is in"
+            )
+            return None
+        if not path.is_file():
+            self.report.add(place, missing_file(path))
+            return None
+        if path.suffix.lower() not in YAML_SUFFIXES:
+            self.report.add(place, f"{path.name} is no YAML file; its name should end in .yaml")
+            return None
+        return self.file(path, model, place)
+
+    def file(self, path: Path, model: type[S], named: Place | None = None) -> tuple[S, Place] | None:
+        """The section that a whole file holds.
+
+        Args:
+            path: of the file.
+            model: of the section.
+            named: where it is referred to; None where it was given by itself.
+        """
+        key = (path, model)
+        if key not in self._read:
+            try:
+                place = Place(Document.read(path))
+            except ConfigError as error:
+                self.report.problems.extend(error.problems)
+                self._read[key] = None
+            else:
+                kind = KINDS.get(model)
+                other = None if kind is None else wrong_kind(place.document, kind)
+                if other is not None and named is not None:
+                    self.report.add(named, f"{shown_path(path)} {other.message}")
+                elif other is not None:
+                    self.report.problems.append(other)
+                read = None if other is not None else validate(model, place, self.report)
+                self._read[key] = None if read is None else (read, place)
+        found = self._read[key]
+        if found is None:
+            return None
+        section, place = found
+        assert isinstance(section, model)
+        return section, place
+
+    def vessel(self, value: Any, place: Place) -> VesselSpec | None:
+        """A vessel; None where something is wrong with it (which is reported)."""
+        found = self.section(value, place, VesselFile)
+        if found is None:
+            return None
+        key = (found[1].document.path, found[1].loc)
+        if key not in self._vessels:
+            self._vessels[key] = resolve_vessel(*found, self.report)
+        return self._vessels[key]
+
+    def liquid(self, value: Any, place: Place) -> Liquid | None:
+        """A liquid; None where something is wrong with it."""
+        found = self.section(value, place, LiquidFile)
+        return None if found is None else resolve_liquid(found[0])
+
+    def laboratory(self, value: Any, place: Place) -> Any:
+        """A `LaboratorySpec`; None where something is wrong with it."""
+        found = self.section(value, place, LaboratoryFile)
+        return None if found is None else resolve_laboratory(*found, self.report)

@@ -1,0 +1,188 @@
+"""What the calibration strategies share: asking, listening, dropping what failed, reporting θ*."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+from actors.optimizer.core.problem import Point, Suggestion
+from orchestrator.errors import LearningError
+from orchestrator.plan import CalibrationPlan
+from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
+from orchestrator.strategies.asking import Questions
+from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.display import displayed_map
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
+from orchestrator.strategies.trials import Trial, Trials
+from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import MINIMUM_POURED, normalised_spillage
+
+MAP_RESOLUTION = 30
+
+
+class Calibration(ABC):
+    """Base of C1 to C4. Subclasses say what to try next (`_next`) and what a simulation tells (`_discrepancy`).
+
+    Only pours of the split 'train' are used. A simulation that failed, or poured too little for c_s to be defined, says
+    nothing and is dropped.
+    """
+
+    NAME = ""
+
+    def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
+        """Plan the campaign.
+
+        Raises:
+            LearningError: fewer than two usable pours.
+        """
+        self._train = [pour for pour in measured if pour.split == "train"]
+        self._usable = [pour for pour in self._train if pour.spillage is not None]
+        if len(self._usable) < 2:
+            raise LearningError(
+                f"calibration needs at least 2 training pours with ≥ {MINIMUM_POURED:.0%} poured, got "
+                f"{len(self._usable)} of {len(self._train)}; make more pours, or let them tilt farther (max_angle)"
+            )
+        self._plan = plan
+        self._seeds = SeedStream(seed, self.NAME)
+        self._questions = Questions(self._seeds)
+        self._trials = Trials()
+        self._width_known = False
+        self._undefined = 0
+        self._best: Point | None = None
+        self._expected: tuple[float, float] = (0.0, 0.0)
+        self._final: Suggestion | None = None
+        self.decisions: list[Decision] = []
+
+    # -- asking ----------------------------------------------------------------------------------------------------
+
+    @property
+    def finished(self) -> bool:
+        """θ* is known."""
+        return self._best is not None and not self._questions.out
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """What is queued, and what comes next as soon as its premises are known."""
+        if not self._width_known and slots.simulations > 0:
+            self._trials.width, self._width_known = self._trials_at_once(slots.simulations), True
+        simulations = self._trials.issue(slots.simulations)
+        if not self.finished and not self._questions.out and not self._trials.queued:
+            self._next()
+            simulations += self._trials.issue(slots.simulations - len(simulations))
+        # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
+        return [*self._questions.issue(), *simulations]
+
+    @abstractmethod
+    def _next(self) -> None:
+        """Put the next question, queue trials, or conclude. Nothing is queued and no question is out."""
+
+    def _trials_at_once(self, slots: int) -> int:
+        """Trials that are in flight at a time."""
+        return slots
+
+    # -- listening -------------------------------------------------------------------------------------------------
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a question or a simulation."""
+        if isinstance(request, Suggest):
+            self._questions.answer(request, outcome)
+        elif isinstance(request, Simulate):
+            self._trials.settle(request, self._judged(request, outcome))
+        else:
+            raise ValueError(f"calibration asks for no {type(request).__name__}")
+
+    def _judged(self, request: Simulate, outcome: Outcome) -> float | None:
+        if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
+            return None
+        if not is_sound(outcome.outcome.fractions):
+            return None
+        simulated = normalised_spillage(outcome.outcome.fractions)
+        if simulated is None:
+            self._undefined += 1
+            return None
+        return self._discrepancy(request, simulated)
+
+    @abstractmethod
+    def _discrepancy(self, request: Simulate, simulated: float) -> float:
+        """What a simulation's c_s(a, θ) tells about Δ."""
+
+    def _settle(self, point: Point, mean: float, deviation: float) -> None:
+        """θ* is found: where, and what discrepancy is expected there."""
+        self._best, self._expected = point, (mean, deviation)
+        text = f"θ* {described(self._values(point))}: |Δ| {max(mean, 0.0):.3f} ± {deviation:.3f}"
+        self.decisions.append(Decision(text, {"mean": mean, "sd": deviation}))
+
+    def _settle_at_minimum(self, suggestion: Suggestion) -> None:
+        """θ* is the proposed minimiser of the posterior mean."""
+        if not suggestion.means:
+            raise self._nothing_learnt()
+        self._final = suggestion
+        self._settle(suggestion.points[0], suggestion.means[0], suggestion.deviations[0])
+
+    def _nothing_learnt(self) -> LearningError:
+        return LearningError(
+            f"calibration learnt nothing: of {self._trials.answered} simulations {self._trials.lost} gave no "
+            "discrepancy (see their reasons in the journal)"
+        )
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def parameters_at(self, point: Point) -> SimulationParameters:
+        """θ_s of a place in the unit cube, with the plan's fixed values."""
+        return SimulationParameters.from_values({**self._plan.fixed_parameters, **self._values(point)})
+
+    @property
+    def theta(self) -> SimulationParameters:
+        """θ*.
+
+        Raises:
+            RuntimeError: the calibration isn't finished.
+        """
+        if self._best is None:
+            raise RuntimeError("the calibration isn't finished")
+        return self.parameters_at(self._best)
+
+    def _values(self, point: Point) -> dict[str, float]:
+        return self._plan.parameters.decode(point)
+
+    @property
+    @abstractmethod
+    def _budget(self) -> int:
+        """Simulations in all."""
+
+    def progress(self) -> tuple[int, int]:
+        """Simulations answered, simulations in all."""
+        return self._trials.answered, self._budget
+
+    @abstractmethod
+    def _row(self, number: int, trial: Trial) -> Mapping[str, object]:
+        """What the result has of a trial beside its θ."""
+
+    def result(self) -> dict[str, object]:
+        """θ* with its expected discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
+        trials = [(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed]
+        result: dict[str, object] = {
+            "strategy": self.NAME,
+            "simulations": self._trials.answered,
+            "lost": self._trials.lost,
+            "undefined": self._undefined,
+            "training_pours": len(self._usable),
+            "trials": [{"theta": self._values(trial.point), **self._row(i, trial)} for i, trial in trials],
+        }
+        if self.finished:
+            mean, deviation = self._expected
+            final = self._final
+            result |= {
+                "theta": self.theta.model_dump(),
+                "searched": list(self._plan.parameters.names),
+                "predicted_discrepancy": mean,
+                "predicted_deviation": deviation,
+                "hyperparameters": None if final is None else final.hyperparameters,
+                "map": None if final is None else displayed_map(final.surrogate, self._plan.parameters),
+            }
+        return result
+
+
+def described(values: Mapping[str, float]) -> str:
+    """Parameters for people: 'particles 1200  cohesion 0.031'."""
+    return "  ".join(f"{name} {value:.4g}" for name, value in values.items())

@@ -1,0 +1,241 @@
+"""C4: Bayesian optimisation of O2, at one simulation per iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from actors.optimizer.core.problem import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
+from orchestrator.errors import LearningError
+from orchestrator.plan import CalibrationPlan
+from orchestrator.requests import Decision, Simulate
+from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, described
+from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.calibration.posterior import directions, posterior_result
+from orchestrator.strategies.calibration.prior import actions_of_prior
+from orchestrator.strategies.trials import Trial
+from sim_engine.losses import MINIMUM_POURED
+
+CONTEXT_SIZE = 24
+"""Actions over which the surrogate's answer is averaged."""
+
+LIVE_MAP_EVERY = 10
+"""Simulations between two maps for those who watch; one costs about 20 ms."""
+
+LIVE_MAP_RESOLUTION = 20
+
+
+class ContinuousBayesianCalibration(Calibration):
+    """C4: minimise O2(θ) = E_{a~g} |c_r(a) − c_s(a, θ)| with one simulation per iteration.
+
+    The measured spillage is first regressed by a GP, so that a discrepancy can be formed at any action. Every iteration
+    simulates one θ at one action of the prior g; the surrogate does the averaging. Two things are done
+    differently from the paper, because both lower the variance at the same price:
+
+    * In place of independent draws the actions are a scrambled Sobol sequence: any run of consecutive iterations
+      covers g evenly.
+    * The discrepancy varies far more over actions than over θ, and |·| folds away its sign. So the surrogate is a GP of
+      the signed difference c_r − c_s over (θ, a), and what is minimised is the mean over g of the absolute
+      value that it predicts (the plan's `averaging`: 'context'). With 'noise', as in the paper, the surrogate sees
+      |c_r − c_s| over θ alone and takes the action's influence for noise; κ is a constant then, too.
+
+    g is uniform over the box of actions unless the plan has a `prior`, but limited to where c_r is defined: actions at
+    which less than 5 % is expected to be poured are left out. A simulation that failed, or poured too little for c_s to
+    be defined, says nothing about its neighbours and is dropped. θ* minimises the posterior mean over the whole box:
+    the lowest observation would only be the luckiest.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); a surrogate over both arguments of an expected cost:
+    Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
+    Limitations: θ that make the simulated pour stop short are judged only by the actions at which they do pour. With
+    `averaging` 'noise' the optimiser sees heteroscedastic noise, large where the discrepancy varies over g, and nothing
+    can be said about θ beside θ*.
+    """
+
+    NAME = "C4"
+
+    def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
+        """Plan the campaign; only pours of the split 'train' are used.
+
+        Raises:
+            LearningError: fewer than two usable pours.
+            ValueError: no budget.
+        """
+        super().__init__(plan, measured, seed)
+        if plan.simulations < 1:
+            raise ValueError(f"calibration needs a budget of simulations, got {plan.simulations}")
+        self._knows_actions = plan.averaging == "context"
+        self._started = False
+        self._mapped = 0
+        self._actions: tuple[Point, ...] = ()
+        self._measured_at: tuple[float, ...] = ()
+        self._expected_at: dict[Simulate, float] = {}
+        self._posterior: Posterior | None = None
+
+    # -- asking ----------------------------------------------------------------------------------------------------
+
+    def _next(self) -> None:
+        """Regress c_r once; then θ by θ, one simulation each; last, θ*."""
+        if not self._started:
+            self._started = True
+            self._ask_regression()
+        elif self._actions:
+            self._ask_parameters()
+
+    def _ask_regression(self) -> None:
+        """c_r(a), and whether it is defined, along the prior's sequence of actions."""
+        count, seed = 2 * self._plan.simulations, self._seeds.next()
+        plan, encode = self._plan, self._plan.actions.encode
+        sequence = actions_of_prior(plan.actions, count, seed, plan.constraints, plan.prior)
+        spillage, poured = Data(), Data()
+        for pour in self._train:
+            point = tuple(encode({name: _number(pour, name) for name in self._plan.actions.names}))
+            poured = poured.added(point, pour.poured)
+            if pour.spillage is not None:
+                spillage = spillage.added(point, pour.spillage)
+        problem = SuggestProblem(self._plan.actions, spillage, count=0, predict_at=sequence)
+
+        def with_poured(regression: Suggestion, likely: Suggestion | None) -> None:
+            keep = [
+                i
+                for i in range(len(sequence))
+                if likely is None or likely.predictions[i] - likely.prediction_deviations[i] >= MINIMUM_POURED
+            ][: self._plan.simulations]
+            if not keep:
+                raise LearningError(
+                    f"at no action of the calibration's space would {MINIMUM_POURED:.0%} of the liquid be poured, as "
+                    "far as the weighed pours tell; let it tilt farther (max_angle)"
+                )
+            # few places may be left where c_r is defined: they are used again
+            order = [keep[i % len(keep)] for i in range(self._plan.simulations)]
+            self._actions = tuple(sequence[i] for i in order)
+            self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
+            self.decisions.append(
+                Decision(f"c_r(a) regressed from {len(self._usable)} pours", dict(regression.hyperparameters or {}))
+            )
+
+        def with_spillage(regression: Suggestion) -> None:
+            if len(self._usable) == len(self._train):
+                with_poured(regression, None)
+            else:
+                where_defined = SuggestProblem(self._plan.actions, poured, count=0, predict_at=sequence)
+                self._questions.put(where_defined, "regress", lambda likely: with_poured(regression, likely))
+
+        self._questions.put(problem, "regress", with_spillage)
+
+    def _ask_parameters(self) -> None:
+        """The next θ, or θ* once the budget is spent."""
+        remaining = self._plan.simulations - len(self._trials)
+        if remaining <= 0:
+            if self._trials.idle:
+                problem = self._problem(everything=True, acquisition="posterior_minimum", resolution=MAP_RESOLUTION)
+                self._questions.put(problem, "conclude", self._conclude)
+            return
+        if len(self._trials) == 0:
+            count = min(max(self._plan.initial, 1), remaining)
+            problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
+            self._questions.put(problem, "start", self._queue)
+        elif self._trials.ready:
+            self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
+
+    def _conclude(self, suggestion: Suggestion) -> None:
+        """θ* is known; what the pours say about θ beside it is asked."""
+        self._settle_at_minimum(suggestion)
+        if self._knows_actions:
+            self._ask_posterior()
+
+    def _ask_posterior(self) -> None:
+        """Draws of θ given the training pours: first what the regression says at them, for it is in the differences."""
+        encode, names = self._plan.actions.encode, self._plan.actions.names
+        places = tuple(tuple(encode({name: _number(pour, name) for name in names})) for pour in self._usable)
+        weighed = tuple(pour.spillage for pour in self._usable if pour.spillage is not None)
+
+        def drawn(suggestion: Suggestion) -> None:
+            self._posterior = suggestion.posterior
+            if self._posterior is not None:
+                for text in directions(np.array(self._posterior.points), self._plan.parameters.names):
+                    self.decisions.append(Decision(text))
+
+        def regressed(regression: Suggestion) -> None:
+            offsets = tuple(
+                spillage - min(max(expected, 0.0), 1.0)
+                for spillage, expected in zip(weighed, regression.predictions, strict=True)
+            )
+            noise = (regression.hyperparameters or {}).get("noise", 0.0)
+            problem = replace(
+                self._problem(everything=True), count=0, posterior=PosteriorQuestion(places, offsets, noise)
+            )
+            self._questions.put(problem, "posterior", drawn)
+
+        data = Data(places, weighed)
+        self._questions.put(SuggestProblem(self._plan.actions, data, count=0, predict_at=places), "regress", regressed)
+
+    def _live_resolution(self) -> int:
+        """Resolution of the map that the next answer carries for those who watch; mostly 0, for none."""
+        if len(self._trials) - self._mapped < LIVE_MAP_EVERY:
+            return 0
+        self._mapped = len(self._trials)
+        return LIVE_MAP_RESOLUTION
+
+    def _problem(self, *, everything: bool = False, acquisition: str = "lcb", resolution: int = 0) -> SuggestProblem:
+        data = self._trials.data(everything=everything)
+        return SuggestProblem(
+            self._plan.parameters,
+            data,
+            pending=() if everything else self._trials.pending(),
+            acquisition=acquisition,  # type: ignore[arg-type]
+            kappa=self._plan.kappa,
+            map_resolution=resolution,
+            context=self._actions[:CONTEXT_SIZE] if self._knows_actions else (),
+            plain=not self._knows_actions,
+        )
+
+    # -- listening -------------------------------------------------------------------------------------------------
+
+    def _queue(self, suggestion: Suggestion) -> None:
+        for i, point in enumerate(suggestion.points):
+            index = len(self._trials)
+            theta = self.parameters_at(point)
+            action = self._plan.scene.action(self._plan.actions.decode(self._actions[index]))
+            request = Simulate(self._plan.scene.name, action, theta, self._seeds.next(), "calibrate")
+            context = self._actions[index] if self._knows_actions else ()
+            self._expected_at[request] = self._measured_at[index]
+            self._trials.add(Trial(point, (request,), context))
+            if suggestion.means:
+                text = f"θ {described(self._values(point))}: expected |Δ| {max(suggestion.means[i], 0.0):.3f}"
+                self.decisions.append(Decision(text, {"mean": suggestion.means[i], "sd": suggestion.deviations[i]}))
+
+    def _discrepancy(self, request: Simulate, simulated: float) -> float:
+        """c_r(a) − c_s(a, θ); without its sign where the surrogate takes actions for noise."""
+        difference = self._expected_at[request] - simulated
+        return difference if self._knows_actions else abs(difference)
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def result(self) -> dict[str, object]:
+        """As every calibration; with what the pours say about θ beside θ*."""
+        result = super().result()
+        if self.finished and self._posterior is not None:
+            result["posterior"] = posterior_result(self._posterior, self._plan.parameters)
+        return result
+
+    @property
+    def _budget(self) -> int:
+        return self._plan.simulations
+
+    def _row(self, number: int, trial: Trial) -> Mapping[str, object]:
+        action = trial.requests[0].action
+        return {
+            "action_si": {name: getattr(action, name) for name in self._plan.actions.names},
+            "measured": self._measured_at[number],
+            "discrepancy": None if trial.cost is None else abs(trial.cost),
+            "difference": trial.cost if self._knows_actions else None,
+        }
+
+
+def _number(pour: MeasuredPour, name: str) -> float:
+    value = getattr(pour.action, name)
+    if value is None:
+        raise ValueError(f"{name} is searched, but switched off in a measured pour")
+    return float(value)

@@ -1,0 +1,239 @@
+"""Which pours to make for calibration: a stratified design, asked for one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.optimizer.core.problem import Linear, Point
+from orchestrator.plan import RecordedPour
+from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.strategies.calibration.prior import region_of
+from orchestrator.strategies.display import displayed_action
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
+from sim_engine.action import Action, described
+from sim_engine.losses import normalised_spillage
+from sim_engine.space import Space
+from sim_engine.task import Scene
+
+if TYPE_CHECKING:
+    from actors.optimizer.core.region import Region
+
+Array = NDArray[np.float64]
+
+MAX_TRIES = 12
+"""Actions tried in one stratum before it is given up as impossible."""
+
+MAX_DRAWS = 100
+"""Points of a stratum of which none meets the constraints, before one from anywhere is taken."""
+
+
+@dataclass(frozen=True)
+class MeasuredPour:
+    """A weighed pour as calibration and evaluation need it.
+
+    Attributes:
+        spillage: r = spilled / poured; None below 5 % poured, where it is undefined.
+        poured: fraction of the load that left the pourer.
+        split: 'train', 'test' or 'transfer'.
+    """
+
+    action: Action
+    spillage: float | None
+    poured: float
+    split: str = "train"
+
+    @classmethod
+    def from_record(cls, record: RecordedPour) -> MeasuredPour:
+        """From a row of a file of recorded pours."""
+        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split)
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """A cell of the unit cube: lower and upper corners, (dimension,) each."""
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+    def draw(self, rng: np.random.Generator) -> Point:
+        """A uniform point of the cell."""
+        u = rng.random(len(self.lower))
+        return tuple(float(a + (b - a) * x) for a, b, x in zip(self.lower, self.upper, u, strict=True))
+
+
+def stratified(count: int, dimension: int, rng: np.random.Generator) -> list[Stratum]:
+    """Cells of a jittered design of `count` points, in random order.
+
+    The paper's: k^dimension equal cells with two points each (32 = 4×4×2), or one each where `count` is such a power;
+    any other number: a Latin hypercube, every axis cut into `count` slices used once.
+    """
+    if count < 1:
+        raise ValueError(f"a design needs at least one pour, got {count}")
+    for each in (2, 1):
+        k = round((count / each) ** (1.0 / dimension))
+        if k >= 2 and each * k**dimension == count:
+            cells = np.stack(np.meshgrid(*[np.arange(k)] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
+            cells = np.repeat(cells, each, axis=0)
+            break
+    else:
+        k = count
+        cells = np.stack([rng.permutation(count) for _ in range(dimension)], axis=1)
+    order = rng.permutation(count)
+    return [Stratum(tuple((c / k).tolist()), tuple(((c + 1) / k).tolist())) for c in cells[order]]
+
+
+def draw_allowed(stratum: Stratum, region: Region | None, rng: np.random.Generator) -> Point:
+    """A point of the stratum that lies in the region; one from anywhere in it where the stratum seems to have none."""
+    point = stratum.draw(rng)
+    if region is None:
+        return point
+    for _ in range(MAX_DRAWS):
+        if region.allows(np.array([point]))[0]:
+            return point
+        point = stratum.draw(rng)
+    return tuple(map(float, region.draw(1, rng, even=False)[0]))
+
+
+def choose_holdout(strata: list[Stratum], count: int, rng: np.random.Generator) -> frozenset[int]:
+    """Indices of the strata kept for testing: spread over the first axis, one from each of `count` equal groups."""
+    if not 0 <= count < len(strata):
+        raise ValueError(f"holdout {count} must be at least 0 and below the number of pours, {len(strata)}")
+    order = sorted(range(len(strata)), key=lambda i: strata[i].lower)
+    groups = np.array_split(np.array(order), count) if count else []
+    return frozenset(int(rng.choice(group)) for group in groups)
+
+
+@dataclass
+class _Planned:
+    stratum: Stratum
+    split: str
+    tries: int = 0
+    action: Action | None = None
+    measured: MeasuredPour | None = None
+    given_up: str | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+class DesignedPours:
+    """Weigh a stratified set of pours: two actions from each of 4×4 strata, as in the paper, or a Latin hypercube.
+
+    An action that turns out to be invalid (touching vessels) is replaced by another of its stratum; a stratum without
+    a possible action is given up after `MAX_TRIES`. A pour that failed is not repeated: its liquid is gone, and the
+    design loses one point.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 4.1 (32 actions, stratified; 28 train, 4 test).
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        actions: Space,
+        count: int,
+        holdout: int,
+        seed: int,
+        *,
+        points: Sequence[Point] | None = None,
+        constraints: Sequence[Linear] = (),
+    ) -> None:
+        """Plan.
+
+        Args:
+            points: the actions themselves, in the unit cube, in place of drawn ones: pours that are to be repeated.
+            constraints: that the actions meet, if drawn.
+        """
+        self._scene = scene
+        self._actions = actions
+        self._seeds = SeedStream(seed, "design")
+        if points is None:
+            strata = stratified(count, actions.dimension, self._seeds.rng)
+        else:
+            strata = [Stratum(point, point) for point in points]
+        kept = choose_holdout(strata, holdout, self._seeds.rng)
+        self._planned = [_Planned(s, "test" if i in kept else "train") for i, s in enumerate(strata)]
+        self._region = region_of(actions, constraints if points is None else ())
+        self._current = 0
+        self._pouring: Pour | None = None
+        self.decisions: list[Decision] = []
+
+    @property
+    def finished(self) -> bool:
+        """Every stratum has been poured or given up."""
+        return self._current >= len(self._planned)
+
+    @property
+    def measured(self) -> tuple[MeasuredPour, ...]:
+        """The pours weighed so far."""
+        return tuple(p.measured for p in self._planned if p.measured is not None)
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The next pour, if none is under way."""
+        if self.finished or self._pouring is not None or slots.pours < 1:
+            return []
+        planned = self._planned[self._current]
+        values = self._actions.decode(draw_allowed(planned.stratum, self._region, self._seeds.rng))
+        planned.tries += 1
+        planned.action = self._scene.action(values)
+        self._pouring = Pour(
+            self._scene.name, planned.action, self._current + 1, self._seeds.next(), purpose="calibration"
+        )
+        self.decisions.append(
+            Decision(
+                f"calibration pour {self._current + 1}/{len(self._planned)} ({planned.split}): {described(values)}"
+            )
+        )
+        return [self._pouring]
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What the balance said, or why there is nothing to say."""
+        if self._pouring is None or request != self._pouring:
+            raise ValueError(f"this pour was not asked for: {request}")
+        self._pouring = None
+        planned = self._planned[self._current]
+        match outcome:
+            case Poured(measurement) if not is_sound(measurement.fractions):
+                planned.given_up = "weighing: the balance gave no numbers"
+            case Poured(measurement):
+                fractions = measurement.fractions
+                assert planned.action is not None
+                planned.measured = MeasuredPour(
+                    planned.action, normalised_spillage(fractions), fractions.poured, planned.split
+                )
+            case Failed("invalid_action", reason) if planned.tries < MAX_TRIES:
+                planned.notes.append(reason)
+                return  # another draw of the same stratum
+            case Failed(kind, reason):
+                planned.given_up = f"{kind}: {reason}"
+            case _:
+                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+        self._current += 1
+
+    def progress(self) -> tuple[int, int]:
+        """Pours done, pours in all."""
+        return self._current, len(self._planned)
+
+    def result(self) -> dict[str, object]:
+        """The pours so far, in the order made; actions in display units."""
+        rows: list[dict[str, object]] = []
+        for number, planned in enumerate(self._planned[: self._current], start=1):
+            if planned.measured is None:
+                rows.append({"number": number, "split": planned.split, "given_up": planned.given_up})
+                continue
+            action = planned.measured.action
+            rows.append(
+                {
+                    "number": number,
+                    "split": planned.split,
+                    "action": displayed_action({name: getattr(action, name) for name in self._actions.names}),
+                    "action_si": {name: getattr(action, name) for name in self._actions.names},
+                    "spillage": planned.measured.spillage,
+                    "poured": planned.measured.poured,
+                    "invalid_tries": len(planned.notes),
+                }
+            )
+        return {"pours": rows}

@@ -1,0 +1,122 @@
+"""The calibrated θ beside its rivals: what calibration was worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from orchestrator.requests import Decision, Outcome, Request, Simulate, Slots
+from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
+from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
+from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Space
+
+CALIBRATED = "theta"
+"""Label of θ* in the results."""
+
+
+class Scorecard:
+    """Score θ* on all weighed pours, and its rivals on those that calibration did not see.
+
+    The rivals are random θ from the same box (their median), the mean of the training pours, and a GP regression of
+    the training pours. The regression is judged in the calibration's scene only: of another vessel it knows nothing.
+    Random θ are not simulated on training pours, where nothing is to be won by it.
+    """
+
+    def __init__(
+        self,
+        theta: SimulationParameters,
+        random_thetas: Mapping[str, SimulationParameters],
+        pours: Sequence[ScoredPour],
+        actions: Space,
+        seed: int,
+    ) -> None:
+        """Plan.
+
+        Args:
+            random_thetas: by label, 'random 1' … .
+            pours: of the splits 'train', 'test' and 'transfer'.
+            actions: space of the regression.
+        """
+        unseen = [scored for scored in pours if scored.pour.split != "train"]
+        train = [scored for scored in pours if scored.pour.split == "train"]
+        # The unseen come first in both, so that θ* and random θ meet the same seeds on them.
+        self._parts = [
+            Evaluation({CALIBRATED: theta}, [*unseen, *train], seed),
+            Evaluation(random_thetas, unseen, seed),
+        ]
+        self._owner: dict[Simulate, Evaluation] = {}
+        self._actions = actions
+        self._pours: dict[str, list[MeasuredPour]] = {}
+        for scored in pours:
+            self._pours.setdefault(scored.pour.split, []).append(scored.pour)
+        self._baselines: dict[str, dict[str, float | None]] | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Every simulation has been answered."""
+        return all(part.finished for part in self._parts)
+
+    @property
+    def decisions(self) -> list[Decision]:
+        """Why these simulations."""
+        return [decision for part in self._parts for decision in part.decisions]
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The next simulations, θ* first."""
+        requests: list[Request] = []
+        for part in self._parts:
+            asked = part.ask(Slots(slots.simulations - len(requests), 0))
+            self._owner.update({request: part for request in asked if isinstance(request, Simulate)})
+            requests += asked
+        return requests
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a simulation. Raises ValueError if it was not asked for."""
+        part = self._owner.get(request) if isinstance(request, Simulate) else None
+        if part is None:
+            raise ValueError(f"this simulation was not asked for: {request}")
+        part.tell(request, outcome)
+
+    def progress(self) -> tuple[int, int]:
+        """Simulations answered, simulations in all."""
+        numbers = [part.progress() for part in self._parts]
+        return sum(done for done, _ in numbers), sum(total for _, total in numbers)
+
+    def result(self) -> dict[str, object]:
+        """Mean |r − c_s| by label and split, the random θ's median by split, and the rivals without a simulator."""
+        ours, rivals = (part.result() for part in self._parts)
+        result: dict[str, object] = {
+            key: {**_mapping(ours[key]), **_mapping(rivals[key])} for key in ("discrepancy", "thetas")
+        }
+        result["random_median"] = rivals["random_median"]
+        result["simulations"] = self.progress()[0]
+        result["undefined"] = {CALIBRATED: ours["undefined"], "random": rivals["undefined"]}
+        result["pairs"] = [*_list(ours["pairs"]), *_list(rivals["pairs"])]
+        if self.finished:
+            result |= self._without_simulator()
+        return result
+
+    def _without_simulator(self) -> dict[str, dict[str, float | None]]:
+        if self._baselines is None:
+            train = self._pours.get("train", [])
+            unseen = {split: pours for split, pours in self._pours.items() if split != "train"}
+            self._baselines = {
+                "mean_predictor": {split: mean_predictor_discrepancy(train, p) for split, p in unseen.items()},
+                "regression": {
+                    split: regression_discrepancy(self._actions, train, p)
+                    for split, p in unseen.items()
+                    if split == "test"
+                },
+            }
+        return self._baselines
+
+
+def _mapping(value: object) -> Mapping[str, object]:
+    assert isinstance(value, Mapping)
+    return value
+
+
+def _list(value: object) -> list[object]:
+    assert isinstance(value, list)
+    return value

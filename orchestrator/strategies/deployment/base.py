@@ -1,0 +1,372 @@
+"""What the deployment strategies share: asking, pouring, counting, reporting."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
+from orchestrator.plan import DeploymentPlan
+from orchestrator.requests import (
+    Decision,
+    Failed,
+    Outcome,
+    Pour,
+    Poured,
+    Prediction,
+    Request,
+    Simulate,
+    Slots,
+    Suggest,
+)
+from orchestrator.strategies.asking import Questions
+from orchestrator.strategies.deployment.compromise import Compromise
+from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.objectives import Vector
+from orchestrator.strategies.deployment.pours import PourTrial, former_pours, trust
+from orchestrator.strategies.display import displayed_action, displayed_map
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.sound import is_sound
+from orchestrator.strategies.trials import Trial, Trials
+from sim_engine.action import Action, described
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import Scene
+
+MAX_REFUSED = 20
+"""Actions that may be refused (touching vessels, out of reach) free of charge: pours before a strategy gives up, and as
+many simulations before others count against the budget."""
+
+MAP_RESOLUTION = 25
+
+
+class Deployment(ABC):
+    """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
+
+    An action that can't be made, because the vessels touch or the arm can't reach, is refused before anything is
+    simulated or moved. It has no cost; the optimiser is told the place, and keeps away from where another refusal is
+    likely. A refusal does not count against a budget, but only so many are free. A pour that failed after something had
+    moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
+    """
+
+    NAME = ""
+    LEARNS_ON_POURS = True
+    """Whether real pours, also those of before, enter its surrogate."""
+
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        self._plan = plan
+        self._data = plan.data if self.LEARNS_ON_POURS else None
+        self._scene = scene
+        self._parameters = parameters
+        self._costing = Costing.of(plan, scene, parameters)
+        self._seeds = SeedStream(seed, f"{self.NAME} {scene.name}")
+        self._compromise = Compromise(self._costing, self._seeds.rng)
+        self._questions = Questions(self._seeds)
+        self._trials = Trials()
+        self._width_known = False
+        self._pours: list[PourTrial] = []
+        self._former = () if self._data is None else former_pours(self._data, scene, plan.actions, self._costing)
+        self._queued_pour: Pour | None = None
+        self._pouring: Pour | None = None
+        self._final: Suggestion | None = None
+        self._latest_map: Suggestion | None = None
+        self._finished = False
+        self.decisions: list[Decision] = []
+        if self._data is not None:
+            path = self._data.path
+            text = f"{len(self._former)} former pours enter the data ({path.parent.name}/{path.name})"
+            self.decisions.append(Decision("; left out: ".join([text, *self._data.left_out])))
+
+    # -- asking and listening --------------------------------------------------------------------------------------
+
+    @property
+    def finished(self) -> bool:
+        """Nothing more to ask, nothing more to wait for."""
+        return self._finished and self._pouring is None and self._trials.idle
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """What is queued, and a question about what comes next as soon as its premises are known."""
+        if not self._width_known and slots.simulations > 0:
+            self._trials.width, self._width_known = slots.simulations, True
+        simulations = self._trials.issue(slots.simulations)
+        pours: list[Pour] = []
+        if self._queued_pour is not None and slots.pours > 0:
+            pours, self._pouring, self._queued_pour = [self._queued_pour], self._queued_pour, None
+        if not self._finished and self._may_think and self._queued_pour is None:
+            self._next(slots.simulations - len(simulations))
+        # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
+        return [*self._questions.issue(), *pours, *simulations]
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a question, a simulation or a pour."""
+        if isinstance(request, Suggest):
+            self._questions.answer(request, outcome)
+        elif isinstance(request, Simulate):
+            avoided = self._avoids and request.pose_error is None  # under an error, touching is what may happen
+            if avoided and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
+                self._trials.settle(request, None, refused=True)
+            else:
+                vector = self._costing.simulated(outcome, request.action)
+                self._trials.settle(request, self._compromise.note(request, vector))
+        elif request == self._pouring:
+            self._pouring = None
+            self._weigh(self._pours[-1], outcome)
+        else:
+            raise ValueError(f"this pour was not asked for: {request}")
+
+    @property
+    def _may_think(self) -> bool:
+        """Nothing is queued and no question is out, so that it can be said what comes next."""
+        return not self._questions.out and not self._trials.queued
+
+    @abstractmethod
+    def _next(self, free_simulations: int) -> None:
+        """Put the next question, or finish. Called where `_may_think` and no pour is queued."""
+
+    def _weigh(self, trial: PourTrial, outcome: Outcome) -> None:
+        match outcome:
+            case Poured(measurement) if not is_sound(measurement.fractions):
+                trial.status, trial.reason = "failed", "weighing: the balance gave no numbers"
+            case Poured(measurement):
+                trial.vector = self._costing.poured(measurement, self._scene.action(trial.values))
+                trial.cost, trial.status = self._costing.total(trial.vector), "weighed"
+                trial.measurement = measurement
+                self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
+                return
+            case Failed("invalid_action", reason):
+                trial.status, trial.reason = "refused", reason
+            case Failed(kind, reason):
+                trial.status, trial.reason = "failed", f"{kind}: {reason}"
+                trial.mishap = kind == "pour_failed"
+            case _:
+                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+        penalised = self._plan.on_failed_pour == "penalise"
+        if (not self._avoids) if trial.status == "refused" else penalised:
+            trial.cost, trial.vector = self._costing.worst, self._costing.worst_vector
+
+    # -- pieces for subclasses -------------------------------------------------------------------------------------
+
+    def _simulate(self, suggestion: Suggestion, purpose: str, *, first: int = 0, repeats: int = 1) -> None:
+        """Queue simulations of the suggested points, from the `first`."""
+        for i, point in enumerate(suggestion.points[first:], start=first):
+            values = self._plan.actions.decode(point)
+            self._trials.add(Trial(point, self._repeated(self._scene.action(values), purpose, repeats)))
+            self._decide(f"simulate ({purpose})", values, suggestion, i)
+
+    def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
+        """Simulations of one action."""
+        name, parameters = self._scene.name, self._parameters
+        return tuple(Simulate(name, action, parameters, self._seeds.next(), purpose) for _ in range(repeats))
+
+    def _pour(self, suggestion: Suggestion, point: Point, prediction: Prediction | None) -> None:
+        """Queue a pour."""
+        values = self._plan.actions.decode(point)
+        noise = 0.0 if prediction is None or prediction.scatter is None else prediction.scatter
+        trial = PourTrial(self._counted + 1, point, values, prediction, noise)
+        self._pours.append(trial)
+        action = self._scene.action(values)
+        self._queued_pour = Pour(self._scene.name, action, trial.number, self._seeds.next(), prediction)
+        text = f"pour {trial.number}/{self._plan.pours}  {described(values)}"
+        if prediction is None:
+            self.decisions.append(Decision(text))
+        else:
+            expected = {"mean": prediction.mean, "sd": prediction.deviation}
+            text += f"  predicted {max(prediction.mean, 0.0):.4g} ± {prediction.deviation:.2g}"
+            if prediction.scatter is not None:
+                expected["scatter"] = prediction.scatter
+                text += f", a pour scatters by {prediction.scatter:.2g}"
+            self.decisions.append(Decision(text, expected))
+
+    def _pour_first(self, suggestion: Suggestion) -> None:
+        """Queue a pour of the first suggested point, with the surrogate's prediction where there is one."""
+        self._latest_map = suggestion if suggestion.surrogate is not None else self._latest_map
+        known = None
+        if suggestion.means and not self._compromise.exploring:
+            noise = suggestion.noises[0] if suggestion.noises else None
+            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise))
+        self._pour(suggestion, suggestion.points[0], known)
+
+    def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
+        """Standard deviation of one observation around the surrogate [the loss' unit]: from pour to pour, or in
+        simulation from seed to seed, as fitted; None without a surrogate.
+
+        Args:
+            noise: what the answer says of the place; None, as in journals of before: what it says of all.
+        """
+        return (suggestion.hyperparameters or {}).get("noise") if noise is None else noise
+
+    def _real(self) -> Data:
+        """Observations of the real cost, those of before the campaign first."""
+        poured = self._poured
+        return self._compromise.data(poured, [*poured, *self._compromise.of(self._trials.counting(everything=True))])
+
+    def _simulated(self, *, everything: bool = False) -> Data:
+        """Observations of the simulated cost."""
+        if not self._compromise.exploring:
+            return self._trials.data(everything=everything)
+        observed = self._compromise.of(self._trials.counting(everything=everything))
+        return self._compromise.data(observed, [*self._poured, *observed])
+
+    @property
+    def _poured(self) -> list[tuple[Point, Vector]]:
+        return [*self._former, *((p.point, p.vector) for p in self._pours if p.vector is not None)]
+
+    @property
+    def _counted(self) -> int:
+        """Pours that count against the budget."""
+        former = len(self._former) if self._data is not None and self._data.counts else 0
+        return former + sum(p.status in ("weighed", "failed") for p in self._pours)
+
+    @property
+    def _avoids(self) -> bool:
+        return self._plan.refusals == "avoid"
+
+    @property
+    def _warned(self) -> bool:
+        """Pours that went wrong are warnings of more near them; in the paper they are pours that lost everything."""
+        return self._avoids and not self._plan.plain
+
+    @property
+    def _refused(self) -> int:
+        return sum(p.status == "refused" for p in self._pours)
+
+    @property
+    def _spent(self) -> int:
+        """Simulated trials before any pour that count against their budget, as far as the next choice may know."""
+        return len(self._trials) - self._unspent
+
+    @property
+    def _unspent(self) -> int:
+        counting = self._trials.counting(everything=self._trials.idle)
+        return min(sum(t.refused and t.requests[0].purpose not in ("refine", "window") for t in counting), MAX_REFUSED)
+
+    @property
+    def _pours_left(self) -> bool:
+        return self._counted < self._plan.pours and self._refused < MAX_REFUSED
+
+    def _conclude(self, suggestion: Suggestion) -> None:
+        self._final = suggestion
+        self._finish()
+
+    def _finish(self) -> None:
+        """The end, once the front is known where one is looked for: a regression of each objective."""
+        if not self._compromise.wanted or self._compromise.front is not None:
+            self._finished = True
+            return
+        simulated, poured = self._compromise.of(self._trials.counting(everything=True)), self._poured
+        candidates = self._compromise.candidates([*simulated, *poured])
+        answers: dict[int, Suggestion] = {}
+
+        def answered(j: int, suggestion: Suggestion) -> None:
+            answers[j] = suggestion
+            if len(answers) == len(self._compromise.names):
+                self._compromise.settle(candidates, [answers[k] for k in sorted(answers)], self._plan.actions)
+                self._finished = True
+
+        for j in range(len(self._compromise.names)):
+            problem = self._front_problem(_objective(simulated, j), _objective(poured, j))
+            problem = replace(problem, count=0, predict_at=tuple(candidates))
+            self._questions.put(problem, "front", partial(answered, j))
+
+    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
+        """How one objective is regressed: of the simulations, unless a strategy pours."""
+        return self._problem(simulated)
+
+    def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
+        text = f"{what}  {described(values)}"
+        if suggestion.means and self._compromise.exploring:
+            self.decisions.append(Decision(f"{text}  (a compromise under random weights)"))
+        elif suggestion.means:
+            mean, deviation = suggestion.means[index], suggestion.deviations[index]
+            self.decisions.append(
+                Decision(f"{text}  predicted {max(mean, 0.0):.4g} ± {deviation:.2g}", {"mean": mean, "sd": deviation})
+            )
+        else:
+            self.decisions.append(Decision(f"{text}  (no surrogate yet)"))
+
+    def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
+        """A question about the loss.
+
+        Args:
+            everything: use all refusals of simulations; else those that the next choice may know.
+            changes: fields of the problem.
+        """
+        trials = self._trials.counting(everything=everything)
+        return SuggestProblem(
+            self._plan.actions,
+            data,
+            kappa=self._plan.kappa,
+            constraints=self._plan.constraints,
+            infeasible=tuple(trial.point for trial in trials if trial.refused),
+            refused=tuple(p.point for p in self._pours if p.status == "refused") if self._avoids else (),
+            failed=tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
+            noise=self._plan.noise,
+            **changes,
+        )
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    @property
+    def best_values(self) -> dict[str, float] | None:
+        """The action to use from now on, by posterior mean [SI]; None before the end, or if nothing was learnt."""
+        if self._final is not None and self._final.best_point is not None:
+            return self._plan.actions.decode(self._final.best_point)
+        return None
+
+    def progress(self) -> tuple[int, int]:
+        """Steps done, steps in all."""
+        return min(self._counted, self._plan.pours), self._plan.pours
+
+    def _trusted(self, weighed: Sequence[PourTrial]) -> dict[str, object]:
+        """How far the first pours bore out what was predicted."""
+        return trust(weighed)
+
+    def result(self) -> dict[str, object]:
+        """What was learnt so far; actions in display units and in SI."""
+        weighed = [p for p in self._pours if p.status == "weighed" and p.cost is not None]
+        result: dict[str, object] = {
+            "strategy": self.NAME,
+            "scene": self._scene.name,
+            "loss": self._plan.loss_name,
+            "simulations": self._trials.answered,
+            "simulations_lost": self._trials.lost,
+            "simulations_refused": sum(trial.refused for trial in self._trials.all),
+            "pours": [p.row(self._compromise.names) for p in self._pours if p.status != "pouring"],
+            "former_pours": len(self._former),
+            "refused_pours": self._refused,
+            "failed_pours": sum(p.status == "failed" for p in self._pours),
+            "trust": self._trusted(weighed),
+        }
+        if weighed:
+            best = min(weighed, key=lambda p: p.cost if p.cost is not None else math.inf)
+            for name, trial in (("first", weighed[0]), ("best", best), ("latest", weighed[-1])):
+                result[f"{name}_loss"] = trial.cost
+                result[f"{name}_spillage"] = trial.row(self._compromise.names)["spillage"]
+        if self._refused >= MAX_REFUSED:
+            result["gave_up"] = f"{self._refused} pours were refused as invalid; the action space hardly allows any"
+        if self._compromise.names:
+            result["objectives"] = list(self._compromise.names)
+        if self._compromise.front is not None:
+            result["front"] = self._compromise.front
+        latest = self._final or self._latest_map
+        if latest is not None and latest.surrogate is not None:
+            result["map"] = displayed_map(latest.surrogate, self._plan.actions)
+        values = self.best_values
+        if values is not None and self._final is not None:
+            result |= {
+                "action": displayed_action(values),
+                "action_si": values,
+                "predicted_loss": self._final.best_mean,
+                "predicted_deviation": self._final.best_deviation,
+                "predicted_scatter": self._scatter(self._final, self._final.best_noise),
+                "hyperparameters": self._final.hyperparameters,
+            }
+        return result
+
+
+def _objective(observed: Sequence[tuple[Point, Vector]], index: int) -> Data:
+    """One objective alone."""
+    return Data(tuple(point for point, _ in observed), tuple(vector[index] for _, vector in observed))

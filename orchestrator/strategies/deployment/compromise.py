@@ -1,0 +1,106 @@
+"""Several objectives behind one question: which scalar the next action minimises, and the front that was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from actors.optimizer.core.problem import Data, Point, Suggestion
+from orchestrator.requests import Simulate
+from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.front import random_weights, scalarised, undominated
+from orchestrator.strategies.deployment.objectives import Vector
+from orchestrator.strategies.display import displayed_action
+from orchestrator.strategies.trials import Trial
+from sim_engine.space import Space
+
+Observed = Sequence[tuple[Point, Vector]]
+"""Where objectives were observed, and what they were."""
+
+
+class Compromise:
+    """Remembers the objectives of simulations, and weighs them anew for every question.
+
+    Unless a front is looked for, what is minimised is always the one number of `Costing.total`.
+    """
+
+    def __init__(self, costing: Costing, rng: np.random.Generator) -> None:
+        self._costing = costing
+        self._rng = rng
+        self._vectors: dict[Simulate, Vector] = {}
+        self._weights: Vector | None = None
+        self.front: list[dict[str, object]] | None = None
+
+    @property
+    def wanted(self) -> bool:
+        """A front is looked for."""
+        return self._costing.objectives is not None and self._costing.objectives[0].pareto
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the objectives; empty with a plain loss."""
+        return () if self._costing.objectives is None else self._costing.objectives[0].names
+
+    @property
+    def exploring(self) -> bool:
+        """The question minimises a random compromise, and its numbers are no losses."""
+        return self._weights is not None
+
+    def weigh(self, *, exploring: bool) -> None:
+        """Weigh for the next question: at random to explore the front, else as the campaign says."""
+        self._weights = random_weights(len(self.names), self._rng) if self.wanted and exploring else None
+
+    def note(self, request: Simulate, vector: Vector | None) -> float | None:
+        """Remember what a simulation came to; its cost."""
+        if vector is None:
+            return None
+        self._vectors[request] = vector
+        return self._costing.total(vector)
+
+    def of(self, trials: Sequence[Trial]) -> list[tuple[Point, Vector]]:
+        """Mean objectives of the trials that have any."""
+        found = []
+        for trial in trials:
+            known = [self._vectors[request] for request in trial.requests if request in self._vectors]
+            if known:
+                found.append((trial.point, tuple(float(v) for v in np.mean(known, axis=0))))
+        return found
+
+    def data(self, observed: Observed, among: Observed) -> Data:
+        """Observations of what the next question minimises.
+
+        Args:
+            observed: what is wanted.
+            among: all that is known: its range scales the objectives.
+        """
+        points, vectors = tuple(point for point, _ in observed), [vector for _, vector in observed]
+        if self._weights is None:
+            return Data(points, tuple(self._costing.total(vector) for vector in vectors))
+        known = [vector for _, vector in among]
+        return Data(points, tuple(scalarised(vectors, self._weights, self._costing.limits, known)))
+
+    def candidates(self, observed: Observed) -> list[Point]:
+        """Tried actions that may be on the front: those that delivered enough."""
+        limits = np.array(self._costing.limits) + 1e-9
+        return list(dict.fromkeys(point for point, vector in observed if np.all(np.array(vector) <= limits)))
+
+    def settle(self, candidates: Sequence[Point], answers: Sequence[Suggestion], actions: Space) -> None:
+        """The front among the candidates, by each objective's posterior mean."""
+        if any(len(answer.predictions) != len(candidates) for answer in answers):
+            self.front = []  # too little was observed for a surrogate
+            return
+        means = [tuple(max(answer.predictions[i], 0.0) for answer in answers) for i in range(len(candidates))]
+        kept = sorted(undominated(means), key=lambda i: means[i])
+        self.front = []
+        for i in kept:
+            values = actions.decode(candidates[i])
+            deviations = [answer.prediction_deviations[i] for answer in answers]
+            self.front.append(
+                {
+                    "action": displayed_action(values),
+                    "action_si": values,
+                    "objectives": dict(zip(self.names, means[i], strict=True)),
+                    "deviations": dict(zip(self.names, deviations, strict=True)),
+                }
+            )

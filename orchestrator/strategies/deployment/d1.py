@@ -1,0 +1,204 @@
+"""D1: plan in simulation only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
+from orchestrator.plan import DeploymentPlan
+from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
+from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment.window import SafeWindow
+from orchestrator.strategies.sound import is_sound
+from orchestrator.strategies.trials import Trial
+from sim_engine.action import Action, described
+from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import normalised_spillage
+from sim_engine.outcome import Fractions
+from sim_engine.spread import Spread
+from sim_engine.task import Scene
+
+FEWEST_CHECKS = 2
+"""Simulations of an action that is to lie inside the safe window; `simulations_per_iteration` where that is more."""
+
+
+class OneShotPlanning(Deployment):
+    """D1: minimise the simulated loss, then pour once. Needs no sensor.
+
+    Bayesian optimisation of f̄_s(a) = 1/m1 Σ_j f_s(a, seed_j), with m1 simulations an iteration, started at Sobol points
+    in place of random ones. The last iteration simulates the minimiser of the posterior mean over the whole box;
+    what is recommended, and poured if there is a budget for it, is the best simulated action by posterior mean: an
+    action that was at least tried in simulation, and not merely the luckiest.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D1); that m1 simulations are averaged is our reading.
+    Limitations: an error of the simulator is an error of the plan.
+    """
+
+    NAME = "D1"
+    LEARNS_ON_POURS = False
+
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        super().__init__(plan, scene, parameters, seed)
+        self._spillages: dict[Simulate, float | None] = {}
+        self._window: SafeWindow | None = None
+        self._searched: list[Trial] = []
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """As every deployment; checks of the window, and the pour after them, follow from no answer of the optimiser:
+        they are asked for at once."""
+        requests = super().ask(slots)
+        return requests if requests or self._window is None else super().ask(slots)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """As every deployment; and how much each simulation spilled, whatever the loss is."""
+        super().tell(request, outcome)
+        if (
+            isinstance(request, Simulate)
+            and isinstance(outcome, Simulated)
+            and outcome.outcome.invalid is None
+            and is_sound(outcome.outcome.fractions)
+        ):
+            self._spillages[request] = normalised_spillage(outcome.outcome.fractions)
+
+    def _next(self, free_simulations: int) -> None:
+        done, wanted = self._spent, max(self._plan.iterations, 1)
+        repeats = max(self._plan.simulations_per_iteration, 1)
+        if self._width_known and self._trials.all == []:
+            # slots count simulations, a trial takes `repeats` of them
+            self._trials.width = math.ceil(self._trials.width / repeats)
+
+        def simulate(suggestion: Suggestion) -> None:
+            self._simulate(suggestion, "plan", repeats=repeats)
+
+        if self._window is not None and not self._window.closed:
+            if self._trials.idle:
+                self._check_window(self._window)
+        elif self._final is not None:
+            if self._pouring is not None:
+                return
+            if self._counted == 0 and self._avoids and self._pours_left:  # it was refused
+                self._recommend_again()
+            else:  # the one pour has been weighed
+                self._finish()
+        elif len(self._trials) == 0:
+            count = min(max(self._plan.initial, 1), max(wanted - 1, 1))
+            self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
+        elif done < wanted - 1:
+            if self._trials.ready:
+                self._questions.put(self._model(), "plan", simulate)
+        elif done < wanted:
+            if self._trials.idle:
+                self._questions.put(self._model(everything=True, acquisition="posterior_minimum"), "plan", simulate)
+        elif self._trials.idle:
+            self._recommend_again()
+
+    def _recommend_again(self) -> None:
+        problem = self._model(everything=True, count=0, map_resolution=MAP_RESOLUTION)
+        self._questions.put(problem, "conclude", self._recommend)
+
+    def _model(self, *, everything: bool = False, **changes: Any) -> SuggestProblem:
+        self._compromise.weigh(exploring=not everything)
+        data = self._simulated(everything=everything)
+        pending = self._trials.pending(everything=everything)
+        return self._problem(data, everything=everything, pending=pending, **changes)
+
+    def _recommend(self, suggestion: Suggestion) -> None:
+        self._final, self._searched = suggestion, list(self._trials.all)
+        if suggestion.best_point is None:
+            self._finish()  # too few simulations succeeded; the result says how many were lost
+        elif self._plan.tolerance is None:
+            self._use(suggestion)
+        else:
+            window = SafeWindow(self._plan.actions, suggestion.best_point, self._tolerated(self._plan.tolerance))
+            problem = replace(self._model(everything=True, count=0), predict_at=window.places)
+
+            self._questions.put(problem, "window", lambda outline: self._outlined(window, problem, outline))
+
+    def _use(self, suggestion: Suggestion) -> None:
+        """Pour what is recommended, or leave it at that."""
+        if self._plan.pours < 1 or suggestion.best_point is None:
+            self._finish()
+        else:
+            self._pour(suggestion, suggestion.best_point, self._prediction(suggestion))
+
+    def _prediction(self, suggestion: Suggestion) -> Prediction | None:
+        """Of the pour of what is recommended."""
+        if suggestion.best_mean is None or suggestion.best_deviation is None:
+            return None
+        return Prediction(
+            suggestion.best_mean, suggestion.best_deviation, self._scatter(suggestion, suggestion.best_noise)
+        )
+
+    # -- the safe window -------------------------------------------------------------------------------------------
+
+    def _tolerated(self, share: float) -> float:
+        """A share of what spilling everything would cost, in the loss' own unit."""
+        all_spilled = self._plan.loss(
+            Fractions(1.0, 1.0, 0.0),
+            loaded_mass=self._scene.liquid.mass,
+            particles=self._parameters.particles,
+        )
+        assert all_spilled is not None
+        return share * all_spilled
+
+    def _outlined(self, window: SafeWindow, problem: SuggestProblem, outline: Suggestion) -> None:
+        """The surrogate's answer for the window's places is there: go on with checks."""
+        window.outline(outline.predictions, () if outline.risk is None else outline.risk.worst)
+        self._window = window
+        self._check_window(window)
+
+    def _check_window(self, window: SafeWindow) -> None:
+        """Judge what was simulated of the window; simulate what is left to check, or conclude."""
+        if window.waiting:
+            tried = self._trials.all[-len(window.waiting) :]
+            for check, trial in zip(tuple(window.waiting), tried, strict=True):
+                window.judge(check, trial.cost)
+        for check in window.next_checks():
+            action = self._scene.action(self._plan.actions.decode(check.point))
+            self._trials.add(Trial(check.point, self._checking(action, window.worst(check), self._checks)))
+            self.decisions.append(Decision(f"check {check.what}  {described(self._plan.actions.decode(check.point))}"))
+        if window.closed:
+            assert self._final is not None
+            self._use(self._final)
+
+    @property
+    def _checks(self) -> int:
+        """Simulations of one place."""
+        return max(self._plan.simulations_per_iteration, FEWEST_CHECKS)
+
+    def _checking(self, action: Action, worst: Sequence[int], repeats: int) -> tuple[Simulate, ...]:
+        """Simulations that tell whether an action is inside the window; `worst`: see `RiskAnswer`."""
+        return self._repeated(action, "window", repeats)
+
+    def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
+        """Of a single seed: what is observed here are means of m1 of them."""
+        of_means = super()._scatter(suggestion, noise)
+        return None if of_means is None else of_means * math.sqrt(max(self._plan.simulations_per_iteration, 1))
+
+    def progress(self) -> tuple[int, int]:
+        """Simulations and pours done, and in all."""
+        repeats = max(self._plan.simulations_per_iteration, 1)
+        pours = 1 if self._plan.pours else 0
+        answered = self._trials.answered - repeats * self._unspent
+        checks = 0 if self._window is None else sum(len(t.requests) for t in self._trials.all[len(self._searched) :])
+        return answered + self._counted, max(self._plan.iterations, 1) * repeats + checks + pours
+
+    def result(self) -> dict[str, object]:
+        """As every deployment; with r = spilled / poured over the simulations of the recommended action.
+
+        These seeds took part in choosing the action; `orchestrator.strategies.repeats` has fresh ones.
+        """
+        result = super().result()
+        if self._final is not None and self._final.best_point is not None:
+            tried = [trial for trial in self._searched if trial.point == self._final.best_point]
+            known = [r for trial in tried for q in trial.requests if (r := self._spillages.get(q)) is not None]
+            spillage = Spread.of(known)
+            result["predicted_spillage"] = None if spillage is None else spillage.mean
+            result["predicted_spillage_deviation"] = None if spillage is None else spillage.deviation
+        if self._window is not None and self._window.closed:
+            simulations = sum(len(trial.requests) for trial in self._trials.all[len(self._searched) :])
+            result["window"] = {**self._window.result(), "simulations": simulations}
+        return result

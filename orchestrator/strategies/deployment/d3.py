@@ -1,0 +1,175 @@
+"""D3: real pours around what simulation expects, while simulation goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from actors.optimizer.core.problem import Data, MeanName, Suggestion, SuggestProblem
+from orchestrator.plan import DeploymentPlan, ModelName
+from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
+from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment.pours import PourTrial
+from orchestrator.strategies.deployment.trust import TrustCheck
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import Scene
+
+MEANS: dict[ModelName, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
+"""How the optimiser calls the models."""
+
+WIDENING = 3.0
+"""Factor on the noise that simulations are expected to have, once they were found wrong."""
+
+
+class Hybrid(Deployment):
+    """D3: as D2, but the surrogate's prior mean is learnt from m2 simulations, and goes on learning between pours.
+
+    First, Bayesian optimisation in simulation chooses m2 actions. Their surrogate becomes the prior of the real
+    cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds to δ's. The first
+    pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the weighed pours.
+
+    With `per_pour = k`, one question answers with the next pour and k places where a simulation would matter
+    most, which are simulated beside the pour and enter the prior: learning from real trials interleaved with planning
+    in a model (Dyna). With `per_pour = None`, simulations go on for as long as the pour takes.
+
+    Where the plan says so, the first pours are compared with the simulations (`TrustCheck`). One that is wrong is
+    then forgotten, believed less, or put to a person. `model` says how simulations enter the surrogate; the above is
+    'residual', the paper's.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3; m2 = 37, 15 pours).
+    Limitations: a prior from an untrustworthy simulator is worse than none; pours made before that is known are lost.
+    """
+
+    NAME = "D3"
+
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        super().__init__(plan, scene, parameters, seed)
+        self._check = None if plan.trust is None else TrustCheck(plan.trust, self._costing.worst)
+        self._unasked: Ask | None = None
+        self._asked: Ask | None = None
+
+    # -- asking and listening --------------------------------------------------------------------------------------
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """As every deployment; nothing new while a person has to decide."""
+        if self._unasked is not None:
+            self._asked, self._unasked = self._unasked, None
+            return [self._asked]
+        return [] if self._asked is not None else super().ask(slots)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """As every deployment, or how to go on with a simulator that is wrong."""
+        if not isinstance(request, Ask):
+            super().tell(request, outcome)
+            return
+        if request != self._asked or self._check is None or not isinstance(outcome, Answered):
+            raise ValueError(f"this was not asked, or not answered: {request.question}")
+        self._asked = None
+        self._settle(self._check, outcome.answer)
+
+    def _next(self, free_simulations: int) -> None:
+        if self._check is not None and self._pouring is None and (pours := self._check.due(self._pours)):
+            self._compare(self._check, pours)
+        elif self._spent < self._plan.prior_simulations and not self._pours:
+            self._next_prior()
+        elif self._pouring is not None:
+            if self._plan.per_pour is None and free_simulations > 0 and self._followed != "D2":
+                self._refine(free_simulations)
+        elif self._pours_left:
+            if self._trials.idle or (self._plan.per_pour is None and self._pours):
+                self._next_pour()
+        elif self._trials.idle:
+            self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
+
+    def _compare(self, check: TrustCheck, pours: list[PourTrial]) -> None:
+        """Ask what the simulations alone say of the actions poured, and go by it."""
+        self._compromise.weigh(exploring=False)
+
+        def answered(suggestion: Suggestion) -> None:
+            check.compare(pours, suggestion)
+            self._unasked = check.question
+            self._heard(check)
+
+        simulated = self._trials.data(everything=True)
+        places = tuple(pour.point for pour in pours)
+        self._questions.put(self._problem(simulated, count=0, predict_at=places), "trust", answered)
+
+    def _settle(self, check: TrustCheck, answer: str) -> None:
+        check.settle(answer)
+        self._heard(check)
+
+    def _heard(self, check: TrustCheck) -> None:
+        self.decisions += check.decisions
+        check.decisions.clear()
+
+    @property
+    def _followed(self) -> str | None:
+        """What followed on an alarm."""
+        return None if self._check is None else self._check.policy
+
+    def _next_prior(self) -> None:
+        def simulate(suggestion: Suggestion) -> None:
+            self._simulate(suggestion, "prior")
+
+        if len(self._trials) == 0:
+            count = min(max(self._plan.initial, 1), self._plan.prior_simulations)
+            self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
+        elif self._trials.ready:
+            self._compromise.weigh(exploring=True)
+            known, pending, plain = self._simulated(), self._trials.pending(), self._plan.plain
+            problem = self._problem(known, everything=False, pending=pending, plain=plain)
+            self._questions.put(problem, "prior", simulate)
+
+    def _next_pour(self) -> None:
+        """The next pour, and with it the simulations that run beside it."""
+        problem = self._hybrid(
+            count=1 + (0 if self._followed == "D2" else self._plan.per_pour or 0),
+            acquisition="lcb" if self._pours or self._former else "posterior_minimum",
+            map_resolution=MAP_RESOLUTION,
+        )
+
+        def pour(suggestion: Suggestion) -> None:
+            self._pour_first(suggestion)
+            self._simulate(suggestion, "refine", first=1)
+
+        self._questions.put(problem, "pour", pour)
+
+    def _refine(self, count: int) -> None:
+        """More simulations while the pour takes its time."""
+
+        def simulate(suggestion: Suggestion) -> None:
+            self._simulate(suggestion, "refine")
+
+        problem = self._hybrid(count=count, pending=(*self._trials.pending(everything=True), self._pours[-1].point))
+        self._questions.put(problem, "refine", simulate)
+
+    def _hybrid(self, **changes: Any) -> SuggestProblem:
+        self._compromise.weigh(exploring=changes.get("count") != 0)
+        return self._informed(self._real(), self._simulated(everything=True), **changes)
+
+    def _informed(self, poured: Data, simulated: Data, **changes: Any) -> SuggestProblem:
+        """A question about the real cost, with what the simulations are still good for."""
+        match self._followed:
+            case "D2":
+                return self._problem(poured, **changes)
+            case "widen":
+                return self._problem(poured, mean="pooled", widening=WIDENING, simulated=simulated, **changes)
+            case _:
+                return self._problem(poured, mean=MEANS[self._plan.model], simulated=simulated, **changes)
+
+    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
+        return self._informed(poured, simulated)
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def _trusted(self, weighed: Sequence[PourTrial]) -> dict[str, object]:
+        return super()._trusted(weighed) if self._check is None else self._check.result()
+
+    def progress(self) -> tuple[int, int]:
+        """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
+        simulations = self._plan.prior_simulations + self._plan.pours * (self._plan.per_pour or 0)
+        answered = self._trials.answered - self._unspent
+        done = min(answered, simulations) if self._plan.per_pour is None else answered
+        if self._followed == "D2":  # those that will not be made any more
+            simulations = done
+        return done + min(self._counted, self._plan.pours), simulations + self._plan.pours

@@ -1,0 +1,167 @@
+"""An arm and its cell in a laboratory's file mean what they say, and say where they are wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+
+from actors.arm.spec import Plane, Pose, UrArmSpec
+from orchestrator.config.laboratory.arm import ArmSection, CellSection, arm_as_file, resolve_arm
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.source import Document, Place, Report
+from orchestrator.config.yaml.validate import validate
+
+
+class Laboratory(Section):
+    arm: ArmSection | None = None
+    """As in a laboratory's file."""
+
+    cell: CellSection | None = None
+    """Likewise."""
+
+
+def load(text: str, mode: str = "virtual") -> UrArmSpec:
+    report = Report()
+    place = Place(Document.parse(dedent(text), Path("lab.yaml").resolve()))
+    section = validate(Laboratory, place, report)
+    spec = None
+    if section is not None and section.arm is not None:
+        spec = resolve_arm(section.arm, section.cell, place, report, mode=mode)
+    report.raise_if_any()
+    assert spec is not None
+    return spec
+
+
+BOX = "{low: {x: 250 mm, y: -600 mm, z: 0 mm}, high: {x: 1000 mm, y: 400 mm, z: 900 mm}}"
+VIRTUAL = f"""\
+arm:
+  model: ur10e
+  tool: {{z: 170 mm}}
+  payload: 1.6 kg
+  grip: {{y: -60 mm, rx: -90 deg}}
+  home: {{base: -14 deg, shoulder: -91 deg, elbow: -115 deg, wrist1: -154 deg, wrist2: -104 deg, wrist3: 0 deg}}
+  limits:
+    box: {BOX}
+cell:
+  receiver: {{x: 750 mm, y: 0 mm, z: 60 mm}}
+  direction: 90 deg
+"""
+HARDWARE = VIRTUAL.replace("model: ur10e", "model: ur10e\n  address: 192.168.0.10")
+FULL = HARDWARE.replace(f"    box: {BOX}", f"""\
+    box: {BOX}
+    planes:
+      - {{normal: [0, -2, 0], offset: -390 mm}}
+      - {{normal: [0.6, 0, 0.8], offset: 150 mm}}
+    joint_speed: 120 deg/s
+    tool_speed: 800 mm/s
+    tilt: 135 deg
+    tilt_speed: 110 deg/s
+    singularity: 0.15
+    clearance: 8 mm
+  payload_centre: {{x: 1 mm, y: 2 mm, z: 110 mm}}
+  approach_speed: 30 deg/s
+  approach_acceleration: 60 deg/s^2
+  untilt_speed: 15 deg/s
+  announcement: 5 s
+  rate: 250 Hz""")  # fmt: skip
+
+
+def test_every_key_reaches_the_arm():
+    spec = load(FULL + "  table: -10 mm\n", "hardware")
+    deg = math.radians
+    assert (spec.model, spec.address, spec.payload) == ("ur10e", "192.168.0.10", 1.6)
+    assert spec.tool == Pose(z=0.17)
+    assert spec.grip == Pose(y=-0.06, rx=deg(-90.0))
+    assert spec.payload_centre == pytest.approx((0.001, 0.002, 0.11))
+    assert spec.home == pytest.approx([deg(v) for v in (-14, -91, -115, -154, -104, 0)])
+    assert (spec.approach_speed, spec.approach_acceleration) == pytest.approx((deg(30.0), deg(60.0)))
+    assert (spec.untilt_speed, spec.announcement, spec.rate) == pytest.approx((deg(15.0), 5.0, 250.0))
+    limits, cell = spec.limits, spec.cell
+    assert (limits.box_low, limits.box_high) == ((0.25, -0.6, 0.0), (1.0, 0.4, 0.9))
+    assert limits.planes == (Plane((0.0, -1.0, 0.0), -0.39), Plane((0.6, 0.0, 0.8), 0.15))
+    assert (limits.joint_speed, limits.tilt, limits.tilt_speed) == pytest.approx((deg(120), deg(135), deg(110)))
+    assert (limits.tool_speed, limits.singularity, limits.clearance) == pytest.approx((0.8, 0.15, 0.008))
+    assert (cell.receiver, cell.direction, cell.table) == ((0.75, 0.0, 0.06), pytest.approx(deg(90)), -0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "mode"),
+    [
+        (VIRTUAL, "virtual"),
+        (FULL, "hardware"),
+        (FULL.replace("[0, -2, 0]", "[0.1, -2, 0.3]"), "hardware"),
+    ],
+)
+def test_the_resolved_arm_loads_to_the_same(text, mode):
+    spec = load(text, mode)
+    assert load(json.dumps(arm_as_file(spec)), mode) == spec
+
+
+@pytest.mark.parametrize("address", ["10.0.0.7", "ur10.lab.example", "robot-1", "127.0.0.1"])
+def test_a_controller_is_found_by_address_or_name(address):
+    assert load(HARDWARE.replace("192.168.0.10", address), "hardware").address == address
+
+
+def changed(old: str, new: str, text: str = VIRTUAL) -> str:
+    assert old in text
+    return text.replace(old, new)
+
+
+CASES = [
+    (HARDWARE, "virtual", r"lab.yaml:3:12: arm.address: a virtual arm has no address"),
+    (VIRTUAL, "hardware", r"arm: an arm of hardware needs its controller's 'address'"),
+    (changed("192.168.0.10", "192.168.0.10:30004", HARDWARE), "hardware", r"neither an IPv4 address nor a host name"),
+    (changed("192.168.0.10", "192.168.0.300", HARDWARE), "hardware", r"'192.168.0.300' is neither an IPv4 address"),
+    (changed("192.168.0.10", "http://ur", HARDWARE), "hardware", r"'http://ur' is neither"),
+    (changed("payload:", "time_scale: 2\n  payload:", HARDWARE), "hardware", r"arm.time_scale: unknown key"),
+    (changed("model: ur10e", "model: ur5"), "virtual", r"'ur5' is not known here"),
+    (changed("  payload: 1.6 kg\n", ""), "virtual", r"key 'payload' is missing; add for example 'payload: 1.5 kg'"),
+    (changed("1.6 kg", "1.6"), "virtual", r"1.6 has no unit; write '1.6 kg'"),
+    (changed("shoulder: -91 deg, ", ""), "virtual", r"arm.home: key 'shoulder' is missing"),
+    (changed("elbow: -115 deg", "elbow: -115 mm"), "virtual", r"is a length; should be an angle"),
+    (changed("y: 0 mm, z: 60 mm", "z: 60 mm"), "virtual", r"cell.receiver: key 'y' is missing"),
+    (VIRTUAL.partition("cell:")[0], "virtual", r"an arm needs to know what stands where; add 'cell: "),
+    (changed("direction", "directoin"), "virtual", r"did you mean 'direction'\?"),
+    (changed("[0, -2, 0]", "[0, 0, 0]", FULL), "hardware", r"planes\[0\].normal: has no direction"),
+    (changed("[0, -2, 0]", "[0, 1]", FULL), "hardware", r"lab.yaml:\d+:\d+: arm.limits.planes"),
+    (changed("rate: 250", "rate: 50", FULL), "hardware", r"50 Hz is outside 100 … 500 Hz"),
+    (changed("ur10e", "ur10", FULL), "hardware", r"arm.rate: a ur10 answers at most 125 times a second"),
+    (changed("x: 250 mm", "x: 1250 mm"), "virtual", r"lab.yaml:8:10: arm.limits.box: x of 'low' should be smaller"),
+    (changed("wrist3: 0 deg", "wrist3: 12 deg"), "virtual", r"lab.yaml:6:9: arm.home: the pourer leans 12.0 deg"),
+    (changed("y: -600", "y: -100"), "virtual", r"home: the tool is outside the box, at y = -0.\d+ m"),
+    (changed("x: 750 mm, y: 0", "x: 750 mm, y: 500"), "virtual", r"cell.receiver: .* lies outside limits.box"),
+    (changed("z: 60 mm", "z: -60 mm"), "virtual", r"lab.yaml:10:13: cell.receiver: stands at -0.060 m, below"),
+    (changed("approach_speed: 30", "approach_speed: 130", FULL), "hardware", r"approach_speed: 130 deg/s is above"),
+    (changed("untilt_speed: 15", "untilt_speed: 120", FULL), "hardware", r"untilt_speed: 120 deg/s is above"),
+    (changed("singularity: 0.15", "singularity: 0.6", FULL), "hardware", r"home: the shoulder is 0.\d+ from singular"),
+    (changed("offset: -390 mm", "offset: 150 mm", FULL), "hardware", r"receiver: .* lies beyond plane 1"),
+    (changed("x: 750 mm, y: 0 mm", "x: 1500 mm, y: 0 mm").replace("x: 1000", "x: 1800"), "virtual",
+     r"out of reach by \d+ mm; move the receiver nearer"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "mode", "said"), CASES)
+def test_mistakes_are_shown_with_their_place_and_what_would_be_right(text, mode, said):
+    with pytest.raises(ConfigError, match=said):
+        load(text, mode)
+
+
+def test_all_mistakes_come_at_once():
+    text = changed("1.6 kg", "1.6", changed("direction: 90 deg", "direction: 90"))
+    with pytest.raises(ConfigError) as caught:
+        load(text)
+    assert len(caught.value.problems) == 2
+
+
+def test_keys_are_typed_in_the_sections_that_say_them():
+    # every key has a sentence for the editor's tooltip
+    def sentences(model: type[Section]) -> list[str | None]:
+        return [field.description for field in model.model_fields.values()]
+
+    assert all(sentences(ArmSection))
+    assert all(sentences(CellSection))

@@ -1,0 +1,139 @@
+"""A balance in a laboratory's file means what it says, and says where it is wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+
+from actors.balance.placement import Placement
+from actors.balance.settling import SettlingRule
+from actors.balance.spec import BalanceSpec
+from actors.balance.virtual_serial.scale import ScaleSettings
+from orchestrator.config.laboratory.balance import (
+    BalanceDeviceSection,
+    SettlingSection,
+    VirtualScaleSection,
+    balance_as_file,
+    resolve_balance,
+)
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.config.yaml.source import Document, Place, Report
+from orchestrator.config.yaml.validate import validate
+
+
+def load(text: str, mode: str = "hardware") -> BalanceSpec:
+    report = Report()
+    place = Place(Document.parse(dedent(text), Path("lab.yaml").resolve()))
+    section = validate(BalanceDeviceSection, place, report)
+    spec = None if section is None else resolve_balance(section, place, report, mode=mode)
+    report.raise_if_any()
+    assert spec is not None
+    return spec
+
+
+FULL = """
+    placement: receiver
+    port: /dev/serial/by-id/usb-KERN
+    dialect: kern-swt
+    baud: 4800
+    format: "7E1"
+    handshake: software
+    step: 0.05 g
+    repeatability: 0.02 g
+    settling: {readings: 6, span: 2 s, steps: 2, deadline: 30 s}
+    interval: 0.2 s
+    answer_time: 2 s
+    reconnect_time: 60 s
+    pourer: elsewhere
+    load_tolerance: 2 g
+"""
+SIMPLE = "placement: tray\nport: /dev/serial/by-id/usb-KERN\n"
+VIRTUAL = "virtual: {resolution: 0.01 g, noise: 0.02 g, drift: 0.001 g/s, settling_time: 2 s, capacity: 3 kg}\n"
+
+
+def test_every_key_reaches_the_balance():
+    spec = load(FULL)
+    assert spec.placement is Placement.RECEIVER
+    assert spec.pourer_elsewhere
+    assert spec.load_tolerance == pytest.approx(2e-3)
+    serial = spec.serial
+    assert serial is not None
+    assert (serial.port, serial.dialect, serial.baud, serial.format) == (
+        "/dev/serial/by-id/usb-KERN", "kern-swt", 4800, "7E1")  # fmt: skip
+    assert serial.handshake == "software"
+    assert serial.step == pytest.approx(5e-5)
+    assert serial.repeatability == pytest.approx(2e-5)
+    assert serial.settling == SettlingRule(6, 2.0, 2.0, 30.0)
+    assert (serial.interval, serial.answer_time, serial.reconnect_time) == (0.2, 2.0, 60.0)
+
+
+def test_a_port_is_enough_and_the_rest_is_found_out():
+    serial = load(SIMPLE).serial
+    assert serial is not None
+    assert (serial.dialect, serial.baud, serial.format) == ("auto", None, None)
+
+
+def test_a_virtual_balance_has_a_data_sheet_and_speaks_kcp_unless_told_otherwise():
+    spec = load(VIRTUAL, mode="virtual")
+    assert spec.virtual == ScaleSettings(1e-5, 3.0, 2e-5, 1e-6, 2.0)
+    assert spec.serial is not None
+    assert spec.serial.dialect == "kcp"
+    other = load(VIRTUAL + "dialect: sbi\n", mode="virtual").serial
+    assert other is not None
+    assert other.dialect == "sbi"
+
+
+def test_where_the_operator_types_there_is_no_line():
+    assert load("placement: manual\nload_tolerance: 1 g\n").serial is None
+
+
+@pytest.mark.parametrize(("text", "mode"), [(FULL, "hardware"), (SIMPLE, "hardware"), (VIRTUAL, "virtual"),
+                                            ("placement: manual", "hardware")])  # fmt: skip
+def test_the_resolved_balance_loads_to_the_same(text, mode):
+    spec = load(text, mode)
+    assert load(json.dumps(balance_as_file(spec)), mode) == spec
+
+
+def test_the_page_on_balances_names_every_key():
+    page = (Path(__file__).parents[3] / "docs" / "balances.md").read_text(encoding="utf-8")
+    for model in (BalanceDeviceSection, SettlingSection, VirtualScaleSection):
+        for key in model.written_keys():
+            assert f"`{key}`" in page
+
+
+def test_the_balance_shown_on_that_page_is_one():
+    page = (Path(__file__).parents[3] / "docs" / "balances.md").read_text(encoding="utf-8")
+    shown = page.partition("```yaml\nbalance:\n")[2].partition("```")[0]
+    assert load(shown).placement is Placement.TRAY
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "said"),
+    [
+        ("placement: tray", "hardware", r"'tray' reads the balance; add 'port: /dev/serial/by-id/usb-…', or type"),
+        ("placement: tray", "virtual", r"add 'virtual: \{resolution: 0.1 g\}'"),
+        (VIRTUAL, "hardware", r"lab.yaml:1:10: virtual: a laboratory of hardware weighs on a balance that is there"),
+        (SIMPLE, "virtual", r"lab.yaml:2:7: port: a virtual laboratory has no port"),
+        (SIMPLE + VIRTUAL, "hardware", r"has a 'port' or is 'virtual', not both"),
+        ("placement: manual\nport: x", "hardware", r"lab.yaml:2:7: port: is not used with placement 'manual'"),
+        ("placement: manual\npourer: here", "hardware", r"pourer: is not used with placement 'manual'"),
+        (SIMPLE + "format: 8X1", "hardware", r"lab.yaml:3:9: format: '8X1' should be bits, parity and stop bits"),
+        (SIMPLE + "format: 7E1", "hardware", r"format: should be text, got the number 70.0; put it in quotes"),
+        (SIMPLE + "dialect: KCP", "hardware", r"'KCP' is not known here; did you mean 'kcp'\?"),
+        (SIMPLE + "baud: fast", "hardware", r"baud: should be a whole number"),
+        (SIMPLE + "repeatability: 0.1", "hardware", r"0.1 has no unit; write '0.1 g'"),
+        (SIMPLE + "placment: tray", "hardware", r"did you mean 'placement'\?"),
+        (SIMPLE + "settling: {span: 5 s, deadline: 2 s}", "hardware", r"'deadline' should be longer than 'span'"),
+        (SIMPLE + "settling: {readings: 1}", "hardware", r"readings: 1 is too small; at least 2"),
+        (SIMPLE + "baud: 9601", "hardware", r"lab.yaml:3:7: baud: no balance talks at 9601 baud; .* 9600, "),
+        (SIMPLE + "step: 50 g", "hardware", r"lab.yaml:3:7: step: .* steps of 50 g can't tell .* load_tolerance, 5 g"),
+        ("virtual: {resolution: 2 g}\nload_tolerance: 1 g", "virtual", r"lab.yaml:1:23: virtual.resolution: a display"),
+        (SIMPLE + "step: 0 g", "hardware", r"step: 0 g should be above 0"),
+    ],
+)
+def test_mistakes_are_shown_with_their_place_and_what_would_be_right(text, mode, said):
+    with pytest.raises(ConfigError, match=said):
+        load(text, mode)

@@ -1,0 +1,296 @@
+"""Campaign files mean what they say, and say where they are wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from actors.spec import RaySpec
+from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import PricesPlan
+from sim_engine.action import DEG
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+def test_all_errors_of_a_file_and_of_what_it_names_come_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "vessels").mkdir()
+    (tmp_path / "vessels/cup.yaml").write_text(
+        "name: cup\nprofile:\n  unit: mm\n  inner: [[0, 0], [40, 0], [40, 100]]\n  wall: 4\n  flor: 4 mm\n"
+    )
+    (tmp_path / "campaign.yaml").write_text(
+        textwrap.dedent("""\
+        name: test
+        name: twice
+        laboratory: {name: desk}
+        liquid: {mass: 200 g}
+        pourer: vessels/cup.yaml
+        receiver: vessels/cup.yaml
+        seed: -1
+        motion: {height: 90 mm, x_offset: 80}
+        calibration:
+          actions: {angular_velocity: [120 deg/s, 15 deg/s]}
+          pours: {count: 8}
+          simulatons: 20
+        deployment:
+          strategy: D3
+          actions: {angular_velocity: [15 deg/s, 120 deg/s]}
+          pours: 15
+        """)
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_campaign(Path("campaign.yaml"))
+    where = [(p.path.name, p.line, p.column, p.where) for p in caught.value.problems]
+    assert where == [
+        ("campaign.yaml", 2, 1, "name"),
+        ("campaign.yaml", 7, 7, "seed"),
+        ("campaign.yaml", 8, 35, "motion.x_offset"),
+        ("campaign.yaml", 9, 1, "calibration"),  # max_angle has no value
+        ("campaign.yaml", 9, 1, "calibration"),  # nothing to search
+        ("campaign.yaml", 10, 31, "calibration.actions.angular_velocity"),
+        ("campaign.yaml", 11, 18, "calibration.pours.count"),
+        ("campaign.yaml", 12, 3, "calibration.simulatons"),
+        ("campaign.yaml", 13, 1, "deployment"),  # max_angle has no value
+        ("campaign.yaml", 16, 10, "deployment.pours"),
+        ("cup.yaml", 5, 9, "profile.wall"),
+        ("cup.yaml", 6, 3, "profile.flor"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("surface_tension: 72", "72 has no unit; write '72 mN/m' if that is what is meant"),
+        ("surface_tension: 72 N/m", "72 N/m is outside 1 … 1000 mN/m"),
+        (
+            "dynamic_viscosity: 1 mN/m",
+            "'1 mN/m' is a surface tension; should be a dynamic viscosity, for example '1 mPa*s'",
+        ),
+        ("dynamic_viscosity: 0 mPa*s", "0 mPa*s is outside 0.01 … 1e+06 mPa*s"),
+        ("viscosity: 1 mPa*s", "liquid.viscosity: unknown key; did you mean 'dynamic_viscosity'?"),
+    ],
+)
+def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, message: str, tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
+    (tmp_path / "campaign.yaml").write_text(text.replace("mass: 200 g", f"mass: 200 g, {written}"), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_campaign(tmp_path / "campaign.yaml")
+    assert message in str(caught.value)
+
+
+def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_after_its_density_was(
+    tmp_path: Path,
+) -> None:
+    """Tension and viscosity decide which warnings are given, and no request."""
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+
+    def printed(addition: str) -> object:
+        path = tmp_path / "campaign.yaml"
+        path.write_text(text.replace("mass: 200 g", f"mass: 200 g{addition}"), encoding="utf-8")
+        return fingerprint(load_campaign(path))
+
+    assert printed("") == printed(", surface_tension: 40 mN/m, dynamic_viscosity: 2 mPa*s")
+    assert printed("") != printed(", density: 900 kg/m^3")
+
+
+def test_error_shows_the_line_and_a_caret_under_the_culprit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "v.yaml").write_text("name: cup\nmesh: cup.stl\nunit: furlong\n")
+    with pytest.raises(ConfigError) as caught:
+        load_vessel(Path("v.yaml"))
+    assert "v.yaml:3:7: unit: 'furlong' is not known here" in str(caught.value)
+    assert "\n    3 | unit: furlong\n      |       ^" in str(caught.value)
+
+
+@pytest.mark.parametrize("address", ["auto", "ray://head:10001", "head", "head:0", "head:70000", ":6379", "a b:6379"])
+def test_an_address_of_a_cluster_that_ray_would_puzzle_over_is_refused(address: str, tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(f"name: far\nmode: virtual\nray: {{address: '{address}'}}\n")
+    with pytest.raises(ConfigError, match=r"lab\.yaml:3:16: ray\.address: .* should be host:port of the cluster's"):
+        load_laboratory(path)
+
+
+def test_a_cluster_needs_an_address_and_its_bench_has_a_usual_name(tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text("name: far\nmode: virtual\nray: {address: '[fd00::1]:6379'}\n")
+    assert load_laboratory(path).ray == RaySpec("[fd00::1]:6379", "decant_bench")
+    path.write_text("name: far\nmode: virtual\nray: {bench_resource: left}\n")
+    with pytest.raises(ConfigError, match="key 'address' is missing"):
+        load_laboratory(path)
+
+
+def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path: Path) -> None:
+    vessels = CONFIGS / "vessels"
+    text = textwrap.dedent(f"""\
+        name: everything
+        seed: 41
+        laboratory:
+          name: odd
+          simulators: 3
+          in_process: true
+          object_store: 300 MB
+          ray: {{address: "head.local:6379", bench_resource: left_bench}}
+          bench:
+            liquid: {{particles: 3100, cohesion: 31 mN/m, viscosity: 7 Hz, friction: 0.31}}
+            pose_error: {{x: 1.1 mm, y: -2 mm, tilt: 0.7 deg, speed_factor: 1.03}}
+            pose_noise: {{x: 0.3 mm, y: 0.4 mm, tilt: 0.2 deg, speed_factor: 0.02}}
+            balance: {{resolution: 0.01 g, noise: 0.2 g, drift: 0.5 g/min, settling_time: 2.5 s}}
+            time_scale: 12
+            operator_time: 1 min
+        liquid: {{name: oil, mass: 0.15 kg, density: 0.92 g/cm^3, surface_tension: 32 mN/m, dynamic_viscosity: 84 cP}}
+        pourer: {vessels}/beaker.yaml
+        motion:
+          pivot: {{x: 30 mm, z: 70 mm}}
+          angular_acceleration: 300 deg/s^2
+          hold_time: 0.7 s
+          hold_cap: 2 s
+          return_velocity: 45 deg/s
+          y_offset: 3 mm
+          height: 55 mm
+        simulator:
+          parameters: {{particles: {{range: [700, 900], scale: log}}, cohesion: 0.04 N/m, viscosity: [1 1/s, 9 1/s]}}
+        calibration:
+          receiver: {vessels}/tumbler.yaml
+          motion: {{x_offset: 97 mm}}
+          actions: {{angular_velocity: {{range: [20 deg/s, 90 deg/s], scale: log}}, max_angle: [80 deg, 110 deg]}}
+          pours: {{count: 9, holdout: 3}}
+          simulations: 33
+          initial: 5
+          kappa: 1.5
+          random_baseline: 4
+        deployment:
+          strategy: D3
+          receivers: [{vessels}/narrow.yaml, {vessels}/mug.yaml]
+          motion: {{max_angle: 115 deg, return_velocity: 30 deg/s}}
+          actions: {{angular_velocity: [20 deg/s, 90 deg/s], x_offset: [90 mm, 130 mm]}}
+          loss: {{name: spilled_and_retained, retained_weight: 0.5}}
+          pours: 6
+          prior_simulations: 11
+          per_pour: free
+          prices: {{pour: 75 s, simulation: 4 s, worth: 0.01}}
+          kappa: 3
+          initial: 4
+          on_failed_pour: ignore
+        on_unknown: repeat
+        parallel_simulations: 5
+        outputs: {{directory: here, rrd: false, figures: false, record_rate: 4 1/s, recorded_simulations: 2}}
+        """)
+    (tmp_path / "all.yaml").write_text(text)
+    plan = load_campaign(tmp_path / "all.yaml")
+    calibration, deployment, bench = plan.calibration, plan.deployment, plan.laboratory.bench
+    assert calibration is not None
+    assert deployment is not None
+    assert bench is not None
+    assert (plan.name, plan.seed, plan.parallel_simulations, plan.on_unknown) == ("everything", 41, 5, "repeat")
+    assert dataclasses.astuple(plan.outputs) == (tmp_path / "here", False, False, 4.0, 2)
+    lab = plan.laboratory
+    assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
+    assert lab.ray == RaySpec("head.local:6379", "left_bench")
+    assert (bench.liquid.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
+    assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03))
+    assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02))
+    assert (bench.time_scale, bench.operator_time, bench.settling_time) == pytest.approx((12.0, 60.0, 2.5))
+    assert (bench.balance_resolution, bench.balance_noise) == pytest.approx((1e-5, 2e-4))
+    assert bench.balance_drift == pytest.approx(0.5e-3 / 60.0)
+    scene = calibration.scene
+    assert (scene.liquid.name, scene.liquid.mass, scene.liquid.density) == ("oil", 0.15, pytest.approx(920.0))
+    assert (scene.liquid.surface_tension, scene.liquid.dynamic_viscosity) == pytest.approx((0.032, 0.084))
+    assert (scene.pivot.kind, scene.pivot.x, scene.pivot.z, scene.hold_cap) == ("point", 0.03, 0.07, 2.0)
+    assert scene.fixed == pytest.approx(
+        {
+            "angular_acceleration": 300 * DEG,
+            "hold_time": 0.7,
+            "return_velocity": 45 * DEG,
+            "y_offset": 0.003,
+            "height": 0.055,
+            "x_offset": 0.097,
+        }
+    )
+    assert [(a.name, a.lower, a.upper, a.scale, a.integer) for a in calibration.parameters.axes] == [
+        ("particles", 700.0, 900.0, "log", True),
+        ("viscosity", 1.0, 9.0, "linear", False),
+    ]
+    assert calibration.fixed_parameters["cohesion"] == pytest.approx(0.04)
+    assert plan.parameters.particles == 900, "the default, as far as the range allows"
+    assert [(a.name, a.scale) for a in calibration.actions.axes] == [
+        ("angular_velocity", "log"),
+        ("max_angle", "linear"),
+    ]
+    budgets = (calibration.pour_count, calibration.holdout, calibration.simulations, calibration.initial)
+    assert budgets == (9, 3, 33, 5)
+    assert (calibration.kappa, calibration.random_baseline) == (1.5, 4)
+    assert [s.receiver.name for s in deployment.scenes] == ["narrow", "mug"]
+    assert deployment.scenes[0].fixed["return_velocity"] == pytest.approx(30 * DEG)
+    assert (deployment.loss.name, deployment.loss.retained_weight) == ("spilled_and_retained", 0.5)
+    assert (deployment.pours, deployment.prior_simulations, deployment.per_pour) == (6, 11, None)
+    assert deployment.prices == PricesPlan(pour=75.0, simulation=4.0, worth=0.01)
+    assert (deployment.kappa, deployment.initial, deployment.on_failed_pour) == (3.0, 4, "ignore")
+    (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
+    again = load_campaign(tmp_path / "again.json")
+    assert dataclasses.replace(again, source=plan.source) == plan
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ("strategy: D1", ("D1", 1, 15, 2, 0)),
+        ("strategy: D1\n  pours: 0\n  iterations: 7\n  simulations_per_iteration: 3", ("D1", 0, 7, 3, 0)),
+        ("strategy: D2\n  pours: 9\n  mean: zero", ("D2", 9, 15, 2, 0)),
+        ("strategy: D3\n  pours: 9\n  per_pour: 0", ("D3", 9, 15, 2, 0)),
+        ("strategy: D3\n  pours: 9", ("D3", 9, 15, 2, 2)),
+        ("strategy: D3\n  pours: 9\n  per_pour: free", ("D3", 9, 15, 2, None)),
+    ],
+)
+def test_strategies_have_their_own_budgets(keys: str, expected: tuple[object, ...], tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+    head, tail = re.split(r"  prior_simulations: \d+\n", text)
+    tail = tail[tail.index("on_unknown") :]
+    (tmp_path / "campaign.yaml").write_text(head.replace("strategy: D3", keys) + tail)
+    plan = load_campaign(tmp_path / "campaign.yaml").deployment
+    assert plan is not None
+    budgets = (plan.strategy, plan.pours, plan.iterations, plan.simulations_per_iteration, plan.per_pour)
+    assert budgets == expected
+    assert plan.prices == (PricesPlan() if plan.per_pour is None else None)
+    assert plan.mean == ("zero" if "zero" in keys else "constant")
+
+
+def test_section_overrides_the_motion_of_the_campaign(tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+    path = tmp_path / "campaign.yaml"
+    path.write_text(text.replace("motion: {max_angle: 120 deg,", "motion: {hold_time: 2 s, max_angle: 120 deg,"))
+    plan = load_campaign(path)
+    assert plan.calibration is not None
+    assert plan.deployment is not None
+    assert plan.calibration.scene.fixed["hold_time"] is None
+    assert plan.deployment.scenes[0].fixed["hold_time"] == pytest.approx(2.0)
+
+
+def test_unusual_files_are_errors_and_no_tracebacks(tmp_path: Path) -> None:
+    bomb = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+        f"{c}: &{c} [{', '.join([f'*{p}'] * 10)}]\n" for p, c in zip("abcdef", "bcdefg", strict=True)
+    )
+    for content in (
+        b"\xff\xfe\x00",
+        bomb.encode(),
+        b"a: &x {b: *x}",
+        b"? [a, b]\n: c",
+        b"name: !!python/none x",
+        b"<<: {a: 1}",
+    ):
+        (tmp_path / "odd.yaml").write_bytes(content)
+        with pytest.raises(ConfigError, match=r"odd\.yaml"):
+            load_campaign(tmp_path / "odd.yaml")
+    with pytest.raises(ConfigError, match="no such file"):
+        load_campaign(tmp_path / "absent.yaml")
+    with pytest.raises(ConfigError, match="is a directory"):
+        load_campaign(tmp_path)

@@ -1,0 +1,82 @@
+"""Quantities, values of the command line and parameter files mean what they say."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from orchestrator.config.campaign.assignments import assigned_action, set_action
+from orchestrator.config.load import load_campaign, load_parameters
+from orchestrator.config.yaml.quantities import format_quantity, parse_quantity
+from sim_engine.action import DEG
+from sim_engine.liquid import SimulationParameters
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("180 deg", "rad", math.pi),
+        ("60rpm", "rad/s", 2.0 * math.pi),
+        ("1.5 cm", "m", 0.015),
+        ("0.2 kg", "kg", 0.2),
+        ("1 g/cm³", "kg/m^3", 1000.0),
+        ("72 mN/m", "N/m", 0.072),
+        ("84 mPa*s", "Pa*s", 0.084),
+        ("84 cP", "Pa*s", 0.084),
+        ("1.4 Pa s", "Pa*s", 1.4),
+        ("3 1/s", "1/s", 3.0),
+        ("3 Hz", "1/s", 3.0),
+        ("-5 mm", "m", -0.005),
+        ("1e2 mm", "m", 0.1),
+        ("−5 °", "rad", -5.0 * DEG),
+    ],
+)
+def test_quantity_means(text: str, unit: str, value: float) -> None:
+    assert parse_quantity(text, unit, "1 mm") == pytest.approx(value, rel=1e-12)
+
+
+def test_formatted_quantity_reads_back_to_the_same_float() -> None:
+    for value in (0.1, 1.0 / 3.0, 40.0 * DEG, 0.084, 2.0**-40):
+        for unit, display in (("m", "mm"), ("rad/s", "deg/s"), ("kg", "g"), ("rad", "deg")):
+            assert parse_quantity(format_quantity(value, unit, display), unit, "1 x") == value
+
+
+def test_bare_numbers_on_the_command_line_are_in_the_unit_that_is_shown() -> None:
+    values = set_action(["angular_velocity=40", "x_offset=9 cm", "height = 60", "hold_time=until_flow_ends"])
+    assert values["angular_velocity"] == pytest.approx(40.0 * DEG)
+    assert values["x_offset"] == pytest.approx(0.09)
+    assert values["height"] == pytest.approx(0.06)
+    assert values["hold_time"] is None
+
+
+def test_command_line_values_stand_over_the_scene_and_ask_for_the_rest() -> None:
+    plan = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
+    assert plan.deployment is not None
+    scene = plan.deployment.scenes[0]
+    action = assigned_action(
+        ["angular_velocity=40", "x_offset=90", "height=70"], fixed=scene.fixed, space=plan.deployment.actions
+    )
+    assert action.height == pytest.approx(0.07)
+    assert action.max_angle == pytest.approx(120.0 * DEG)
+    with pytest.raises(ValueError, match="x_offset has no value"):
+        assigned_action(["angular_velocity=40"], fixed=scene.fixed, space=plan.deployment.actions)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"theta": {"particles": 1500, "cohesion": 0.03, "viscosity": 2.5}, "train_discrepancy": 0.02, "other": null}',
+        "particles: 1500\ncohesion: 30 mN/m\nviscosity: 2.5 1/s\n",
+        "parameters: {particles: 1500, cohesion: 0.03 N/m, viscosity: 2.5}",
+    ],
+)
+def test_parameters_as_a_program_or_a_person_writes_them(text: str, tmp_path: Path) -> None:
+    (tmp_path / "theta.json").write_text(text)
+    base = SimulationParameters(friction=0.2)
+    loaded = load_parameters(tmp_path / "theta.json", base)
+    expected = base.model_copy(update={"particles": 1500, "cohesion": 0.03, "viscosity": 2.5})
+    assert loaded.model_dump() == pytest.approx(expected.model_dump())

@@ -1,0 +1,131 @@
+"""`deployment.risk` and `deployment.window` as people write them: what they mean, what is wrong, what a run keeps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+
+from orchestrator.commands import campaigns
+from orchestrator.commands.common import RefusalError
+from orchestrator.config.load import load_campaign
+from orchestrator.config.schema import campaign_schema
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.fingerprint import fingerprint
+from sim_engine.action import DEG
+from sim_engine.task import PoseError
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+def written(tmp_path: Path, deployment: dict[str, Any], **top: Any) -> Path:
+    content = yaml.safe_load((CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8"))
+    for key in ("laboratory", "pourer"):
+        content[key] = str(CONFIGS / "campaigns" / content[key])
+    calibration, old = content["calibration"], content.pop("deployment")
+    calibration["receiver"] = str(CONFIGS / "campaigns" / calibration["receiver"])
+    kept = {key: old[key] for key in ("motion", "actions")}
+    receiver = str(CONFIGS / "campaigns" / old["receiver"])
+    content["deployment"] = {"strategy": "D1", "receiver": receiver, **kept, **deployment}
+    path = tmp_path / "campaign.yaml"
+    path.write_text(yaml.safe_dump({**content, **top}), encoding="utf-8")
+    return path
+
+
+RISK = {
+    "measure": "cvar",
+    "level": 0.9,
+    "pose_error": {"x": "3 mm", "y": "3 mm", "tilt": "0.5 deg", "speed_factor": 0.02},
+    "theta": "posterior",
+}
+
+
+def test_a_risk_is_read_as_it_was_meant_and_can_be_read_again(tmp_path: Path) -> None:
+    path = written(tmp_path, {"risk": RISK, "window": {"tolerance": "2 %"}})
+    jsonschema.validate(yaml.safe_load(path.read_text(encoding="utf-8")), campaign_schema())
+    plan = load_campaign(path)
+    assert plan.deployment is not None
+    risk = plan.deployment.risk
+    assert risk is not None
+    assert (risk.measure, risk.level, risk.tail, risk.theta) == ("cvar", 0.9, 0.9, "posterior")
+    assert risk.pose_error == PoseError(3e-3, 3e-3, pytest.approx(0.5 * DEG), 0.02)  # type: ignore[arg-type]
+    assert plan.deployment.tolerance == pytest.approx(0.02)
+    assert (plan.deployment.iterations, plan.deployment.simulations_per_iteration) == (30, 2)
+    again = tmp_path / "again.yaml"
+    again.write_text(json.dumps(plan.resolved), encoding="utf-8")
+    loaded = load_campaign(again)
+    assert loaded.deployment == plan.deployment
+
+
+def test_a_run_without_a_risk_has_the_fingerprint_that_it_always_had(tmp_path: Path) -> None:
+    plain, risky = (load_campaign(written(tmp_path, d)) for d in ({}, {"risk": RISK, "window": {"tolerance": "2 %"}}))
+    assert not {"risk", "tolerance"} & set(fingerprint(plain)["deployment"])
+    assert fingerprint(risky)["deployment"]["risk"]["measure"] == "cvar"
+    assert plain.deployment is not None
+    assert (plain.deployment.iterations, plain.deployment.simulations_per_iteration) == (15, 2)
+    other = replace(plain.deployment, tolerance=0.02)
+    assert fingerprint(replace(plain, deployment=other)) != fingerprint(plain)
+
+
+@pytest.mark.parametrize(
+    ("deployment", "complaint"),
+    [
+        ({"risk": {**RISK, "level": 1.0}}, "outside 0.01 … 0.99"),
+        ({"risk": {**RISK, "measure": "expected"}}, "belongs to 'measure: cvar'"),
+        ({"risk": {"measure": "expected"}}, "names nothing that could go wrong"),
+        ({"risk": {**RISK, "measure": "worst"}}, "cvar"),
+        ({"risk": {**RISK, "pose_error": {"x": "3 kg"}}}, "should be a length"),
+        ({"risk": {**RISK, "theta": "all"}}, "posterior"),
+        ({"risk": RISK, "simulations_per_iteration": 1}, "at least 2 are needed"),
+        ({"window": {}}, "tolerance"),
+        ({"window": {"tolerance": "2"}}, "outside 0.01 … 100 %"),
+        ({"strategy": "D2", "pours": 5, "risk": RISK}, "belongs to D1, not to D2"),
+        ({"strategy": "D3", "pours": 5, "window": {"tolerance": "2 %"}}, "belongs to D1, not to D3"),
+        ({"risk": RISK, "objectives": [{"name": "spillage"}]}, "can't be combined with 'objectives'"),
+    ],
+)
+def test_each_thing_that_is_wrong_is_one_error(tmp_path: Path, deployment: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_campaign(written(tmp_path, deployment))
+    assert complaint in str(refused.value)
+    assert len(refused.value.problems) == 1
+
+
+def test_a_posterior_that_nobody_makes_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    options = campaigns.RunOptions(
+        resume=False, run_id=None, answer=None, in_process=True, laboratory=None, as_json=False, armed=False
+    )
+    path = written(tmp_path, {"risk": RISK}, outputs={"directory": str(tmp_path / "runs")})
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    del content["calibration"]
+    content["simulator"] = {"parameters": {"particles": 500}}
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with pytest.raises(RefusalError, match="this campaign has no calibration") as refused:
+        campaigns.run(path, options)
+    assert refused.value.code == 2
+    assert not (tmp_path / "runs").exists()
+
+
+def test_planning_takes_the_posterior_from_parameters_and_nowhere_else(tmp_path: Path) -> None:
+    plan = load_campaign(written(tmp_path, {"risk": RISK}))
+    with pytest.raises(RefusalError, match="needs --parameters") as refused:
+        campaigns.planning_plan(plan, None, None, None, None)
+    assert refused.value.code == 2
+    theta = tmp_path / "theta.json"
+    theta.write_text('{"theta": {"cohesion": 0.02}}', encoding="utf-8")
+    with pytest.raises(RefusalError, match="has no 'posterior'") as refused:
+        campaigns.planning_plan(plan, theta, None, None, None)
+    assert refused.value.code == 2
+    rows = [{"theta": {"cohesion": 0.01}, "weight": 3.0}, {"theta": {"cohesion": 0.05}, "weight": 1.0}]
+    theta.write_text(json.dumps({"theta": {"cohesion": 0.02}, "posterior": rows}), encoding="utf-8")
+    planning = campaigns.planning_plan(plan, theta, None, None, None)
+    assert planning.deployment is not None
+    assert planning.deployment.risk is not None
+    drawn = [one.cohesion for one in planning.deployment.risk.thetas]
+    assert drawn.count(0.01) == 3 * drawn.count(0.05) > 0
+    assert planning.parameters.cohesion == 0.02

@@ -1,0 +1,208 @@
+"""What campaigns may say about strategies: their own keys, what they cost, and errors that say where."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from orchestrator.config.load import load_campaign
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import CampaignPlan
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+CALIBRATED = f"""\
+name: test
+laboratory: {CONFIGS}/laboratories/virtual.yaml
+liquid: {{name: water, mass: 200 g}}
+pourer: {CONFIGS}/vessels/beaker.yaml
+receiver: {CONFIGS}/vessels/tumbler.yaml
+motion: {{max_angle: 110 deg, x_offset: 110 mm, height: 90 mm}}
+simulator:
+  parameters:
+    particles: {{range: [500, 2500], scale: log}}
+    cohesion: [0 N/m, 0.1 N/m]
+calibration:
+  actions: {{angular_velocity: [15 deg/s, 120 deg/s]}}
+  pours: {{count: 32, holdout: 4}}
+"""
+
+
+def load(folder: Path, text: str) -> CampaignPlan:
+    path = folder / "campaign.yaml"
+    path.write_text(text)
+    return load_campaign(path)
+
+
+def refusal(folder: Path, text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load(folder, text)
+    assert str(caught.value).count("campaign.yaml:") == 1, "one cause, one message"
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("keys", "simulations", "grid", "thetas"),
+    [
+        ("strategy: C1\n  grid: {particles: 5, cohesion: 6}", 840, {"particles": 5, "cohesion": 6}, 0),
+        ("strategy: C1\n  per_axis: 10", 2800, {"particles": 10, "cohesion": 10}, 0),
+        ("strategy: C1\n  simulations: 504", 448, {"particles": 4, "cohesion": 4}, 0),
+        ("strategy: C2\n  samples: 18", 504, {}, 18),
+        ("strategy: C2\n  simulations: 520", 504, {}, 18),
+        ("strategy: C3\n  iterations: 59", 1652, {}, 59),
+        ("strategy: C3\n  simulations: 1652", 1652, {}, 59),
+        ("strategy: C4\n  simulations: 108", 108, {}, 0),
+        ("simulations: 108", 108, {}, 0),
+    ],
+)
+def test_budgets_count_single_simulated_pours(
+    keys: str, simulations: int, grid: dict[str, int], thetas: int, tmp_path: Path
+) -> None:
+    plan = load(tmp_path, f"{CALIBRATED}  {keys}\n")
+    assert plan.calibration is not None
+    found = plan.calibration
+    assert (found.simulations, found.grid, found.thetas) == (simulations, grid, thetas)
+    (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
+    assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ("strategy: C5", "calibration.strategy: 'C5' is not known here; should be 'C1', 'C2', 'C3' or 'C4'"),
+        ("strategy: C1", "calibration: key 'per_axis' is missing; add for example 'per_axis: 10'"),
+        ("strategy: C2", "calibration: key 'samples' is missing; add for example 'samples: 18'"),
+        ("strategy: C4", "calibration: key 'simulations' is missing; add for example 'simulations: 108'"),
+        ("strategy: C2\n  per_axis: 4", "calibration.per_axis: belongs to C1, not to C2; remove it"),
+        ("strategy: C1\n  per_axis: 4\n  kappa: 1", "calibration.kappa: belongs to C3 and C4, not to C1; remove it"),
+        ("strategy: C1\n  per_axis: 4\n  grid: {particles: 2, cohesion: 2}", "stands beside 'grid'; keep one"),
+        ("strategy: C1\n  grid: {particles: 4}", "grid: has no number of values for cohesion, which is searched"),
+        ("strategy: C1\n  grid: {particles: 4, cohesion: 2, friction: 2}", "grid.friction: is not searched"),
+        ("strategy: C1\n  grid: {particles: 4, cohesion: none}", "grid.cohesion: should be a whole number"),
+        ("strategy: C1\n  simulations: 100", "2 values of each searched parameter on 28 training pours take 112"),
+        ("strategy: C1\n  per_axis: 99999", "makes 9999800001 θ × 28 training pours"),
+        ("strategy: C3\n  simulations: 27", "not a single θ: each is simulated on all 28 training pours"),
+        ("strategy: C3\n  iterations: 5", "iterations: 8 random parameters don't fit into 5 θ"),
+        (
+            "strategy: C2\n  samples: 18\n  simulations: 400",
+            "samples: makes 18 θ × 28 training pours = 504 simulations; 'simulations' allows 400",
+        ),
+    ],
+)
+def test_a_budget_that_makes_no_sense_is_refused(keys: str, expected: str, tmp_path: Path) -> None:
+    assert expected in refusal(tmp_path, f"{CALIBRATED}  {keys}\n")
+
+
+def test_runs_from_before_the_other_strategies_can_be_gone_on_with(tmp_path: Path) -> None:
+    old = fingerprint(load(tmp_path, f"{CALIBRATED}  simulations: 108\n"))
+    assert not {"grid", "thetas"} & old["calibration"].keys()
+    new = fingerprint(load(tmp_path, f"{CALIBRATED}  strategy: C2\n  samples: 18\n"))
+    assert new["calibration"]["thetas"] == 18
+
+
+# -- losses and objectives -----------------------------------------------------------------------------------------
+
+DEPLOYED = f"""\
+name: test
+laboratory: {CONFIGS}/laboratories/virtual.yaml
+liquid: {{name: water, mass: 200 g}}
+pourer: {CONFIGS}/vessels/beaker.yaml
+receiver: {CONFIGS}/vessels/narrow.yaml
+motion: {{x_offset: 110 mm, height: 50 mm}}
+deployment:
+  strategy: D1
+  actions: {{angular_velocity: [15 deg/s, 120 deg/s], max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]}}
+"""
+TARGET = "{name: target_volume, volume: 150 mL, tolerance: 2 mL}"
+
+
+LEAST_FOR_NOT_POURING = [
+    ("name: grams", "campaign.yaml:10:16: deployment.loss.name: 'grams' is least where next to nothing is poured"),
+    ("name: particles", "deployment.loss.name: 'particles' is least where next to nothing is poured"),
+    ("name: normalised", "deployment.loss.name: 'normalised' is least where next to nothing is poured"),
+    ("retained_weight: 0", "campaign.yaml:10:27: deployment.loss.retained_weight: with 0 the loss is least where next"),
+]
+
+
+@pytest.mark.parametrize("stop", ["max_angle: [70 deg, 125 deg]", "hold_time: [0 s, 3 s]"])
+@pytest.mark.parametrize(("loss", "expected"), LEAST_FOR_NOT_POURING)
+def test_a_loss_that_not_pouring_serves_best_is_refused_where_a_pour_may_stop_so_early(
+    loss: str, expected: str, stop: str, tmp_path: Path
+) -> None:
+    angle = "" if stop.startswith("max_angle") else "  motion: {max_angle: 120 deg}\n"
+    actions = f"actions: {{angular_velocity: [15 deg/s, 120 deg/s], {stop}}}"
+    text = f"{DEPLOYED[: DEPLOYED.index('actions')]}{actions}\n  loss: {{{loss}}}\n{angle}"
+    said = refusal(tmp_path, text)
+    assert expected in said
+    assert f"fix {stop.partition(':')[0]} under motion, use spilled_and_retained" in said
+    assert load(tmp_path, text.replace(loss, "retained_weight: 0.5")).deployment is not None
+
+
+@pytest.mark.parametrize("loss", [loss for loss, _ in LEAST_FOR_NOT_POURING])
+def test_any_loss_may_be_had_where_every_pour_empties_the_pourer(loss: str, tmp_path: Path) -> None:
+    text = DEPLOYED.replace(", max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]", "")
+    plan = load(tmp_path, f"{text}  motion: {{max_angle: 120 deg}}\n  loss: {{{loss}}}\n")
+    assert plan.deployment is not None
+
+
+def objectives(*parts: str, more: str = "") -> str:
+    return f"{DEPLOYED}  objectives: [{', '.join(parts)}]\n{more}"
+
+
+def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None:
+    text = objectives(TARGET, "{name: time, weight: 0.2, scale: 6 s}", more="  pareto: true\n  floor: 0.3\n")
+    plan = load(tmp_path, text)
+    assert plan.deployment is not None
+    found = plan.deployment.objectives
+    assert found is not None
+    target, time = found.parts
+    assert (target.name, target.weight, target.volume, target.tolerance) == ("target_volume", 1.0, 1.5e-4, 2e-6)
+    assert (time.name, time.weight, time.scale) == ("time", 0.2, 6.0)
+    assert (found.pareto, found.floor) == (True, 0.3)
+    assert plan.deployment.loss_name == "objectives"
+    (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
+    assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
+    assert "objectives" not in fingerprint(load(tmp_path, DEPLOYED))["deployment"]
+    assert fingerprint(plan)["deployment"]["objectives"]["floor"] == 0.3
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (objectives("{name: spilage}"), "objectives[0].name: 'spilage' is not known here; did you mean 'spillage'?"),
+        (objectives("{weight: 2}"), "deployment.objectives[0]: key 'name' is missing"),
+        (objectives(), "deployment.objectives: is empty; name at least one"),
+        (objectives("{name: spillage}", "{name: spillage}"), "objectives[1]: spillage stands twice in the list"),
+        (objectives("{name: spillage, volume: 1 mL}"), "volume: belongs to target_volume, not to spillage; remove it"),
+        (
+            objectives("{name: target_volume}"),
+            "objectives[0]: key 'volume' is missing; add for example",
+        ),
+        (objectives(TARGET.replace("150", "250")), "volume: is 250 mL, and only 200.4 mL are loaded (liquid.mass)"),
+        (objectives(TARGET.replace("150 mL", "150 g")), "volume: '150 g' is a mass; should be a volume"),
+        (objectives(TARGET.replace(" 2 mL", " 160 mL")), "tolerance: is as much as the volume: not pouring would do"),
+        (objectives(TARGET, "{name: retained}"), "objectives[1]: wants the pourer to be emptied, and target_volume"),
+        (
+            objectives("{name: spillage}", more="  pareto: true\n"),
+            "pareto: needs two objectives that can't both",
+        ),
+        (objectives("{name: spillage}", more="  loss: {name: grams}\n"), "loss: stands beside 'objectives'; keep one"),
+        (DEPLOYED + "  pareto: true\n", "deployment.pareto: belongs to 'objectives'; name some, or remove it"),
+        (
+            objectives(TARGET)
+            .replace(", max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]", "")
+            .replace("motion: {", "motion: {max_angle: 120 deg, "),
+            "objectives[0]: needs an action that stops the pour; search max_angle or hold_time",
+        ),
+        (
+            objectives("{name: time}").replace(", hold_time: [0 s, 3 s]", ""),
+            "objectives[0]: needs a hold that lasts a known time; search hold_time, or fix it under motion",
+        ),
+    ],
+)
+def test_objectives_that_make_no_sense_are_refused(text: str, expected: str, tmp_path: Path) -> None:
+    assert expected in refusal(tmp_path, text)

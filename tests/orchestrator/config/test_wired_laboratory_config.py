@@ -1,0 +1,190 @@
+"""A laboratory over wires in a file: what fits together, what doesn't, and what may change during a run."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from actors.balance.placement import Placement
+from actors.spec import LaboratorySpec
+from orchestrator.codec import from_json, to_json
+from orchestrator.config.campaign.check import check_campaign
+from orchestrator.config.laboratory.sections import laboratory_as_file
+from orchestrator.config.load import load_campaign, load_laboratory
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import CampaignPlan
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+VIRTUAL = (CONFIGS / "laboratories" / "virtual.yaml").read_text(encoding="utf-8")
+HARDWARE = (CONFIGS / "laboratories" / "ur10-kern.yaml").read_text(encoding="utf-8")
+TWIN = (CONFIGS / "laboratories" / "twin.yaml").read_text(encoding="utf-8")
+
+
+def load(folder: Path, text: str) -> LaboratorySpec:
+    path = folder / "lab.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_laboratory(path)
+
+
+def changed(text: str, *pairs: tuple[str, str]) -> str:
+    for old, new in pairs:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def without(text: str, section: str) -> str:
+    """The file without a top-level section."""
+    kept, skipping = [], False
+    for line in text.splitlines():
+        skipping = line.startswith(f"{section}:") or (skipping and line.startswith((" ", "#")))
+        kept += [] if skipping else [line]
+    return "\n".join(kept) + "\n"
+
+
+def test_the_shipped_laboratories_are_what_they_say(tmp_path):
+    virtual, hardware = load(tmp_path, VIRTUAL), load(tmp_path, HARDWARE)
+    assert virtual.arm is not None
+    assert virtual.balance is not None
+    assert virtual.balance.serial is not None
+    assert (virtual.mode, virtual.operator.answers, virtual.arm.address) == ("virtual", "virtual", "")
+    assert virtual.arm.time_scale == virtual.balance.serial.time_scale == 30.0
+    assert hardware.arm is not None
+    assert hardware.balance is not None
+    assert hardware.balance.serial is not None
+    assert (hardware.mode, hardware.operator.answers, hardware.bench) == ("hardware", "person", None)
+    assert hardware.arm.time_scale == hardware.balance.serial.time_scale == 1.0
+
+
+def test_hardware_differs_from_virtual_in_addresses_and_limits_only(tmp_path):
+    virtual, hardware = load(tmp_path, VIRTUAL), load(tmp_path, HARDWARE)
+    assert virtual.arm is not None
+    assert hardware.arm is not None
+    same = replace(hardware.arm, address="", limits=virtual.arm.limits, time_scale=virtual.arm.time_scale)
+    assert same == virtual.arm
+    assert virtual.balance is not None
+    assert hardware.balance is not None
+    assert virtual.balance.placement is hardware.balance.placement is Placement.TRAY
+    for low, narrow in zip(virtual.arm.limits.box_low, hardware.arm.limits.box_low, strict=True):
+        assert low <= narrow
+
+
+@pytest.mark.parametrize("text", [VIRTUAL, HARDWARE, TWIN], ids=["virtual", "ur10-kern", "twin"])
+def test_a_laboratory_as_written_out_loads_to_the_same(tmp_path, text):
+    spec = load(tmp_path, text)
+    assert load(tmp_path, json.dumps(laboratory_as_file(spec))) == spec
+    assert from_json(json.loads(json.dumps(to_json(spec, LaboratorySpec))), LaboratorySpec) == spec
+
+
+BENCH = "bench:\n  liquid: {particles: 4000}\n  time_scale: 30\n"
+
+CASES = {
+    "virtual operator on hardware": (
+        changed(HARDWARE, ("answers: person", "answers: virtual")),
+        r"operator.answers: where an arm moves, a person has to say",
+    ),
+    "operator's time on hardware": (
+        changed(HARDWARE, ("answers: person", "answers: person\n  time: 85 s")),
+        r"operator.time: is a virtual operator's",
+    ),
+    "scaled time on hardware": (HARDWARE + BENCH, r"bench: is what a virtual bench hides, and how fast its time runs"),
+    "hardware without an arm": (without(without(without(without(HARDWARE, "arm"), "cell"), "balance"), "operator"),
+                                r"a laboratory of hardware needs its arm"),
+    "virtual arm without a hidden liquid": (without(VIRTUAL, "bench"), r"a virtual arm pours a hidden liquid"),
+    "arm without a balance": (without(VIRTUAL, "balance"), r"an arm that pours needs a balance"),
+    "arm without a cell": (without(VIRTUAL, "cell"), r"add 'cell:"),
+    "an arm that is faster than it is told": (
+        changed(VIRTUAL, ("tilt: 0.5 deg}", "tilt: 0.5 deg, speed_factor: 1.02}")),
+        r"bench.pose_error.speed_factor: an arm over its wires moves as fast as it is told",
+    ),
+    "… or scatters": (
+        changed(VIRTUAL, ("tilt: 0.3 deg}", "tilt: 0.3 deg, speed_factor: 0.01}")),
+        r"bench.pose_noise.speed_factor: an arm over its wires",
+    ),
+    "time that waits for nothing": (changed(VIRTUAL, ("time_scale: 30", "time_scale: 0")), r"an arm takes its time"),
+    "a bench of numbers' balance": (
+        changed(VIRTUAL, ("  time_scale: 30", "  balance: {noise: 0.1 g}\n  time_scale: 30")),
+        r"bench.balance: is of a bench without wires",
+    ),
+    "a bench of numbers with an operator": (TWIN + "operator: {time: 85 s}\n", r"operator: belongs to an arm"),
+    "a cell without an arm": (
+        TWIN + "cell: {receiver: {x: 1 m, y: 0 m, z: 0 m}, direction: 90 deg}\n",
+        r"cell: belongs to an arm",
+    ),
+    "a port on a virtual bench": (
+        changed(VIRTUAL, ("  repeatability", "  port: /dev/ttyUSB0\n  repeatability")),
+        r"balance.virtual: a balance has a 'port' or is 'virtual'",
+    ),
+    "a reminder after the deadline": (changed(HARDWARE, ("reminder: 2 min", "reminder: 1 h")), r"operator.reminder: "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "message"), CASES.values(), ids=CASES.keys())
+def test_what_does_not_fit_together_is_refused_with_its_place(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        load(tmp_path, text)
+    assert len(error.value.problems) == 1, str(error.value)
+
+
+def quickstart(laboratory: Path) -> CampaignPlan:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
+    path = laboratory.parent / "campaign.yaml"
+    text = text.replace("../laboratories/virtual.yaml", laboratory.name)
+    path.write_text(text.replace("../vessels", str(CONFIGS / "vessels")), encoding="utf-8")
+    return load_campaign(path)
+
+
+def test_pours_are_never_repeated_on_hardware(tmp_path):
+    laboratory = tmp_path / "lab.yaml"
+    laboratory.write_text(HARDWARE, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"on_unknown: 'repeat' needs a virtual bench"):
+        quickstart(laboratory)
+
+
+def test_a_controller_may_get_another_address_between_two_parts_of_a_run_and_the_cell_may_not_change(tmp_path):
+    plan = load_campaign(QUICKSTART)
+    hardware = replace(plan, laboratory=load(tmp_path, HARDWARE))
+
+    def of(text: str) -> object:
+        return fingerprint(replace(hardware, laboratory=load(tmp_path, text)))
+
+    same = of(HARDWARE)
+    assert of(changed(HARDWARE, ("192.168.0.10", "10.0.0.7"))) == same
+    assert of(changed(HARDWARE, ("/dev/serial/by-id/usb-FTDI", "/dev/serial/by-id/usb-PROLIFIC"))) == same
+    assert of(changed(HARDWARE, ("reminder: 2 min", "reminder: 1 min"))) == same
+    assert of(changed(HARDWARE, ("x: 750 mm", "x: 760 mm"))) != same
+    assert of(changed(HARDWARE, ("placement: tray", "placement: receiver"))) != same
+
+
+QUICKSTART = CONFIGS / "campaigns" / "quickstart.yaml"
+
+
+def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
+    plan = load_campaign(QUICKSTART)
+    assert check_campaign(plan) == []
+    assert plan.laboratory.arm is not None
+    arm = plan.laboratory.arm
+    upright = replace(arm.limits, tilt=1.0)
+    low = replace(plan, laboratory=replace(plan.laboratory, arm=replace(arm, limits=upright)))
+    problems = check_campaign(low)
+    assert len(problems) == 2
+    said = problems[0].message
+    assert said.startswith("calibration: the arm can make no action that was tried; for example")
+    assert re.search(r"for example angular_velocity \S+ deg/s  max_angle \S+ deg: the arm can't", said)  # as searched
+    assert "57.3 deg are allowed: lower max_angle, or raise arm.limits.tilt" in said
+    assert problems[0].where == "calibration.actions"
+    assert "deployment into 'narrow'" in problems[1].message
+
+
+def test_an_arm_that_is_set_to_carry_less_than_the_liquid_is_refused():
+    plan = load_campaign(QUICKSTART)
+    assert plan.laboratory.arm is not None
+    weak = replace(plan, laboratory=replace(plan.laboratory, arm=replace(plan.laboratory.arm, payload=0.05)))
+    (problem,) = check_campaign(weak)
+    assert problem.where == "liquid.mass"
+    assert "set to carry 50 g (arm.payload), less than the water alone, 200 g" in problem.message

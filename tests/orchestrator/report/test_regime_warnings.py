@@ -1,0 +1,169 @@
+"""What is not simulated is told where people meet it: once per campaign, for its best actions, for a single pour."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+from typer.testing import CliRunner
+
+from orchestrator.cli import app
+from orchestrator.config.load import load_campaign
+from orchestrator.plan import CampaignPlan
+from orchestrator.report.names import receiver_names
+from orchestrator.report.regimes import best_action_warnings, campaign_warnings, lines, numbers_line, regimes_of
+from orchestrator.report.summary import summarise, summary_table
+from sim_engine.action import DEG
+from sim_engine.space import Axis, Space
+from tests.end_to_end import small
+from tests.orchestrator import watched
+from tests.orchestrator.reported import shown
+
+CAMPAIGNS = Path(__file__).parents[3] / "configs" / "campaigns"
+SLOW = Space((Axis("angular_velocity", 5 * DEG, 10 * DEG), Axis("max_angle", 70 * DEG, 75 * DEG)))
+QUICK = Space((Axis("angular_velocity", 80 * DEG, 120 * DEG), Axis("max_angle", 110 * DEG, 120 * DEG)))
+
+
+def deploying(actions: Space, **changes: float) -> CampaignPlan:
+    """A campaign without calibration, in one scene, with many particles."""
+    plan = watched.campaign()
+    assert plan.deployment is not None
+    liquid = watched.NARROW.liquid.model_copy(update=changes)
+    scene = replace(watched.NARROW, liquid=liquid, fixed={"height": 0.05, "x_offset": 0.09})
+    deployment = replace(plan.deployment, scenes=(scene,), actions=actions)
+    parameters = plan.parameters.model_copy(update={"particles": 20_000})
+    return replace(plan, calibration=None, deployment=deployment, parameters=parameters)
+
+
+def test_a_space_of_slow_pours_is_warned_of_and_one_of_quick_pours_is_not() -> None:
+    (warnings,) = campaign_warnings(deploying(SLOW)).values()
+    assert {one.worst.kind for one in warnings} == {"dribbling", "wetting"}
+    assert all((one.hit, one.tried) == (5, 5) for one in warnings)
+    assert campaign_warnings(deploying(QUICK)) == {}
+
+
+def test_a_warning_names_the_worst_action_and_how_many_were_tried() -> None:
+    mixed = Space((Axis("angular_velocity", 40 * DEG, 90 * DEG), Axis("max_angle", 66 * DEG, 120 * DEG)))
+    warnings = campaign_warnings(deploying(mixed))
+    (dribbling,) = (one for one in warnings["narrow cup"] if one.worst.kind == "dribbling")
+    assert dribbling.values["max_angle"] == pytest.approx(66 * DEG)
+    assert (dribbling.hit, dribbling.tried) == (3, 5)  # the middle of 93° and those to 66°, not those to 120°
+    (header, *told) = lines(warnings, receiver_names(deploying(mixed)))
+    assert header.startswith("not simulated")
+    assert any("into narrow, dribbling: " in line and "3 of 5 actions tried)" in line for line in told)
+    assert any("max angle 66 deg" in line for line in told)
+
+
+def test_a_viscous_liquid_is_told_by_its_viscosity_alone() -> None:
+    (warnings,) = campaign_warnings(deploying(QUICK, dynamic_viscosity=1.4)).values()
+    assert [one.worst.kind for one in warnings] == ["viscous"]
+
+
+def test_calibration_counts_with_the_middle_of_the_particles_that_it_searches() -> None:
+    plan = load_campaign(CAMPAIGNS / "quickstart.yaml")
+    assert plan.calibration is not None
+
+    def thin(lower: int, upper: int) -> bool:
+        axis = Axis("particles", lower, upper, "log", integer=True)
+        assert plan.calibration is not None
+        calibration = replace(plan.calibration, parameters=Space((axis,)))
+        found = campaign_warnings(replace(plan, calibration=calibration, deployment=None))
+        return "thin_stream" in {one.worst.kind for one in found.get("calibration", ())}
+
+    assert thin(300, 600)
+    assert not thin(20_000, 50_000)
+
+
+def test_the_recommended_action_is_judged_with_the_calibrated_number_of_particles() -> None:
+    plan = deploying(QUICK)
+    best = {"angular_velocity": 90 * DEG, "max_angle": 115 * DEG}
+    deployed = {"strategy": "D3", "scene": "narrow cup", "pours": [], "action_si": best}
+    assert best_action_warnings(plan, {"narrow cup": deployed}) == {"narrow cup": []}
+    coarse = {"theta": {"particles": 200}, "trials": []}
+    (told,) = best_action_warnings(plan, {"calibration": coarse, "narrow cup": deployed})["narrow cup"]
+    assert told.kind == "thin_stream"
+    assert best_action_warnings(plan, {"narrow cup": {**deployed, "action_si": None}}) == {}
+
+
+def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, dict[str, Any]]) -> None:
+    plan = watched.campaign()
+    spaces = campaign_warnings(deploying(SLOW))
+    deployed = {"narrow cup": results["narrow cup"]}
+    best = {"narrow cup": [one.worst for one in spaces["narrow cup"]]}
+    summary = summarise(plan, deployed, not_covered=spaces, best_not_covered=best)
+    written = json.loads(json.dumps(summary, allow_nan=False))
+    assert [one["kind"] for one in written["not_covered"]["narrow cup"]] == ["dribbling", "wetting"]
+    assert [one["kind"] for one in written["receivers"]["narrow cup"]["not_covered"]] == ["dribbling", "wetting"]
+    text = " ".join(shown(summary_table(plan, summary)).split())
+    assert "narrow, best action, dribbling: " in text
+    assert "best action, dribbling" not in shown(summary_table(plan, summarise(plan, deployed)))
+
+
+def test_numbers_are_told_with_digits_that_mean_something() -> None:
+    scene = watched.NARROW
+    found = regimes_of(scene, watched.ACTION, 2_000)
+    assert found.lip is not None
+    line = numbers_line(found)
+    assert f"We {found.lip.weber.smallest:.2g} … {found.lip.weber.largest:.2g}" in line
+    assert "e+" not in line
+    nothing = regimes_of(scene, watched.ACTION.with_values(max_angle=10 * DEG), 2_000)
+    assert numbers_line(nothing) == "nothing leaves the pourer, as far as hydrostatics tells"
+
+
+# -- the commands ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A campaign of slow pours in a working directory in which no laboratory opens."""
+    from actors import laboratory
+
+    def closed(*args: object, **kwargs: object) -> NoReturn:
+        raise OSError(28, "No space left on device", "campaign.rrd")
+
+    slow = small.CAMPAIGN.replace("[60 deg/s, 180 deg/s], x_offset", "[5 deg/s, 10 deg/s], x_offset")
+    small.write_campaign(tmp_path, slow.replace("max_angle: 115 deg", "max_angle: 60 deg"))
+    monkeypatch.setattr(laboratory, "open_laboratory", closed)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def invoke(command: str) -> Any:
+    return CliRunner().invoke(app, shlex.split(command), env={"COLUMNS": "120"})
+
+
+@pytest.mark.parametrize("verb", ["run", "plan"])
+def test_a_campaign_begins_with_what_is_not_simulated_in_it_each_kind_once(verb: str, folder: Path) -> None:
+    told = invoke(f"{verb} small.yaml").stderr.splitlines()
+    assert sum(line.startswith("not simulated") for line in told) == 1
+    assert sum(line.strip().startswith("into narrow, dribbling: ") for line in told) == 1
+
+
+def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from orchestrator.commands.common import RefusalError, run_in_front_of_people
+
+    plan = load_campaign(folder / "small.yaml")
+    for resume, times in ((False, 1), (True, 0)):
+        with pytest.raises(RefusalError, match="No space left"):
+            run_in_front_of_people(plan, folder, resume=resume, again="")
+        assert capsys.readouterr().err.count("not simulated (docs") == times
+
+
+def test_calibrate_is_silent_about_a_deployment_that_it_does_not_make(folder: Path) -> None:
+    assert "into narrow" not in invoke("calibrate small.yaml").stderr
+
+
+def test_a_vessel_that_can_t_be_judged_stops_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from orchestrator.report import regimes
+
+    def broken(*args: object) -> NoReturn:
+        raise ValueError("the pourer has no lip")
+
+    monkeypatch.setattr(regimes, "campaign_warnings", broken)
+    result = invoke("run small.yaml")
+    assert "could not be worked out: the pourer has no lip" in result.stderr
+    assert "No space left on device" in result.stderr  # it went on to where this test ends it

@@ -1,0 +1,306 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orchestrator.errors import LearningError
+from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
+from orchestrator.stages import POURS, measured_pours
+from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
+from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour, choose_holdout, stratified
+from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
+from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis, Space
+from tests.orchestrator.play import (
+    CALIBRATION_ACTIONS,
+    PARAMETERS,
+    SCENE,
+    Play,
+    calibration_plan,
+    outcome_of,
+    replay,
+    unit,
+)
+from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
+
+
+class Quiet:
+    """A generator without noise."""
+
+    def standard_normal(self) -> float:
+        return 0.0
+
+
+def measured(seed=0, count=32, holdout=4):
+    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, count, holdout, seed)
+    Play(weighed)(design)
+    return design.measured
+
+
+def true_discrepancy(theta: SimulationParameters) -> float:
+    """E_{a~g} |c_r − c_s| of the toy, which no calibration is told."""
+    rng = np.random.default_rng(0)
+    spills = []
+    for _ in range(200):
+        action = SCENE.action(CALIBRATION_ACTIONS.draw(rng))
+        spills.append(abs(calibration_spill(action, theta, Quiet()) - calibration_spill(action, TRUE_THETA, Quiet())))
+    return float(np.mean(spills))
+
+
+# -- the design ----------------------------------------------------------------------------------------------------
+
+
+def test_thirty_two_pours_lie_two_in_each_of_four_by_four_strata():
+    pours = measured(seed=3)
+    assert len(pours) == 32
+    cells = [tuple((4 * unit(p.action, CALIBRATION_ACTIONS)).astype(int)) for p in pours]
+    assert {cells.count(cell) for cell in cells} == {2}
+    assert len(set(cells)) == 16
+
+
+def test_four_test_pours_come_from_the_four_quarters_of_the_first_axis():
+    tests = [p for p in measured(seed=3) if p.split == "test"]
+    assert sorted(int(4 * unit(p.action, CALIBRATION_ACTIONS)[0]) for p in tests) == [0, 1, 2, 3]
+
+
+def test_any_other_number_of_pours_uses_every_slice_of_every_axis_once():
+    strata = stratified(7, 3, np.random.default_rng(0))
+    for axis in range(3):
+        assert sorted(round(7 * s.lower[axis]) for s in strata) == list(range(7))
+
+
+def test_an_impossible_action_is_replaced_by_another_of_its_stratum():
+    refused = []
+
+    def sometimes_touching(action, theta, rng):
+        if action.max_angle > CALIBRATION_ACTIONS.decode([0.5, 0.95])["max_angle"]:
+            refused.append(action)
+            raise ValueError("cups touch")
+        return 0.1
+
+    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 32, 4, 1)
+    played = Play(sometimes_touching)(design)
+    assert refused
+    assert len(played.pours) == 32 + len(refused)
+    assert len(design.measured) == 32
+    cells = [tuple((4 * unit(p.action, CALIBRATION_ACTIONS)).astype(int)) for p in design.measured]
+    assert {cells.count(cell) for cell in cells} == {2}
+
+
+def test_a_stratum_without_a_possible_action_is_given_up_with_its_reason():
+    def never(action, theta, rng):
+        raise ValueError("cups touch: at tilt 37° …")
+
+    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 2, 0, 1)
+    Play(never)(design)
+    assert design.measured == ()
+    assert "cups touch" in str(design.result()["pours"][0]["given_up"])
+
+
+def test_weighed_pours_survive_the_journal():
+    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 6, 1, 1)
+    Play(weighed)(design)
+    read_back = measured_pours(calibration_plan(), {POURS: design.result()})
+    assert tuple(scored.pour for scored in read_back) == design.measured
+
+
+def test_holding_everything_back_is_refused():
+    with pytest.raises(ValueError, match="holdout 3"):
+        choose_holdout(stratified(3, 2, np.random.default_rng(0)), 3, np.random.default_rng(0))
+
+
+# -- C4 ------------------------------------------------------------------------------------------------------------
+
+
+def test_c4_finds_a_theta_better_than_random_ones():
+    pours = measured()
+    baseline = np.median(
+        [true_discrepancy(t) for t in random_parameters(PARAMETERS, {"friction": 0.1}, 20, 1).values()]
+    )
+    scores = []
+    for seed in range(2):
+        strategy = ContinuousBayesianCalibration(calibration_plan(simulations=30), pours, seed)
+        played = Play(calibration_spill)(strategy)
+        assert len(played.simulations) == 30
+        scores.append(true_discrepancy(strategy.theta))
+    assert max(scores) < 0.5 * baseline
+
+
+def test_c4_asks_for_the_same_whatever_finishes_first_and_when_replayed():
+    def campaign(order="first", seed=5):
+        strategy = ContinuousBayesianCalibration(calibration_plan(simulations=16), measured(), seed)
+        return Play(calibration_spill, slots=3, order=order)(strategy)
+
+    first, reversed_order = campaign(), campaign("last")
+    assert first.simulations == reversed_order.simulations
+    assert campaign(seed=6).simulations != first.simulations
+    fresh = ContinuousBayesianCalibration(calibration_plan(simulations=16), measured(), 5)
+    assert replay(fresh, first) == first.asked
+
+
+def test_every_simulated_theta_and_action_lies_in_its_box_and_keeps_what_is_fixed():
+    strategy = ContinuousBayesianCalibration(calibration_plan(simulations=30), measured(), 2)
+    for request in Play(calibration_spill)(strategy).simulations:
+        theta = request.parameters
+        assert PARAMETERS.contains({"particles": theta.particles, "cohesion": theta.cohesion})
+        assert theta.friction == 0.1
+        assert isinstance(theta.particles, int)
+        assert CALIBRATION_ACTIONS.contains(
+            {"angular_velocity": request.action.angular_velocity, "max_angle": request.action.max_angle}
+        )
+
+
+def test_failed_and_leaking_simulations_never_reach_the_fit():
+    lost = []
+
+    def unlucky(request):
+        if isinstance(request, Simulate) and request.seed % 3 == 0:
+            lost.append(request)
+            if request.seed % 2:
+                return Failed("simulation", "diverged")
+            return Simulated(replace(outcome_of(0.9), invalid="escaped 1.2 %"))
+        return None
+
+    strategy = ContinuousBayesianCalibration(calibration_plan(simulations=40), measured(), 1)
+    played = Play(calibration_spill, answer=unlucky)(strategy)
+    final = [r for r in played.asked if isinstance(r, Suggest)][-1].problem
+    assert lost
+    assert len(final.data) == 40 - len(lost)
+    assert all(map(math.isfinite, final.data.costs))
+    assert strategy.result()["lost"] == len(lost)
+    assert true_discrepancy(strategy.theta) < 0.03
+
+
+def test_pours_too_small_for_a_spillage_are_left_out_and_their_actions_not_simulated():
+    # below 0.4 of the angle's range the toy beaker keeps its liquid
+    def is_poured(action):
+        return unit(action, CALIBRATION_ACTIONS)[1] > 0.4
+
+    pours = [
+        MeasuredPour(p.action, p.spillage, 1.0) if is_poured(p.action) else MeasuredPour(p.action, None, 0.0)
+        for p in measured(count=32, holdout=0)
+    ]
+    strategy = ContinuousBayesianCalibration(calibration_plan(simulations=30), pours, 1)
+    simulations = Play(calibration_spill)(strategy).simulations
+    assert np.mean([is_poured(r.action) for r in simulations]) > 0.9
+    with pytest.raises(LearningError, match="at least 2 training pours"):
+        ContinuousBayesianCalibration(calibration_plan(), [MeasuredPour(pours[0].action, None, 0.0)] * 5, 1)
+
+
+def test_test_pours_are_not_used_for_fitting():
+    pours = measured()
+    strategy = ContinuousBayesianCalibration(calibration_plan(simulations=4), pours, 1)
+    regression = Play(calibration_spill)(strategy).asked[0]
+    assert isinstance(regression, Suggest)
+    assert len(regression.problem.data) == 28
+
+
+def test_signed_differences_calibrate_better_than_noise_at_the_same_price():
+    pours = measured()
+    scores = {}
+    for averaging in ("context", "noise"):
+        scores[averaging] = []
+        for seed in range(4):
+            plan = calibration_plan(simulations=24, averaging=averaging)
+            strategy = ContinuousBayesianCalibration(plan, pours, seed)
+            Play(calibration_spill)(strategy)
+            scores[averaging].append(true_discrepancy(strategy.theta))
+    assert np.mean(scores["context"]) < 0.7 * np.mean(scores["noise"])
+
+
+BOX = Space((*PARAMETERS.axes, Axis("viscosity", 0.0, 1.0), Axis("friction", 0.0, 0.5)))
+
+
+def spill_by_two(action, theta, rng):
+    """Of four searched parameters cohesion and friction matter."""
+    u, v = unit(action, CALIBRATION_ACTIONS)
+    return 0.2 * u + 0.1 * v + 5.0 * abs(theta.cohesion - 0.04) ** 1.5 + 0.8 * (theta.friction - 0.2) ** 2
+
+
+def calibrated_in_four():
+    truth = SimulationParameters(cohesion=0.04, friction=0.2)
+    pours = [replace(p, spillage=spill_by_two(p.action, truth, None)) for p in measured()]
+    strategy = ContinuousBayesianCalibration(calibration_plan(parameters=BOX, simulations=40), pours, 4)
+    return strategy, Play(spill_by_two)(strategy)
+
+
+def test_of_four_parameters_the_result_maps_the_two_that_matter_with_the_others_at_theta_star():
+    strategy, _ = calibrated_in_four()
+    result = strategy.result()
+    drawn, theta = result["map"], result["theta"]
+    assert drawn["over"] == ["cohesion", "friction"]
+    assert drawn["held"] == {"particles": theta["particles"], "viscosity": theta["viscosity"]}
+    mean, deviation = np.array(drawn["mean"]), np.array(drawn["deviation"])
+    assert mean.shape == deviation.shape == (30, 30)
+    # the map goes through θ*: what it says there is what the result expects there, and nowhere is less expected
+    across, up = (np.abs(np.array(drawn["axes"][name]) - theta[name]).argmin() for name in drawn["over"])
+    assert mean[up, across] == pytest.approx(result["predicted_discrepancy"], abs=0.01)
+    assert mean.min() > result["predicted_discrepancy"] - 1e-4
+    assert mean.max() > 5 * mean.min()
+
+
+def test_those_who_watch_get_a_map_about_every_ten_simulations_and_replay_asks_for_the_same():
+    _, played = calibrated_in_four()
+    maps, simulations = [], 0
+    for request, outcome in played.told:
+        simulations += isinstance(request, Simulate)
+        if isinstance(outcome, Suggested) and outcome.suggestion.surrogate is not None:
+            maps.append((simulations, len(outcome.suggestion.surrogate.axes)))
+    assert maps[-1] == (40, 2)
+    assert len(maps) == 4
+    assert all(abs(many - 10 * (i + 1)) <= 2 for i, (many, _) in enumerate(maps))
+    truth = SimulationParameters(cohesion=0.04, friction=0.2)
+    pours = [replace(p, spillage=spill_by_two(p.action, truth, None)) for p in measured()]
+    fresh = ContinuousBayesianCalibration(calibration_plan(parameters=BOX, simulations=40), pours, 4)
+    assert replay(fresh, played) == played.asked
+
+
+def test_without_an_answer_of_the_optimiser_calibration_stops_with_its_reason():
+    def broken(request):
+        return Failed("optimizer", "out of memory") if isinstance(request, Suggest) else None
+
+    with pytest.raises(LearningError, match="out of memory"):
+        Play(calibration_spill, answer=broken)(ContinuousBayesianCalibration(calibration_plan(), measured(), 1))
+
+
+def test_simulations_that_all_fail_end_the_calibration_with_a_reason_and_not_a_traceback():
+    def hopeless(request):
+        return Failed("simulation", "leaked") if isinstance(request, Simulate) else None
+
+    strategy = ContinuousBayesianCalibration(calibration_plan(simulations=6), measured(), 1)
+    with pytest.raises(LearningError, match="6 simulations 6 gave no discrepancy"):
+        Play(calibration_spill, answer=hopeless)(strategy)
+
+
+# -- scores --------------------------------------------------------------------------------------------------------
+
+
+def test_the_true_theta_scores_best_and_undefined_pours_are_left_out():
+    pours = [ScoredPour("cup", p) for p in measured()]
+    pours.append(ScoredPour("cup", MeasuredPour(pours[0].pour.action, None, 0.01)))
+    thetas = {"best": TRUE_THETA, **random_parameters(PARAMETERS, {}, 5, 2)}
+    evaluation = Evaluation(thetas, pours, 1)
+    played = Play(calibration_spill)(evaluation)
+    assert len(played.simulations) == 6 * 32
+    for split in ("train", "test"):
+        assert evaluation.discrepancy("best", split) < 0.025  # noise of 1 % in both
+        assert evaluation.discrepancy("best", split) < evaluation.random_median(split)
+
+
+def test_a_score_is_the_mean_absolute_difference():
+    action = SCENE.action({"angular_velocity": 1.0, "max_angle": 2.0})
+    pours = [ScoredPour("cup", MeasuredPour(action, r, 1.0, "test")) for r in (0.1, 0.5)]
+    evaluation = Evaluation({"one": TRUE_THETA}, pours, 1)
+    Play(lambda a, t, rng: 0.2)(evaluation)
+    assert evaluation.discrepancy("one", "test") == pytest.approx((0.1 + 0.3) / 2)
+
+
+def test_a_regression_beats_the_mean_inside_the_scene_it_was_fitted_in():
+    pours = measured()
+    train, test = [p for p in pours if p.split == "train"], [p for p in pours if p.split == "test"]
+    mean = mean_predictor_discrepancy(train, test)
+    assert mean == pytest.approx(np.mean([abs(p.spillage - np.mean([q.spillage for q in train])) for p in test]))
+    assert regression_discrepancy(CALIBRATION_ACTIONS, train, test) < 0.5 * mean
+    assert mean_predictor_discrepancy(train, []) is None

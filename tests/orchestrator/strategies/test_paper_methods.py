@@ -1,0 +1,197 @@
+"""The paper's own methods, as campaigns and studies name them, are what the paper has and not our changes to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from actors.optimizer.core.problem import SuggestProblem
+from orchestrator.commands.campaigns import RunOptions, run
+from orchestrator.commands.common import RefusalError
+from orchestrator.config.campaign.resolved import campaign_as_file
+from orchestrator.config.load import load_campaign
+from orchestrator.config.study.sections import load_study
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.fingerprint import as_begun, fingerprint
+from orchestrator.plan import CampaignPlan, DeploymentPlan
+from orchestrator.requests import Suggest
+from orchestrator.stages import calibration_stages
+from orchestrator.strategies.deployment.d2 import RealOnly
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.study.cells import cells_of
+from orchestrator.study.folder import finished_results, read_result
+from orchestrator.study.plan import StudyPlan, study_fingerprint
+from orchestrator.study.report.calibrations import draw_calibrations
+from orchestrator.study.report.deployments import draw_deployments
+from orchestrator.study.report.drawing import colour
+from orchestrator.study.report.gather import gather
+from orchestrator.study.report.tables import tables
+from orchestrator.study.worker import run_cell
+from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
+from tests.orchestrator.play import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, Play
+from tests.orchestrator.study_files import read, written
+from tests.orchestrator.toy_study import ToyLaboratory
+from tests.orchestrator.toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
+
+
+def campaign(folder: Path, keys: str) -> CampaignPlan:
+    """The deployment of a file with other keys after `strategy`."""
+    return load_campaign(write(folder, "campaign.yaml", DEPLOYED.replace("strategy: D3", keys)))
+
+
+def questions(strategy: RealOnly | Hybrid, purpose: str) -> list[SuggestProblem]:
+    """What the optimiser is asked for a purpose in a whole campaign."""
+    asked = Play(narrow_cup_biased, narrow_cup)(strategy).asked
+    return [request.problem for request in asked if isinstance(request, Suggest) and request.purpose == purpose]
+
+
+def on_the_toy(plan: DeploymentPlan | None) -> DeploymentPlan:
+    assert plan is not None
+    return replace(plan, scenes=(SCENE,), actions=ACTIONS, pours=1, prior_simulations=8)
+
+
+@pytest.mark.parametrize(("keys", "plain"), [("model: residual", True), ("model: scaled", False)])
+def test_the_simulations_before_the_first_pour_keep_kappa_in_the_papers_model_alone(
+    folder: Path, keys: str, plain: bool
+) -> None:
+    plan = on_the_toy(campaign(folder, f"strategy: D3\n  {keys}").deployment)
+    asked = questions(Hybrid(plan, SCENE, THETA, 1), "prior")
+    assert len(asked) > 2
+    assert {problem.mean for problem in asked} == {"constant"}
+    assert {problem.plain for problem in asked} == {plain}
+
+
+def test_a_run_that_began_before_goes_on_asking_as_it_began(folder: Path) -> None:
+    today = campaign(folder, "strategy: D3\n  model: residual")
+    assert today.deployment is not None
+    before = replace(today, deployment=replace(today.deployment, plain=False))
+    old = fingerprint(before)
+    assert "plain" not in old["deployment"]  # as it was written then
+    assert as_begun(today, old) == before
+    assert as_begun(today, fingerprint(today)) is today
+    scaled = campaign(folder, "strategy: D3")
+    assert "plain" not in fingerprint(scaled)["deployment"]
+    assert as_begun(scaled, fingerprint(scaled)) is scaled
+
+
+# -- C4 ----------------------------------------------------------------------------------------------------------------
+
+
+def calibration(folder: Path, keys: str = "") -> CampaignPlan:
+    """A calibration of a file with further keys."""
+    return load_campaign(write(folder, "calibration.yaml", f"{CAMPAIGN}{keys}"))
+
+
+@pytest.mark.parametrize(("keys", "paper"), [("", False), ("  averaging: noise\n", True)])
+def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, keys: str, paper: bool) -> None:
+    plan = calibration(folder, keys).calibration
+    assert plan is not None
+    plan = replace(plan, scene=SCENE, simulations=8, initial=4, actions=CALIBRATION_ACTIONS, parameters=PARAMETERS)
+    results: dict[str, Any] = {}
+    for stage in calibration_stages(plan)[:2]:
+        played = Play(calibration_spill, weighed)(strategy := stage.build(results, 3))
+        results[stage.name] = strategy.result()
+    asked = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose in ("calibrate", "conclude")]
+    assert len(asked) > 3
+    assert {problem.plain for problem in asked} == {paper}
+    assert {len(problem.data.points[0]) for problem in asked} == ({2} if paper else {4})
+    assert all(cost >= 0.0 for cost in asked[-1].data.costs) is paper
+    assert ("posterior" in results["calibration"]) is not paper
+
+
+def test_how_c4_averages_is_written_down_and_may_not_change_under_a_run(folder: Path) -> None:
+    usual, paper = calibration(folder), calibration(folder, "  averaging: noise\n")
+    before = fingerprint(usual)
+    assert "averaging" not in before["calibration"]  # as it was written before there was a choice
+    assert fingerprint(paper)["calibration"]["averaging"] == "noise"
+    again = load_campaign(write(folder, "again.yaml", yaml.safe_dump(campaign_as_file(paper))))
+    assert fingerprint(again) == fingerprint(paper)
+
+
+def test_only_c4_averages(folder: Path) -> None:
+    text = CAMPAIGN.replace("simulations: 20", "strategy: C2\n  samples: 5\n  averaging: noise")
+    message = "calibration.averaging: belongs to C4, not to C2; remove it"
+    assert message in report(write(folder, "campaign.yaml", text))
+
+
+def test_noise_makes_no_draws_of_theta_for_a_deployment_under_risk(folder: Path) -> None:
+    keys = "strategy: D1\n  risk: {theta: posterior}"
+    text = DEPLOYED.replace("strategy: D3", keys).replace("pours: 15", "pours: 1")
+    path = write(folder, "campaign.yaml", text.replace("simulations: 20", "simulations: 20\n  averaging: noise"))
+    with pytest.raises(RefusalError, match="draws of θ, which no surrogate makes that takes actions for noise"):
+        run(
+            path,
+            RunOptions(
+                resume=False, run_id=None, answer=None, in_process=True, laboratory=None, as_json=False, armed=False
+            ),
+        )
+
+
+# -- studies -----------------------------------------------------------------------------------------------------------
+
+
+def study(folder: Path, **changes: Any) -> StudyPlan:
+    """The quick study with the paper's methods beside ours, and as little of them as possible."""
+    quick = read("quick")
+    c4 = {"repetitions": 1, "simulations": 6, "initial": 4}
+    d2, d3 = ({"repetitions": 1, "pours": 2, "initial": 1, **more} for more in ({}, {"prior_simulations": 4}))
+    arms = {
+        "calibration": {"C4": c4, "C4_paper": c4},
+        "deployment": {"D2": d2, "D2_paper": d2, "D3": d3, "D3_paper": {**d3, "per_pour": 0}},
+    }
+    return load_study(written(folder, {**quick, "mismatch": quick["mismatch"][:1], **arms, **changes}))
+
+
+def test_a_study_has_the_papers_methods_beside_ours(tmp_path: Path) -> None:
+    plan = study(tmp_path, mismatch=read("quick")["mismatch"])
+    ours, papers = plan.calibration("C4").plan, plan.calibration("C4-paper").plan
+    assert (ours.averaging, papers.averaging) == ("context", "noise")
+    assert replace(papers, averaging="context") == ours
+    ours, papers = (plan.deployment(label).plan for label in ("D2", "D2-paper"))
+    assert (ours.mean, papers.mean) == ("constant", "zero")
+    ours, papers = (plan.deployment(label).plan for label in ("D3", "D3-paper"))
+    assert (ours.model, ours.per_pour, ours.plain) == ("scaled", 2, False)
+    assert (papers.model, papers.per_pour, papers.plain, papers.trust) == ("residual", 0, True, None)
+    cells = {cell.id: cell for cell in cells_of(plan)}
+    assert "calibration.small.C4-paper.01" in cells
+    assert "calibration.large.C4-paper.01" not in cells, "it is compared at one level, and nobody uses its θ*"
+    assert cells["deployment.large.D3-paper.deployment-narrow.01"].needs == ("calibration.large.C4.01",)
+    assert cells["deployment.large.D2-paper.deployment-narrow.01"].needs == ()
+
+
+def test_another_mean_than_the_papers_is_none_of_d2_paper(tmp_path: Path) -> None:
+    arm = {"repetitions": 1, "pours": 2, "mean": "constant"}
+    with pytest.raises(ConfigError, match="D2_paper has the paper's mean, 'zero'"):
+        study(tmp_path, deployment={"D2_paper": arm})
+
+
+def test_the_papers_methods_run_and_stand_in_figures_and_tables(tmp_path: Path) -> None:
+    plan = study(tmp_path)
+    for cell in cells_of(plan):
+        run_cell(plan, cell, plan.folder, ToyLaboratory)  # type: ignore[arg-type]
+    alone = read_result(plan.folder, "deployment.small.D3-paper.deployment-narrow.01")
+    assert (alone["simulations"], alone["pours"]) == (4, 2), "none beside the pours"
+    found = gather(plan, finished_results(plan.folder, cells_of(plan)))
+    drawn = {one.number: one for one in (*draw_calibrations(plan, found), *draw_deployments(plan, found))}
+    boxes, curves, losses = (drawn[number].rows for number in ("3b", "3c", "6"))
+    assert {row[0] for row in boxes} == {"uncalibrated", "C4", "C4-paper"}
+    assert sum(row[0] == "C4-paper" for row in curves) > 1, "one point for every θ that was chosen, as for C4"
+    assert {row[2] for row in losses} == {"D2", "D2-paper", "D3", "D3-paper"}
+    effects = next(table for table in tables(plan, found) if table.name == "table-effects")
+    assert {"C4 − C4-paper", "D3-paper − D2-paper", "D2 − D2-paper"} <= {row[0] for row in effects.rows}
+
+
+def test_arms_are_told_apart_in_figures() -> None:
+    for family in (("C1", "C2", "C3", "C4", "C4-paper"), ("D1-15", "D2", "D2-paper", "D3", "D3-paper")):
+        assert len({colour(arm) for arm in family}) == len(family)
+
+
+def test_a_study_without_them_is_written_down_as_before(tmp_path: Path) -> None:
+    written_down = study_fingerprint(load_study(written(tmp_path, read("quick"))))
+    assert list(written_down["calibrations"]) == ["C1", "C2", "C3", "C4"]
+    arms = [*written_down["calibrations"].values(), *written_down["deployments"].values()]
+    assert not any({"averaging", "prior", "plain"} & set(arm) for arm in arms)

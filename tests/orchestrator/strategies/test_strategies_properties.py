@@ -1,0 +1,249 @@
+"""What holds for every strategy, C1 to C4 and D1 to D3: whoever finishes first, whatever fails, wherever it stops."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from actors.optimizer.core.propose import propose
+from orchestrator.errors import LearningError
+from orchestrator.events import Event, RequestFinished
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, PricesPlan, RiskPlan
+from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulated, Suggest
+from orchestrator.strategies.calibration.c1 import UniformGrid
+from orchestrator.strategies.calibration.c2 import StratifiedSampling
+from orchestrator.strategies.calibration.c3 import BayesianCalibration
+from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.design import DesignedPours
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.d2 import RealOnly
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.d3_free import FreeHybrid
+from orchestrator.strategies.deployment.objectives import Objective, Objectives
+from sim_engine.losses import Loss
+from sim_engine.outcome import PourMeasurement
+from sim_engine.space import Axis, Space
+from sim_engine.task import PoseError
+from tests.orchestrator.play import (
+    CALIBRATION_ACTIONS,
+    SCENE,
+    THETA,
+    Play,
+    calibration_plan,
+    deployment_plan,
+    outcome_of,
+    replay,
+)
+from tests.orchestrator.toy import SCENE as TOY
+from tests.orchestrator.toy import SPACE, ToyLaboratory, logical_record, run_toy, slow_laboratory, toy_plan
+from tests.orchestrator.toys import calibration_spill, narrow_cup, weighed
+
+CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "C1": (UniformGrid, {"grid": {"particles": 2, "cohesion": 3}}),
+    "C2": (StratifiedSampling, {"thetas": 6}),
+    "C3": (BayesianCalibration, {"thetas": 6, "initial": 4}),
+    "C4": (ContinuousBayesianCalibration, {"simulations": 12, "initial": 6}),
+}
+BOTH = Objectives((Objective("spillage"), Objective("retained")), pareto=True)
+RISK = RiskPlan("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
+FREE = {"pours": 3, "prior_simulations": 12, "per_pour": None, "prices": PricesPlan(), "model": "scaled"}
+DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "D1": (OneShotPlanning, {"iterations": 6}),
+    "D1, risk": (RobustPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),
+    "D2": (RealOnly, {"pours": 5}),
+    "D3": (Hybrid, {"pours": 3, "prior_simulations": 6, "per_pour": 2}),
+    "D3, front": (Hybrid, {"pours": 3, "prior_simulations": 6, "per_pour": 2, "objectives": BOTH}),
+}
+ALL = [*CALIBRATIONS, *DEPLOYMENTS]
+"""Whose requests depend on outcomes alone."""
+
+AS_TIME_ALLOWS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "D3, free": (FreeHybrid, FREE),
+    "D3, free, varying noise": (FreeHybrid, {**FREE, "prior_simulations": 45, "noise": "varying"}),
+}
+"""Whose requests depend on who answers first, too."""
+
+
+@cache
+def measured() -> tuple[Any, ...]:
+    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 6, 1, 0)
+    Play(weighed)(design)
+    return design.measured
+
+
+def make(name: str, seed: int) -> Any:
+    if name in CALIBRATIONS:
+        kind, changes = CALIBRATIONS[name]
+        return kind(calibration_plan(strategy=name, **changes), measured(), seed)
+    kind, changes = (DEPLOYMENTS | AS_TIME_ALLOWS)[name]
+    return kind(deployment_plan(strategy=name[:2], **changes), SCENE, THETA, seed)
+
+
+class Shuffled(Play):
+    """Simulations come back in any order."""
+
+    def __init__(self, *arguments: Any, shuffle: int, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._rng = random.Random(shuffle)
+
+    def _next(self, waiting: list[Request]) -> Request:
+        first = super()._next(waiting)
+        return self._rng.choice([request for request in waiting if type(request) is type(first)])
+
+
+def spill(name: str) -> Callable[..., float]:
+    return calibration_spill if name in CALIBRATIONS else narrow_cup
+
+
+@pytest.mark.parametrize("name", ALL)
+@settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**31), slots=st.integers(1, 7), shuffle=st.integers(0, 1000))
+def test_the_order_in_which_simulations_return_changes_no_request(
+    name: str, seed: int, slots: int, shuffle: int
+) -> None:
+    first = Play(spill(name), slots=slots)(make(name, seed))
+    other = Shuffled(spill(name), slots=slots, shuffle=shuffle)(make(name, seed))
+    assert (other.simulations, other.pours) == (first.simulations, first.pours)
+    assert [r.problem for r in other.asked if isinstance(r, Suggest)] == [
+        r.problem for r in first.asked if isinstance(r, Suggest)
+    ]
+    assert replay(make(name, seed), first) == first.asked
+
+
+NAN = math.nan
+
+
+def misfortune(share: float, seed: int) -> Callable[[Request], Outcome | None]:
+    """Every kind of bad luck, in a share of the requests."""
+    rng = np.random.default_rng(seed)
+
+    def strike(request: Request) -> Outcome | None:
+        if isinstance(request, Suggest) or rng.random() >= share:
+            return None
+        if isinstance(request, Pour):
+            lost = PourMeasurement(0.2, NAN, 0.0)
+            return [Failed("pour_failed", "spilled by hand"), Failed("invalid_action", "touch"), Poured(lost)][
+                int(rng.integers(3))
+            ]
+        return [
+            Failed("simulation", "diverged"),
+            Failed("invalid_action", "cups touch"),
+            Simulated(outcome_of(NAN)),
+            Simulated(replace(outcome_of(0.9), invalid="escaped 1.2 %")),
+            Simulated(outcome_of(0.0, retained=1.0)),
+            Simulated(outcome_of(0.3, retained=NAN)),
+        ][int(rng.integers(6))]
+
+    return strike
+
+
+@pytest.mark.parametrize("name", [*ALL, *AS_TIME_ALLOWS])
+@settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**31), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]))
+def test_whatever_fails_every_question_has_numbers_and_the_end_is_an_answer_or_a_reason(
+    name: str, seed: int, share: float
+) -> None:
+    strategy = make(name, seed)
+    played, reason = Play(spill(name), slots=3, answer=misfortune(share, seed), beside=20), ""
+    try:
+        played(strategy)
+    except LearningError as error:
+        reason = str(error)
+    assert strategy.finished or (name in CALIBRATIONS and "gave no discrepancy" in reason)
+    questions = [request.problem for request in played.asked if isinstance(request, Suggest)]
+    assert all(math.isfinite(cost) for q in questions for cost in (*q.data.costs, *q.simulated.costs))
+    assert all(math.isfinite(u) for q in questions for point in q.data.points for u in point)
+    if name != "D1, risk":  # what was executed may lie beside the box
+        assert all(0.0 <= u <= 1.0 for q in questions for point in q.data.points for u in point)
+    json.dumps(strategy.result(), allow_nan=False)
+
+
+def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
+    def lost(request: Request) -> Outcome | None:
+        return Poured(PourMeasurement(0.2, NAN, 0.0)) if isinstance(request, Pour) and request.number == 2 else None
+
+    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 4, 1, 0)
+    Play(weighed, answer=lost)(design)
+    assert len(design.measured) == 3
+    assert "no numbers" in str(design.result()["pours"][1]["given_up"])  # type: ignore[index]
+
+
+# -- through scheduler and journal ---------------------------------------------------------------------------------
+
+TOY_PARAMETERS = Space((Axis("cohesion", 0.0, 0.1), Axis("friction", 0.0, 0.5)))
+GRID = {"grid": {"cohesion": 2, "friction": 2}}
+
+
+class Optimizer:
+    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+        return propose(problem)
+
+
+def campaign(directory: Path, name: str) -> CampaignPlan:
+    if name in CALIBRATIONS:
+        changes = GRID if name == "C1" else CALIBRATIONS[name][1]
+        values: dict[str, Any] = {"simulations": 12} | changes
+        calibration = CalibrationPlan(
+            strategy=name,  # type: ignore[arg-type]
+            scene=TOY,
+            actions=SPACE,
+            parameters=TOY_PARAMETERS,
+            fixed_parameters={"particles": 700},
+            pour_count=4,
+            holdout=1,
+            records=None,
+            transfer=None,
+            **values,
+        )
+        return toy_plan(directory, calibration=calibration, deployment=None, on_unknown="repeat")
+    values = {"pours": 3} | DEPLOYMENTS[name][1]
+    deployment = DeploymentPlan(name[:2], (TOY,), SPACE, Loss(), **values)  # type: ignore[arg-type]
+    return toy_plan(directory, deployment=deployment, on_unknown="repeat")
+
+
+class Stopper:
+    """Pauses the run that it watches after so many outcomes."""
+
+    def __init__(self, outcomes: int) -> None:
+        self._left = outcomes
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, RequestFinished) and not event.replayed:
+            self._left -= 1
+            if self._left == 0:
+                next(t for t in asyncio.all_tasks() if t.get_coro().__name__ == "run_toy").cancel()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_an_interrupted_run_on_a_slow_laboratory_asks_for_what_an_undisturbed_one_does(
+    name: str, tmp_path: Path
+) -> None:
+    def run(folder: str, laboratory: ToyLaboratory, **arguments: Any) -> None:
+        laboratory.optimizer = Optimizer()  # type: ignore[assignment]
+        plan = campaign(tmp_path, name)
+        asyncio.run(run_toy(tmp_path / folder, laboratory, plan=plan, stages=None, **arguments))
+
+    run("undisturbed", ToyLaboratory())
+    expected = logical_record(tmp_path / "undisturbed")
+    clock, resume = random.Random(1), False
+    for outcomes in (3, 7):
+        with pytest.raises(asyncio.CancelledError):
+            run("run", slow_laboratory(0.004, clock), resume=resume, watchers=[Stopper(outcomes)])
+        resume = True
+        assert logical_record(tmp_path / "run") == expected[: len(logical_record(tmp_path / "run"))]
+    run("run", slow_laboratory(0.004, clock), resume=True)
+    assert logical_record(tmp_path / "run") == expected

@@ -1,0 +1,199 @@
+"""A study's cells are a pure function of its file, and what is wrong with the file is said with its place."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from orchestrator.config.campaign.check import touch
+from orchestrator.config.study.sections import load_study
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.errors import RunError
+from orchestrator.stages import deployment_stages
+from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.d2 import RealOnly
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.study.campaigns import campaign_of
+from orchestrator.study.cells import cells_of
+from sim_engine.vessel.build import build_vessel
+from tests.orchestrator.study_files import ROOT, STUDIES, read, small, without, written
+
+
+def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:
+    cells = cells_of(load_study(STUDIES / "paper.yaml"))
+    count = Counter((cell.kind, cell.arm, cell.level) for cell in cells)
+    assert [count["calibration", arm, "moderate"] for arm in ("C1", "C2", "C3", "C4")] == [10, 5, 5, 10]
+    for level in ("small", "moderate", "large"):
+        assert count["pours", "", level] == 10
+        for arm in ("D1-15", "D2", "D3"):
+            assert count["deployment", arm, level] == 3 * 10
+    spent = {arm: sum(c.simulations - 32 for c in cells if c.arm == arm) for arm in ("C2", "C3")}
+    assert spent == {"C2": 5 * 504, "C3": 5 * 1652}
+    assert [c.simulations for c in cells if c.kind == "grid"] == [100 * 32]
+
+
+def test_a_study_may_have_other_values_and_ranges_of_parameters_than_its_campaign(tmp_path: Path) -> None:
+    changes = {"particles": {"range": [300, 350], "scale": "log"}, "cohesion": "0.02 N/m"}
+    study = small(tmp_path, parameters=changes, search=["particles"])
+    plan = study.calibration("C4").plan
+    axis = plan.parameters.axes[0]
+    assert (axis.name, axis.lower, axis.upper, axis.scale) == ("particles", 300.0, 350.0, "log")
+    assert plan.fixed_parameters["cohesion"] == 0.02
+    assert study.base.parameters.particles == 350, "the default, as near as the range allows"
+    assert study.base.parameters.cohesion == 0.02
+
+
+@pytest.mark.parametrize("name", ["paper", "quick"])
+def test_cells_are_the_same_whenever_the_file_is_read_and_come_after_what_they_need(name: str) -> None:
+    cells = cells_of(load_study(STUDIES / f"{name}.yaml"))
+    assert cells == cells_of(load_study(STUDIES / f"{name}.yaml"))
+    assert len({cell.id for cell in cells}) == len(cells)
+    known: set[str] = set()
+    for cell in cells:
+        assert known.issuperset(cell.needs), cell.id
+        known.add(cell.id)
+
+
+def test_repetitions_levels_and_receivers_have_seeds_of_their_own_and_arms_share_them() -> None:
+    seeds: dict[tuple[str, str, str, int, int], set[int]] = {}
+    for cell in cells_of(load_study(STUDIES / "paper.yaml")):
+        kind = "calibration" if cell.kind == "uncalibrated" else cell.kind
+        seeds.setdefault((kind, cell.level, cell.receiver, cell.repetition, cell.again), set()).add(cell.seed)
+    assert all(len(found) == 1 for found in seeds.values())
+    assert len(set.union(*seeds.values())) == len(seeds)
+
+
+def test_another_seed_gives_other_seeds_to_all_cells(tmp_path: Path) -> None:
+    one, other = cells_of(small(tmp_path / "a", seed=1)), cells_of(small(tmp_path / "b", seed=2))
+    assert [cell.id for cell in one] == [cell.id for cell in other]
+    assert not {cell.seed for cell in one} & {cell.seed for cell in other}
+
+
+@pytest.mark.parametrize("name", ["paper", "quick"])
+def test_no_mismatch_lets_the_cups_touch_in_calibration(name: str) -> None:
+    study = load_study(STUDIES / f"{name}.yaml")
+    assert study.base.calibration is not None
+    scene, actions = study.base.calibration.scene, study.base.calibration.actions
+    pourer, receiver = build_vessel(scene.pourer), build_vessel(scene.receiver)
+    action = scene.action(actions.decode([1.0] * actions.dimension))
+    for level in study.levels:
+        error, noise = level.bench.pose_error, level.bench.pose_noise
+        nearest = action.with_values(x_offset=action.x_offset + error.x - 3 * noise.x)
+        assert touch(scene, nearest, pourer, receiver) is None, level.name
+
+
+def test_without_levels_a_study_pours_on_its_laboratory_as_it_is(tmp_path: Path) -> None:
+    changes = without(without(read("quick"), "mismatch"), "compared")
+    study = load_study(written(tmp_path, changes))
+    twin = study.base.laboratory.bench
+    assert [level.name for level in study.levels] == [study.compared] == ["twin"]
+    assert twin is not None
+    assert study.levels[0].bench == replace(twin, time_scale=0.0), "numbers are not waited for"
+    wired = {**changes, "laboratory": str(ROOT / "configs/laboratories/virtual.yaml")}
+    study = load_study(written(tmp_path / "wired", wired))
+    assert study.base.laboratory.arm is not None
+    assert study.levels[0].bench == study.base.laboratory.bench, "an arm over wires needs its time"
+
+
+def risky(folder: Path, **arm: Any) -> Path:
+    """The quick study of a campaign that plans under risk."""
+    campaign = YAML(typ="safe").load((ROOT / "configs/campaigns/quickstart.yaml").read_text(encoding="utf-8"))
+    for section, key in (("calibration", "receiver"), ("deployment", "receiver")):
+        campaign[section][key] = str((ROOT / "configs/campaigns" / campaign[section][key]).resolve())
+    for key in ("laboratory", "pourer"):
+        campaign[key] = str((ROOT / "configs/campaigns" / campaign[key]).resolve())
+    kept = {key: campaign["deployment"][key] for key in ("receiver", "motion", "actions")}
+    risk = {"measure": "expected", "pose_error": {"x": "3 mm"}, "theta": "posterior"}
+    campaign["deployment"] = {**kept, "strategy": "D1", "risk": risk, "window": {"tolerance": "2 %"}}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "campaign.yaml").write_text(json.dumps(campaign), encoding="utf-8")
+    data = read("quick")
+    data["deployment"]["D1"]["simulations_per_iteration"] = arm.get("simulations_per_iteration", 2)
+    return written(folder, {**data, "campaign": str(folder / "campaign.yaml")})
+
+
+def test_risk_of_the_campaign_is_that_of_d1_and_leaves_the_others_what_they_are(tmp_path: Path) -> None:
+    study = load_study(risky(tmp_path))
+    plans = {arm.label: arm.plan for arm in study.deployments}
+    assert plans["D1-2"].risk is not None
+    assert plans["D1-2"].tolerance == pytest.approx(0.02)
+    assert {plans[label].risk for label in ("D2", "D3")} == {plans[label].tolerance for label in ("D2", "D3")} == {None}
+    theta = study.base.parameters.model_dump()
+    rows = [{"cohesion": 0.01 * i} for i in range(3)]
+    known = {"calibration": {"theta": theta, "posterior": {"thetas": rows}}}
+    made = {}
+    for cell in cells_of(study):
+        if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":
+            plan, stages = campaign_of(study, cell, lambda name: known, tmp_path)
+            made[cell.arm] = stages[0].build({}, 1)
+            assert plan.deployment is not None
+            if plan.deployment.risk is not None:
+                assert [one.cohesion for one in plan.deployment.risk.thetas] == [0.0, 0.01, 0.02]
+    assert {arm: type(one) for arm, one in made.items()} == {"D1-2": RobustPlanning, "D2": RealOnly, "D3": Hybrid}
+    for arm in ("D2", "D3"):
+        wrong = replace(plans[arm], risk=plans["D1-2"].risk)
+        with pytest.raises(RunError, match=f"risk: belongs to D1, not to {arm}"):
+            deployment_stages(study.base, wrong)
+    with pytest.raises(ConfigError, match="at least 2 are needed"):
+        load_study(risky(tmp_path / "few", simulations_per_iteration=1))
+
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "no mismatch left": (lambda d: {**without(d, "compared"), "mismatch": []}, "mismatch: is empty"),
+    "hardware": (
+        lambda d: {**d, "laboratory": str(ROOT / "configs/laboratories/ur10-kern.yaml")},
+        "laboratory 'ur10-kern' is hardware. An arm moves only for one run, after '--arm'",
+    ),
+    "nothing to confirm": (lambda d: without({**d, "confirm": 1}, "deployment"), "confirm: there is no deployment"),
+    "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),
+    "level twice": (lambda d: {**d, "mismatch": [d["mismatch"][0]] * 2}, "mismatch[1]: a level 'small'"),
+    "not searched": (lambda d: {**d, "search": ["friction"]}, "search[0]: 'friction' is not searched"),
+    "nothing left to search": (
+        lambda d: {
+            **without(d, "search"),
+            "parameters": {"particles": 500, "cohesion": "0 N/m", "viscosity": "1 1/s"},
+        },
+        "parameters: fixes all that the campaign searches",
+    ),
+    "no bench": (
+        lambda d: {**d, "laboratory": str(ROOT / "configs/laboratories/planning.yaml")},
+        "laboratory 'planning' has no virtual bench",
+    ),
+    "no such campaign": (lambda d: {**d, "campaign": "nothing.yaml"}, "campaign: no such file"),
+    "another's key": (
+        lambda d: {**d, "calibration": {**d["calibration"], "C1": {"repetitions": 1, "per_axis": 2, "samples": 3}}},
+        "calibration.C1.samples: belongs to C2, not to C1",
+    ),
+    "no budget": (
+        lambda d: {**d, "calibration": {**d["calibration"], "C3": {"repetitions": 1}}},
+        "calibration.C3: key 'iterations' is missing",
+    ),
+    "no θ for D3": (
+        lambda d: {**d, "calibration": without(d["calibration"], "C4")},
+        "D3 simulates with the θ* that C4 finds",
+    ),
+    "all for testing": (lambda d: {**d, "holdout": 5}, "holdout: 5 of 6 pours for testing"),
+    "nothing to compare": (lambda d: without(without(d, "calibration"), "deployment"), "there is nothing to compare"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_with_a_study_is_said_with_its_place(case: str, tmp_path: Path) -> None:
+    change, message = WRONG[case]
+    path = written(tmp_path, change(read("quick")))
+    with pytest.raises(ConfigError) as refused:
+        load_study(path)
+    assert message in str(refused.value)
+    if case != "no such campaign":
+        assert f"{path}:1:" in str(refused.value)
+
+
+def test_a_campaign_is_no_study() -> None:
+    with pytest.raises(ConfigError, match="describes a campaign, but a study is needed here"):
+        load_study(ROOT / "configs" / "campaigns" / "quickstart.yaml")

@@ -1,0 +1,274 @@
+"""What a study shows, on results that are made up so that the right numbers are known."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orchestrator.config.study.sections import load_study
+from orchestrator.study.cells import Cell, cells_of
+from orchestrator.study.code import code_now, told
+from orchestrator.study.folder import run_folder, write_result
+from orchestrator.study.plan import StudyPlan
+from orchestrator.study.report.deployments import draw_deployments
+from orchestrator.study.report.drawing import look
+from orchestrator.study.report.effects import effect
+from orchestrator.study.report.gather import at_pour, gather, running_least
+from orchestrator.study.report.intervals import Estimate, estimate
+from orchestrator.study.report.page import write_report
+from orchestrator.study.report.tables import pours_needed, tables
+from tests.orchestrator.study_files import read, written
+
+FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7", "final")
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> StudyPlan:
+    return load_study(written(tmp_path_factory.mktemp("study"), read("quick")))
+
+
+# Test discrepancies of the two repetitions of each strategy: their means are 10, 2 (C4) and so on [%].
+DISCREPANCY = {"": (0.10, 0.10), "C1": (0.03, 0.05), "C2": (0.05, 0.05), "C3": (0.02, 0.04), "C4": (0.01, 0.03)}
+
+
+def made_up(cell: Cell) -> dict[str, Any]:
+    """A cell's result as the worker would have written it."""
+    results: dict[str, Any] = {}
+    if cell.kind in ("calibration", "uncalibrated"):
+        off = DISCREPANCY[cell.arm][cell.repetition - 1]
+        results["evaluation"] = {
+            "pairs": [
+                {"theta": "theta", "split": split, "measured": 0.3, "simulated": 0.3 + sign * off}
+                for split, sign in (("test", 1), ("test", -1), ("train", 1))
+            ]
+            + [{"theta": "theta", "split": "test", "measured": 0.3, "simulated": None}]
+        }
+    if cell.kind == "calibration":
+        axes = {"particles": [500.0, 1000.0, 1500.0], "cohesion": [0.0, 0.05, 0.1]}
+        results["calibration"] = {
+            "simulations": 12,
+            "training_pours": 4,
+            "searched": ["particles", "cohesion"],
+            "theta": {"particles": 700 + 10 * cell.repetition, "cohesion": 0.04},
+            "predicted_discrepancy": 0.04,
+            "trials": [
+                {"theta": {"particles": 600 + 100 * i, "cohesion": 0.02 * i}, "discrepancy": d}
+                for i, d in enumerate((0.2, None, 0.1, 0.3))
+            ],
+            "map": {"over": ["particles", "cohesion"], "axes": axes, "mean": np.full((3, 3), 0.1).tolist()},
+        }
+    if cell.kind == "deployment":
+        losses = {"D1": [0.08], "D2": [0.5, 0.2, 0.1], "D3": [0.1, 0.3, 0.05]}[cell.arm.split("-")[0]]
+        off = 0.02 if cell.repetition == 1 else 0.0
+        results["deployment:narrow"] = {"pours": [{"status": "weighed", "loss": loss + off} for loss in losses]}
+        results["deployment:narrow"]["pours"].append({"status": "refused", "loss": 1.0})
+    if cell.kind == "final":
+        loss = {"D1": 0.09, "D2": 0.2, "D3": 0.06}[cell.arm.split("-")[0]] + 0.02 * (cell.repetition == 1)
+        made = (cell.level, cell.arm, cell.repetition) != ("large", "D2", 2)
+        results["final"] = {"loss": loss, "spillage": loss / 2, "made": True, "reason": ""}
+        if not made:
+            results["final"] |= {"loss": 1.0, "spillage": 1.0, "made": False}
+    expected = [[4, 0.2], [5, 0.3], [6, -0.1]]
+    return {"results": results, "simulations": 10, "pours": 3, "cpu_s": 36.0, "seconds": 72.0, "expected": expected}
+
+
+def rows(folder: Path, name: str) -> list[dict[str, str]]:
+    with (folder / "report" / f"{name}.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_study_of_which_nothing_is_there_yet_has_a_page(study: StudyPlan, tmp_path: Path) -> None:
+    page = write_report(study, tmp_path).read_text(encoding="utf-8")
+    assert "Unfinished: 0 of 41 cells" in page
+    assert "<img" not in page
+
+
+def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
+    study: StudyPlan, tmp_path: Path
+) -> None:
+    for cell in cells_of(study):
+        run_folder(tmp_path, cell.id).mkdir(parents=True)
+        write_result(tmp_path, cell.id, made_up(cell))
+    page = write_report(study, tmp_path).read_text(encoding="utf-8")
+    for number in FIGURES:
+        assert f'id="figure-{number}"' in page
+        for suffix in ("png", "svg", "csv"):
+            assert (tmp_path / "report" / f"figure-{number}.{suffix}").stat().st_size > 100, f"{number}.{suffix}"
+    assert "Unfinished" not in page
+    assert not re.search(r'(src|href)="(?!data:)', page), "the page refers to something beside it"
+    assert "A repetition resamples the pours" in page
+    assert "Student&#x27;s t over repetitions" in page
+    assert "test pours recur between repetitions" in page
+    assert "before versions were noted" in page
+
+    boxes = {row["strategy"]: row for row in rows(tmp_path, "figure-3b")}
+    assert list(boxes) == ["uncalibrated", "C1", "C2", "C3", "C4"]
+    assert float(boxes["C4"]["mean_percent"]) == pytest.approx(2.0)
+    assert (float(boxes["C4"]["low"]), float(boxes["C4"]["high"])) == pytest.approx((0.0, 2.0 + 12.7062), abs=1e-4)
+    assert int(boxes["C4"]["pours"]) == 4, "two defined test pours in each of two repetitions"
+    curves = [row for row in rows(tmp_path, "figure-3c") if row["strategy"] == "C3"]
+    assert [int(row["simulations"]) for row in curves] == [4, 8, 12, 16]
+    assert [float(row["best_percent"]) for row in curves] == pytest.approx([20, 20, 10, 10])
+    hybrid = [r for r in rows(tmp_path, "figure-6") if (r["level"], r["strategy"]) == ("large", "D3")]
+    assert [float(row["least_%"]) for row in hybrid] == pytest.approx([11, 11, 6])
+    planned = [r for r in rows(tmp_path, "figure-6") if (r["level"], r["strategy"]) == ("large", "D1-2")]
+    assert [float(row["least_%"]) for row in planned] == pytest.approx([9, 9, 9])
+    mean = next(r for r in rows(tmp_path, "figure-5b") if (r["level"], r["strategy"]) == ("small", "D2"))
+    assert float(mean["mean_%"]) == pytest.approx(100 * (0.8 / 3 + 0.01)), "a refused pour is none"
+    price = [r for r in rows(tmp_path, "figure-7") if r["strategy"] == "D3" and r["seconds_per_pour"] == "90.0"]
+    first = next(r for r in price if r["seconds_per_simulation"] == "25.0")
+    assert float(first["total_seconds"]) == 4 * 25 + 90
+    needed = rows(tmp_path, "table-pours")[0]
+    assert (float(needed["D2"]), float(needed["D3"])) == (3, 1), "D3 is at its first pour where D2 is at its last"
+
+
+def test_no_two_arms_of_a_figure_look_alike() -> None:
+    arms = ["D1-5", "D1-15", "D1-10", "D2", "D2-paper", "D3", "D3-paper"]
+    looks = [look(arm, arms) for arm in arms]
+    assert len({one.colour for one in looks}) == len(arms)
+    planned = [look(arm, arms) for arm in ("D1-5", "D1-10", "D1-15")]
+    assert len({one.hatch for one in planned}) == len({one.line for one in planned}) == 3, (
+        "in print without colours too"
+    )
+    brightness = [sum(bytes.fromhex(one.colour[1:])) for one in planned]
+    assert brightness == sorted(brightness, reverse=True), "darker with more iterations, whatever the order of the arms"
+    for name in ("C4", "D2", "D3"):
+        ours, theirs = look(name, [name, f"{name}-paper"]), look(f"{name}-paper", [name, f"{name}-paper"])
+        assert ours.colour != theirs.colour
+        assert (theirs.line, theirs.hatch) == ("--", "//")
+    assert look("D1-5", ["D1-5", "D2"]).hatch == "", "alone it needs none"
+
+
+def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: StudyPlan) -> None:
+    found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
+    for key in [key for key in found.losses if key.level == "small"]:
+        del found.losses[key]
+    for key in found.losses:
+        if key.arm == "D3":
+            found.losses[key] = [[0.004, 0.0, 0.0], [0.004, 0.0, 0.0]]
+    figure = next(one for one in draw_deployments(study, found) if one.number == "6")
+    for axes in figure.figure.axes:
+        assert axes.get_yscale() == "log"
+        (hybrid,) = [line for line in axes.get_lines() if line.get_label() == "D3"]
+        assert list(hybrid.get_ydata()) == pytest.approx([0.4, 0.01, 0.01])
+    assert "less than 0.01 %" in figure.caption
+    assert [row[5] for row in figure.rows if row[2] == "D3"][1] == 0.0, "the numbers are what was measured"
+
+
+def test_an_arm_that_its_first_panel_lacks_is_in_the_legend(study: StudyPlan) -> None:
+    found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
+    lacking = next(key for key in found.losses if key.arm == "D3")
+    found.losses[lacking] = []
+    for one in draw_deployments(study, found):
+        if one.number != "7":  # of one level only
+            assert "D3" in [text.get_text() for text in one.figure.legends[0].get_texts()], one.number
+
+
+def test_recommended_actions_are_compared_by_their_own_pours(study: StudyPlan) -> None:
+    found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
+    known = {table.name: table for table in tables(study, found)}
+    final = {tuple(map(str, row[:3])): row for row in known["table-final"].rows}
+    assert len(final) == 2 * 1 * 3
+    _, _, _, count, loss, spilled, lost = final["small", "narrow", "D3"]
+    assert isinstance(loss, Estimate)
+    assert isinstance(spilled, Estimate)
+    assert (count, loss.mean, spilled.mean, lost) == (2, pytest.approx(7.0), pytest.approx(3.5), "0 of 2")
+    _, _, _, _, worst, spilled, lost = final["large", "narrow", "D2"]
+    assert isinstance(worst, Estimate)
+    assert isinstance(spilled, Estimate)
+    assert (worst.mean, spilled.mean, lost) == (pytest.approx(61.0), pytest.approx(55.5), "1 of 2"), "a failure counts"
+    rows = [row for row in known["table-effects"].rows if str(row[1]).endswith("of the final action")]
+    small = {str(row[0]): row for row in rows if row[2] == "small"}
+    assert list(small) == ["D3 − D2", "D3 − D1-2"]
+    for compared, difference in (("D3 − D2", -14.0), ("D3 − D1-2", -3.0)):
+        one = small[compared][5]
+        assert isinstance(one, Estimate)
+        assert (one.mean, one.high) == pytest.approx((difference, difference)), "repetitions share their chance"
+        assert small[compared][6] == "2 of 2"
+
+
+def test_the_page_tells_by_how_many_codes_the_cells_were_made(study: StudyPlan) -> None:
+    old, new = {"results": {}}, {"results": {}, "code": code_now()}
+    text = told({"a": old, "b": new, "c": new})
+    assert text.startswith("Code: 2 different for 3 cells: 2 of decant ")
+    assert f"solver {code_now()['solver']}" in text
+    assert text.endswith("1 of before versions were noted.")
+
+
+def test_effects_are_differences_within_repetitions() -> None:
+    ours, theirs = {1: 0.1, 2: 0.2, 3: 0.3, 5: math.nan}, {1: 0.3, 2: 0.3, 3: 0.5, 4: 9.0, 5: 1.0}
+    one = effect(ours, theirs)
+    assert one.difference.mean == pytest.approx(-0.5 / 3)
+    assert (one.difference.count, one.better, one.probability) == (3, 3, None)
+    assert one.difference.high < 0.0, "repetitions differ much more than strategies do within one"
+    shifted = {n: 10.0 * n for n in range(8)}
+    sure = effect(shifted, {n: value + 1.0 for n, value in shifted.items()})
+    assert sure.probability == pytest.approx(2 / 2**8)
+    even = effect(shifted, {n: value + (1.0 if n % 2 else -1.0) for n, value in shifted.items()})
+    assert even.probability == 1.0
+
+
+def test_half_a_study_shows_what_is_there(study: StudyPlan, tmp_path: Path) -> None:
+    for cell in cells_of(study):
+        if cell.repetition == 1 and cell.arm in ("C4", "D2"):
+            run_folder(tmp_path, cell.id).mkdir(parents=True)
+            write_result(tmp_path, cell.id, made_up(cell))
+    page = write_report(study, tmp_path).read_text(encoding="utf-8")
+    assert "Unfinished: 6 of 41 cells" in page
+    assert all(f'id="figure-{number}"' in page for number in FIGURES)
+    only = rows(tmp_path, "figure-3b")[0]
+    assert only["low"] == "nan", "one repetition has no interval"
+
+
+def test_interval_of_known_numbers() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.normal(5.0, 2.0, 400)
+    found = estimate(values.tolist())
+    half = 1.96 * values.std() / math.sqrt(400)
+    assert found.mean == pytest.approx(values.mean())
+    assert found.low == pytest.approx(values.mean() - half, abs=0.03)
+    assert found.high == pytest.approx(values.mean() + half, abs=0.03)
+    assert estimate([0.2, math.nan, 0.4]).count == 2
+    assert math.isnan(estimate([]).mean)
+    assert estimate([3.0, 3.0, 3.0]).low == 3.0
+
+
+@pytest.mark.parametrize("count", [5, 10])
+def test_of_a_hundred_intervals_of_few_repetitions_ninety_five_hold_the_true_mean(count: int) -> None:
+    studies = np.random.default_rng(3).normal(0.3, 0.05, (3000, count)).tolist()
+    found = [estimate(repetitions) for repetitions in studies]
+    covered = sum(one.low <= 0.3 <= one.high for one in found) / len(found)
+    # standard deviation of the share: 0.004; the percentile bootstrap has .83 and .91
+    assert 0.93 < covered < 0.97
+
+
+def test_interval_of_a_share_ends_where_shares_do_and_keeps_its_mean() -> None:
+    few = [0.0, 0.0, 0.3]
+    assert estimate(few).low < 0.0, "of numbers that can be anything"
+    assert estimate(few, (0.0, 1.0)).low == 0.0
+    assert estimate(few, (0.0, 1.0)).high == estimate(few).high
+    more = estimate([1.004, 1.001, 1.001], (0.0, 1.0))  # a balance's noise
+    assert more.low < more.high == more.mean
+    off = effect({1: 1.0, 2: 0.1}, {1: 0.0, 2: 0.0}, (0.0, 1.0)).difference
+    assert off.high == 1.0 > off.mean > 0.0 > off.low == -1.0
+
+
+def test_pours_needed_counts_from_one_and_says_when_it_is_never_reached() -> None:
+    assert pours_needed([[0.5, 0.2, 0.1], [0.5, 0.2, 0.1]], 0.2).mean == 2
+    assert pours_needed([[0.5, 0.2, 0.1]], 0.05).mean == 4
+
+
+def test_pours_without_a_loss_and_curves_of_different_lengths() -> None:
+    assert running_least([math.nan, 0.3, 0.4, 0.1])[1:] == [0.3, 0.3, 0.1]
+    assert at_pour([[0.3], [0.4, 0.2]], 2) == [0.3, 0.2]
+
+
+def test_only_the_compared_level_enters_the_comparison(study: StudyPlan) -> None:
+    results = {cell.id: made_up(cell) for cell in cells_of(study)}
+    assert len(gather(study, results).calibrated["C4"].test) == 2
