@@ -75,8 +75,8 @@ def targets(pours: Sequence[Record]) -> str:
 {speed_table}
 {about}
 
-Speed counts only with the physics right. Other solvers have .92, .64 and .29 left in the pourer at these times and
-within .03 of that is right; density inside is that of Voronoi cells in the tilted cup at 1 s.
+Speed counts only with the physics right. Infinitely fine particles have .945, .675 and .31 left in the pourer at these
+times, and within .01 of that is right; density inside is that of Voronoi cells in the tilted cup at 1 s.
 
 {physics_table}
 {settings(pours)}"""
