@@ -64,6 +64,7 @@ def write_inputs(folder: Path) -> None:
     spoil("heavy.yaml", "mass: 100 g", "mass: 120 g")
     spoil("close.yaml", "[60 mm, 100 mm]", "[10 mm, 12 mm]")
     spoil("unwritable.yaml", "directory: runs", "directory: beaker.yaml/runs")
+    spoil("passwd.yaml", "directory: runs", "directory: /etc/passwd")
     start, end = small.CAMPAIGN.index("calibration:"), small.CAMPAIGN.index("deployment:")
     uncalibrated = small.CAMPAIGN[:start] + small.CAMPAIGN[end:]
     spoil("plan-only.yaml", "[0 N/m, 0.1 N/m]", "0.05 N/m", uncalibrated)
@@ -117,8 +118,9 @@ BAD: dict[str, str] = {
     "plan calibrate-only.yaml": "calibrate-only.yaml: has no 'deployment' section",
     # vessels and scenes
     "run heavy.yaml": "narrow holds 113.1 mL to the brim, 120.2 mL asked for",
-    "calibrate unwritable.yaml": "beaker.yaml/runs: can't be written: Not a directory",
-    "plan unwritable.yaml": "beaker.yaml/runs: can't be written: Not a directory",
+    "calibrate unwritable.yaml": "beaker.yaml/runs can't be written: ",
+    "plan unwritable.yaml": "unwritable.yaml:32:22: outputs.directory: ",
+    "validate passwd.yaml": "passwd.yaml:32:22: outputs.directory: /etc/passwd can't be written: /etc/passwd is a file",
     "run close.yaml": "deployment.actions: deployment into 'narrow': the vessels touch at every action that was",
     "run open-mesh.yaml": "open.stl: not watertight: 3 edge(s)",
     "run solid-mesh.yaml": "solid.stl: no cavity: the mesh is one closed skin",
