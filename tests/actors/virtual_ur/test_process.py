@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from actors.virtual_ur import VirtualController, VirtualControllerError
+from tests.depth import examples
 
 from .conftest import next_address
 
@@ -121,7 +122,7 @@ def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
 sizes = st.integers(0, 70_000)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(port=st.sampled_from((*PORTS, 0)), data=st.one_of(st.binary(max_size=200), sizes.map(os.urandom)))
 def test_no_bytes_on_any_port_bring_it_down(shared: VirtualController, port: int, data: bytes) -> None:
     try:

@@ -14,6 +14,7 @@ from actors.virtual_ur.commands.maths import COMMANDS
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.lexer import KEYWORDS, Splitter
 from actors.virtual_ur.urscript.program import Command, Program, Steps
+from tests.depth import examples
 
 from .conftest import Bench
 
@@ -306,7 +307,7 @@ words = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(text=st.lists(words, max_size=40).map(" ".join))
 def test_any_words_are_a_program_or_an_error(text: str) -> None:
     with contextlib.suppress(ScriptError):
@@ -315,7 +316,7 @@ def test_any_words_are_a_program_or_an_error(text: str) -> None:
             run.program.tick()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(text=st.text(max_size=200))
 def test_any_text_is_a_program_or_an_error(text: str) -> None:
     with contextlib.suppress(ScriptError):
