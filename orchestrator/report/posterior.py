@@ -97,7 +97,7 @@ def draw_posterior(path: Path, posterior: Mapping[str, Any], space: Space, theta
 def _histogram(panel: Axes, axis: Axis, posterior: Mapping[str, Any], theta: Mapping[str, float]) -> None:
     steps = np.geomspace if axis.scale == "log" else np.linspace
     values = [draw[axis.name] for draw in posterior["thetas"]]
-    panel.hist(values, bins=steps(axis.lower, axis.upper, BINS + 1), color=style.GREY)
+    panel.hist(values, bins=steps(axis.lower, axis.upper, BINS + 1).tolist(), color=style.GREY)
     name = f"{100 * posterior['level']:.0f} % of the draws"
     panel.axvspan(*posterior["region"][axis.name], color=style.MEASURED, alpha=0.18, linewidth=0.0, label=name)
     panel.axvline(theta[axis.name], color=style.BEST, linewidth=1.8, label="θ*")
