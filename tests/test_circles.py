@@ -1,4 +1,4 @@
-"""No two files need each other, directly or around corners: each can be read, tested and replaced after those below it."""
+"""No two files need each other, directly or around corners: each can be read and tested after those below it."""
 
 from __future__ import annotations
 
