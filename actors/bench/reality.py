@@ -25,7 +25,7 @@ from actors.bench.virtual_operator import Hands
 from actors.bench.world import ATTEMPTS, draw_pose_error, spill_of, stream
 from actors.protocols import InvalidActionError, LaboratoryError, SimulatorPool
 from sim_engine.action import Action
-from sim_engine.motion import SampledMotion
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import PoseError, PourTask, Scene
 
 AT_START = 2e-3

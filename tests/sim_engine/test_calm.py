@@ -15,8 +15,9 @@ from sim_engine.action import DEG, Action
 from sim_engine.calm import CALM, FREEBOARD, STEP, calm_until, liquid_velocity, wave_height
 from sim_engine.hydrostatics import level
 from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.motion import SampledMotion, plan_motion
+from sim_engine.motion import plan_motion
 from sim_engine.pour import PourSimulator
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid
-from sim_engine.motion import PourMotion, SampledMotion, plan_motion
+from sim_engine.motion import PourMotion, plan_motion
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Pivot, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder

@@ -15,8 +15,9 @@ from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.lip import FlowNumbers, bond, capillary_length
 from sim_engine.liquid import Liquid
-from sim_engine.motion import SampledMotion, plan_motion
+from sim_engine.motion import plan_motion
 from sim_engine.regimes import DRIBBLING_WEBER, VISCOUS_REYNOLDS, WETTING_BOND, Regimes, regimes
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Pivot, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder

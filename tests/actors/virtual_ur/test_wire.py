@@ -65,6 +65,7 @@ class Wire(asyncio.Transport):
     def say(self, data: bytes) -> None:
         if not self.cut:
             self._connection.data_received(data)
+            self._connection.connections.uploads.work(1.0)  # as the host does at its next wake-up
 
     def take(self) -> bytes:
         data = bytes(self.got)
