@@ -193,9 +193,9 @@ class _Checker:
 def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Problem]:
     """Build the vessels of a campaign and try its actions.
 
-    Runs must find a folder. Checked for every scene: both vessels can be built and hold the liquid; some action of the space tilts far enough
-    for the liquid to leave, and one lets the vessels stay clear of each other and can be made by the laboratory's arm
-    (middle, corners and a few drawn at random are tried); recorded pours stay clear.
+    Runs must find a folder. Checked for every scene: both vessels can be built and hold the liquid; some action of the
+    space tilts far enough for the liquid to leave, and one lets the vessels stay clear of each other and can be made by
+    the laboratory's arm (middle, corners and a few drawn at random are tried); recorded pours stay clear.
 
     Args:
         plan: of the campaign.

@@ -102,7 +102,7 @@ def write_inputs(folder: Path) -> None:
 BAD: dict[str, str] = {
     # files
     "run nowhere.yaml": "nowhere.yaml: no such file",
-    "run folder": "folder: is a directory; name a YAML file in it",
+    "run folder": "folder: is a directory; name a file in it",
     "run binary.yaml": "binary.yaml: is not text in UTF-8 (byte 128)",
     "run null.yaml": "null.yaml:2:7: not YAML: an unprintable character (code 0)",
     "run empty.yaml": "empty.yaml:1:1: the file is empty",
@@ -120,7 +120,7 @@ BAD: dict[str, str] = {
     "run heavy.yaml": "narrow holds 113.1 mL to the brim, 120.2 mL asked for",
     "calibrate unwritable.yaml": "beaker.yaml/runs can't be written: ",
     "plan unwritable.yaml": "unwritable.yaml:32:22: outputs.directory: ",
-    "validate passwd.yaml": "passwd.yaml:32:22: outputs.directory: /etc/passwd can't be written: /etc/passwd is a file",
+    "calibrate passwd.yaml": "passwd.yaml:32:22: outputs.directory: /etc/passwd can't be written: /etc/passwd is a file",
     "run close.yaml": "deployment.actions: deployment into 'narrow': the vessels touch at every action that was",
     "run open-mesh.yaml": "open.stl: not watertight: 3 edge(s)",
     "run solid-mesh.yaml": "solid.stl: no cavity: the mesh is one closed skin",
