@@ -121,7 +121,7 @@ BAD: dict[str, str] = {
     "run heavy.yaml": "narrow holds 113.1 mL to the brim, 120.2 mL asked for",
     "calibrate unwritable.yaml": "beaker.yaml/runs can't be written: ",
     "plan unwritable.yaml": "unwritable.yaml:32:22: outputs.directory: ",
-    "calibrate passwd.yaml": "passwd.yaml:32:22: outputs.directory: /etc/passwd can't be written: /etc/passwd is a file",
+    "calibrate passwd.yaml": "passwd.yaml:32:22: outputs.directory: /etc/passwd can't be written: /etc/passwd is",
     "run close.yaml": "deployment.actions: deployment into 'narrow': the vessels touch at every action that was",
     "run open-mesh.yaml": "open.stl: not watertight: 3 edge(s)",
     "run solid-mesh.yaml": "solid.stl: no cavity: the mesh is one closed skin",
