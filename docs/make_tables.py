@@ -19,12 +19,12 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from orchestrator.config import vessel
+from orchestrator.config.campaign import sections as campaign
 from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
-from orchestrator.config.campaign.sections import sections as campaign
-from orchestrator.config.laboratory.sections import arm_sections, cluster, operator
-from orchestrator.config.laboratory.sections import sections as laboratory
-from orchestrator.config.study.sections import sections as study
+from orchestrator.config.laboratory import arm_sections, cluster, operator
+from orchestrator.config.laboratory import sections as laboratory
+from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Section
 from orchestrator.report.physics import kept_records
