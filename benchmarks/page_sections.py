@@ -8,6 +8,7 @@ from typing import Any
 
 import core_limit
 import page_figures
+from standard_pour import LEFT, LEFT_LIMIT
 
 TARGETS = {2_000: (1.5, 0.6), 5_000: (5.0, 2.0), 10_000: (12.0, 5.0)}
 """Required and aimed-at CPU seconds of the standard pour, by particles."""
@@ -312,9 +313,10 @@ def verdict(cpu_s: float, required: float | None, aim: float | None) -> str:
 
 
 def _physics(result: Record) -> tuple[str, ...]:
-    left = tuple(f"{value:.3f}" for value in result["left"].values())
-    word = "right" if result["left_is_right"] else "**off**"
-    return (*left, word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
+    left = tuple(result["left"].values())
+    off = max(abs(value - reference) for value, reference in zip(left, LEFT, strict=True))
+    word = "right" if off <= LEFT_LIMIT else "**off**"
+    return (*(f"{value:.3f}" for value in left), word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
 
 
 def _words(key: str) -> str:

@@ -42,7 +42,7 @@ TIMES = (2.3, 2.7, 3.1)
 LEFT = (0.945, 0.675, 0.31)
 """What infinitely fine particles have left in the pourer at `TIMES`: several solvers extrapolate to it within .003 …"""
 LEFT_LIMIT = 0.01
-"""… and what is off by more than this is called so."""
+"""… and what is off by more than this is called so, ours as theirs."""
 
 REST = 1.0
 """When the density is looked at: the cup is tilted by 30° and nothing flows yet [s]."""

@@ -179,7 +179,12 @@ def convergence(
         off = np.abs(found[:, column] - limits)
         for row, pour in enumerate(chosen):
             measurements.append(
-                reported(f"spilled over poured, {pour.name}", float(found[row, column]), limits[row], particles=n)
+                reported(
+                    f"spilled over poured, {pour.name}",
+                    float(found[row, column]),
+                    reference=float(limits[row]),
+                    particles=n,
+                )
             )
         mean, largest = TOLERANCES.get(n, (0.02, 0.04))
         name = f"distance from the limit, mean of {len(chosen)} pours"

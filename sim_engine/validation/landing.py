@@ -130,8 +130,7 @@ def compared(
         for n, here in found.items():
             middles = [float(np.median(part)) for part in np.array_split(here.times, 12)]
             places = [1e3 * float(np.median(part)) for part in np.array_split(here.away, 12)]
-            kind = "reference" if n == finest else "measured"
-            curves.append(Series(f"{n:,} particles", tuple(middles), tuple(places), kind, panel))
+            curves.append(Series(f"{n:,} particles", tuple(middles), tuple(places), panel=panel))
     figure = Figure(
         tuple(f"Turned at {speed:g} °/s" for speed in SPEEDS),
         ("time [s]",) * len(SPEEDS),
