@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from orchestrator.report import style
+from orchestrator.strategies.calibration.posterior import PosteriorFound
 from sim_engine.space import Space
 
 BINS = 18
 
 
-def draw_posterior(path: Path, posterior: Mapping[str, Any], space: Space, theta: Mapping[str, float]) -> Path:
+def draw_posterior(path: Path, posterior: PosteriorFound, space: Space, theta: Mapping[str, float]) -> Path:
     """One histogram per searched parameter with its region, one cloud per pair, θ* marked; logarithmic axes as such.
 
     Args:
@@ -29,14 +30,12 @@ def draw_posterior(path: Path, posterior: Mapping[str, Any], space: Space, theta
     Raises:
         ValueError: there are no draws.
     """
-    draws = posterior["thetas"]
+    draws = posterior.thetas
     if not draws:
         raise ValueError("posterior figure: no draws of θ")
     axes, d = space.axes, space.dimension
     figure, panels = style.new_figure(d, d, size=(1.6 + 2.3 * d, 1.4 + 2.2 * d), squeeze=False)
-    title = (
-        f"θ that fit the pours: {len(draws)} draws, worth {posterior['effective']:.0f}; bars: {posterior['level']:.0%}"
-    )
+    title = f"θ that fit the pours: {len(draws)} draws, worth {posterior.effective:.0f}; bars: {posterior.level:.0%}"
     figure.suptitle(title, fontsize=12, color=style.INK, x=0.02, ha="left")
     for row, up in enumerate(axes):
         for column, across in enumerate(axes):
@@ -50,7 +49,7 @@ def draw_posterior(path: Path, posterior: Mapping[str, Any], space: Space, theta
             if row == column:
                 edges = _edges(across.lower, across.upper, across.scale)
                 panel.hist(x, bins=edges, color=style.PALE)
-                panel.axvspan(*posterior["region"][across.name], color=style.MEASURED, alpha=0.18, linewidth=0.0)
+                panel.axvspan(*posterior.region[across.name], color=style.MEASURED, alpha=0.18, linewidth=0.0)
                 panel.set_yticks([])
             else:
                 panel.plot(x, [draw[up.name] for draw in draws], ".", color=style.MEASURED, markersize=3, alpha=0.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from orchestrator.report import style
 from orchestrator.report.units import LossUnit
+from orchestrator.strategies.deployment.pours import Foretold
+from orchestrator.strategies.deployment.trust import Compared, Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,24 +24,24 @@ FOLLOWED = {
 """What followed on an alarm, in words."""
 
 
-def trust_line(trust: Mapping[str, Any]) -> str | None:
+def trust_line(trust: Compared | Foretold) -> str | None:
     """What people should know of a comparison: what was wrong by how much, and what followed; None where nothing was.
 
     Args:
         trust: of a deployment's result.
     """
-    if not trust.get("alarm"):
+    if not trust.alarm:
         return None
-    text = "the first pours were far from what was predicted; the simulator may not fit this vessel"
-    if "followed" not in trust:  # a run that only tells
-        return text
+    if isinstance(trust, Foretold):  # a run that only tells
+        return "the first pours were far from what was predicted; the simulator may not fit this vessel"
     text = "the first pours were worse than simulated; the simulator may not fit this vessel"
-    followed = trust["followed"]
-    what = "nobody has said yet how to go on" if followed is None else f"after pour {_last(trust)} {FOLLOWED[followed]}"
-    return f"{text} (by {trust['mean_z']:.1f} deviations in the mean, limit {trust['limit']:g}); {what}"
+    what = "nobody has said yet how to go on"
+    if trust.followed is not None:
+        what = f"after pour {trust.pours[-1].number} {FOLLOWED[trust.followed]}"
+    return f"{text} (by {trust.mean_z:.1f} deviations in the mean, limit {trust.limit:g}); {what}"
 
 
-def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver: str) -> Path:
+def draw_trust(path: Path, trust: Compared, *, unit: LossUnit, receiver: str) -> Path:
     """First pours beside what the simulations alone say of their actions, and the distance in standard deviations.
 
     Args:
@@ -54,25 +56,25 @@ def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver
     Raises:
         ValueError: nothing was compared.
     """
-    pours = trust.get("pours") or []
+    pours = trust.pours
     if not pours:
         raise ValueError("trust figure: no pour was compared with the simulations")
     figure, (left, right) = style.new_figure(1, 2, size=(8.2, 3.9))
-    if trust["alarm"]:
+    if trust.alarm:
         verdict = "the simulator is wrong here"
     else:
-        verdict = "better than simulated" if trust.get("better") else "the simulator is borne out"
+        verdict = "better than simulated" if trust.better else "the simulator is borne out"
     figure.suptitle(
         f"First pours against simulation: {receiver}: {verdict}", fontsize=12.5, color=style.INK, x=0.02, ha="left"
     )
-    numbers = np.array([pour["number"] for pour in pours])
+    numbers = np.array([pour.number for pour in pours])
     _losses(left, numbers, pours, unit)
     style.dress(left, title="weighed and simulated", x="pour", y=unit.label)
-    limit, z = trust["limit"], trust["z_scores"]
+    limit, z = trust.limit, trust.z_scores
     right.bar(numbers, z, 0.5, color=[style.BEST if value > limit else style.GOOD for value in z])
     right.axhline(limit, color=style.INK, linewidth=1.0, linestyle="--", label=f"limit {limit:g}")
-    mean = f"mean, better counts as 0: {trust['mean_z']:.1f}"
-    right.axhline(trust["mean_z"], color=style.MEASURED, linewidth=1.6, label=mean)
+    mean = f"mean, better counts as 0: {trust.mean_z:.1f}"
+    right.axhline(trust.mean_z, color=style.MEASURED, linewidth=1.6, label=mean)
     right.axhline(0.0, color=style.INK, linewidth=0.8)
     _legend_above(right)
     right.set_xticks(numbers)
@@ -80,10 +82,10 @@ def draw_trust(path: Path, trust: Mapping[str, Any], *, unit: LossUnit, receiver
     return style.save(figure, path)
 
 
-def _losses(axes: Axes, numbers: Any, pours: list[dict[str, Any]], unit: LossUnit) -> None:
-    simulated = unit.factor * np.array([pour["simulated"] for pour in pours])
-    deviation = unit.factor * np.array([pour["deviation"] for pour in pours])
-    weighed = unit.factor * np.array([pour["weighed"] for pour in pours])
+def _losses(axes: Axes, numbers: Any, pours: Sequence[Comparison], unit: LossUnit) -> None:
+    simulated = unit.factor * np.array([pour.simulated for pour in pours])
+    deviation = unit.factor * np.array([pour.deviation for pour in pours])
+    weighed = unit.factor * np.array([pour.weighed for pour in pours])
     down = np.minimum(2 * deviation, simulated)  # nothing is spilled less than not at all
     axes.errorbar(
         numbers, simulated, yerr=np.vstack([down, 2 * deviation]), fmt="_", markersize=9, elinewidth=6.0,
@@ -100,7 +102,3 @@ def _legend_above(axes: Axes) -> None:
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))
     axes.legend(fontsize=8.5, frameon=False, loc="upper right")
-
-
-def _last(trust: Mapping[str, Any]) -> int:
-    return int(trust["pours"][-1]["number"])

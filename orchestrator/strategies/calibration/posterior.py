@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from actors.optimizer.core.problem import Posterior
+from orchestrator.strategies.learnt import Part
 from sim_engine.space import Space
 
 LEVEL = 0.9
@@ -25,10 +26,57 @@ _PART = 0.35
 """Component of a unit direction from which a parameter belongs to it."""
 
 
-def posterior_result(posterior: Posterior, space: Space) -> dict[str, object]:
-    """JSON-ready: mean, 90 % region per parameter, correlations, open directions in words, and the draws.
+class RemainingDiscrepancy(Part):
+    """How far θ that fit stay from the pours: the region's ends and the median of mean |r − c_s|."""
+
+    low: float
+    median: float
+    high: float
+
+
+class PosteriorSummary(Part):
+    """Which θ fit the weighed pours, without the draws.
 
     Correlations and directions are those of the searched box' unit cube, where logarithmic axes are by their logarithm.
+    """
+
+    level: float
+    """Share of the posterior in the regions."""
+
+    mean: dict[str, float]
+    """Mean of the draws."""
+
+    region: dict[str, tuple[float, float]]
+    """Both ends of each parameter's region."""
+
+    open: tuple[str, ...]
+    """Parameters of which the pours say next to nothing."""
+
+    correlation: tuple[tuple[float, ...], ...]
+    """Rows and columns in the parameters' order."""
+
+    directions: tuple[str, ...]
+    """What is left open, in words."""
+
+    remaining_discrepancy: RemainingDiscrepancy
+
+    effective: float
+    """How many independent draws they are worth."""
+
+
+class PosteriorFound(PosteriorSummary):
+    """Which θ fit the weighed pours."""
+
+    thetas: tuple[dict[str, float], ...]
+    """Draws of the searched parameters, of equal weight."""
+
+    def summary(self) -> PosteriorSummary:
+        """The same without the draws."""
+        return PosteriorSummary.model_validate(self.model_dump(exclude={"thetas"}))
+
+
+def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
+    """What draws of a posterior say.
 
     Args:
         posterior: draws in the unit cube.
@@ -39,17 +87,19 @@ def posterior_result(posterior: Posterior, space: Space) -> dict[str, object]:
     lower, upper, names = space.decode(tuple(low)), space.decode(tuple(high)), space.names
     correlation = _correlation(points)
     lacking = np.quantile(posterior.discrepancies, [(1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2])
-    return {
-        "level": LEVEL,
-        "mean": space.decode(tuple(points.mean(axis=0))),
-        "region": {name: [lower[name], upper[name]] for name in names},
-        "open": [name for name, width in zip(names, high - low, strict=True) if width > WIDE * LEVEL],
-        "correlation": correlation.tolist(),
-        "directions": directions(points, names),
-        "remaining_discrepancy": dict(zip(("low", "median", "high"), map(float, lacking), strict=True)),
-        "effective": posterior.effective,
-        "thetas": [space.decode(tuple(point)) for point in posterior.points],
-    }
+    return PosteriorFound(
+        level=LEVEL,
+        mean=space.decode(tuple(points.mean(axis=0))),
+        region={name: (lower[name], upper[name]) for name in names},
+        open=tuple(name for name, width in zip(names, high - low, strict=True) if width > WIDE * LEVEL),
+        correlation=tuple(tuple(row) for row in correlation.tolist()),
+        directions=tuple(directions(points, names)),
+        remaining_discrepancy=RemainingDiscrepancy(
+            low=float(lacking[0]), median=float(lacking[1]), high=float(lacking[2])
+        ),
+        effective=posterior.effective,
+        thetas=tuple(space.decode(tuple(point)) for point in posterior.points),
+    )
 
 
 def directions(points: Any, names: tuple[str, ...]) -> list[str]:

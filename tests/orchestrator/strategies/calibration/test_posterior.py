@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.commands.campaigns import theta_file
 from orchestrator.config.load import load_parameters, load_posterior
 from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.publish import theta_file
 from orchestrator.report.posterior import draw_posterior
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.design import MeasuredPour
@@ -36,7 +36,7 @@ def summed(action: Any, theta: SimulationParameters, rng: np.random.Generator) -
     return float(0.1 + 0.5 * speed * both + 0.005 * rng.standard_normal())
 
 
-def calibrated(spill: Any, truth: Any, seed: int = 0, **changes: Any) -> dict[str, Any]:
+def calibrated(spill: Any, truth: Any, seed: int = 0, **changes: Any) -> Any:
     rng = np.random.default_rng(seed)
     pours = []
     for _ in range(16):
@@ -48,27 +48,27 @@ def calibrated(spill: Any, truth: Any, seed: int = 0, **changes: Any) -> dict[st
 
 
 @pytest.fixture(scope="module")
-def determined() -> dict[str, Any]:
+def determined() -> Any:
     return calibrated(calibration_spill, weighed, 1)
 
 
 @pytest.fixture(scope="module")
-def tied() -> dict[str, Any]:
+def tied() -> Any:
     truth = SimulationParameters(cohesion=0.05, friction=0.25)
     return calibrated(
         summed, lambda action, _, rng: summed(action, truth, rng), parameters=TIED, fixed_parameters={"particles": 2000}
     )
 
 
-def test_the_region_holds_the_truth_and_is_smaller_than_what_was_searched(determined: dict[str, Any]) -> None:
-    posterior = determined["posterior"]
+def test_the_region_holds_the_truth_and_is_smaller_than_what_was_searched(determined: Any) -> None:
+    posterior = determined.found.posterior
     assert json.loads(json.dumps(posterior, allow_nan=False)) == posterior
-    for name, (low, high) in posterior["region"].items():
+    for name, (low, high) in posterior.region.items():
         assert low <= getattr(TRUE_THETA, name) <= high, name
         assert PARAMETERS.contains({**PARAMETERS.decode((0.5, 0.5)), name: low})
-    low, high = posterior["region"]["particles"]
+    low, high = posterior.region["particles"]
     assert np.log(high / low) < 0.7 * np.log(8)
-    assert posterior["effective"] > 50
+    assert posterior.effective > 50
 
 
 @pytest.mark.slow
@@ -76,19 +76,19 @@ def test_regions_of_nine_tenths_mostly_hold_the_truth() -> None:
     """θ* itself often lies far along the ridge on which the toy's two parameters make up for each other."""
     held = []
     for seed in range(8):
-        region = calibrated(calibration_spill, weighed, seed)["posterior"]["region"]
+        region = calibrated(calibration_spill, weighed, seed).found.posterior.region
         held += [low <= getattr(TRUE_THETA, name) <= high for name, (low, high) in region.items()]
     assert sum(held) >= 12  # of 16; fewer than that has a chance of 2 % if nine in ten held
 
 
-def test_parameters_that_make_up_for_each_other_are_named(tied: dict[str, Any]) -> None:
-    posterior = tied["posterior"]
-    said = " ".join(posterior["directions"])
+def test_parameters_that_make_up_for_each_other_are_named(tied: Any) -> None:
+    posterior = tied.found.posterior
+    said = " ".join(posterior.directions)
     assert "cohesion and friction make up for each other: more of one, less of the other" in said
-    sums = [0.5 * (t["cohesion"] / 0.1 + t["friction"] / 0.5) for t in posterior["thetas"]]
+    sums = [0.5 * (t["cohesion"] / 0.1 + t["friction"] / 0.5) for t in posterior.thetas]
     low, high = np.quantile(sums, [0.05, 0.95])
     assert low <= 0.5 <= high
-    apart = np.ptp(np.quantile([t["cohesion"] / 0.1 for t in posterior["thetas"]], [0.05, 0.95]))
+    apart = np.ptp(np.quantile([t["cohesion"] / 0.1 for t in posterior.thetas], [0.05, 0.95]))
     assert high - low < 0.6 * apart  # the sum is known, neither of the two is
 
 
@@ -104,27 +104,27 @@ def test_open_directions_are_put_into_words() -> None:
     assert directions(0.5 + 0.01 * rng.standard_normal((500, 2)), ("friction", "cohesion")) == []
 
 
-def test_theta_file_carries_the_posterior_and_can_still_be_planned_with(
-    determined: dict[str, Any], tmp_path: Path
-) -> None:
-    content = theta_file(determined)
+def test_theta_file_carries_the_posterior_and_can_still_be_planned_with(determined: Any, tmp_path: Path) -> None:
+    content = theta_file(determined.found)
     path = tmp_path / "theta.json"
     path.write_text(json.dumps(content), encoding="utf-8")
-    assert load_parameters(path) == SimulationParameters.model_validate(determined["theta"])
+    assert load_parameters(path) == determined.found.theta
     assert len(content["posterior"]) >= 50
     assert sum(one["weight"] for one in content["posterior"]) == pytest.approx(1.0)
     for one in content["posterior"]:
         assert SimulationParameters.model_validate(one["theta"]).friction == 0.1  # what was fixed stays so
 
 
-def test_the_posterior_is_drawn(determined: dict[str, Any], tmp_path: Path) -> None:
-    path = draw_posterior(tmp_path / "posterior.png", determined["posterior"], PARAMETERS, determined["theta"])
+def test_the_posterior_is_drawn(determined: Any, tmp_path: Path) -> None:
+    path = draw_posterior(
+        tmp_path / "posterior.png", determined.found.posterior, PARAMETERS, determined.found.theta.model_dump()
+    )
     assert is_picture(path)
 
 
-def test_a_prediction_takes_turns_with_thetas_of_the_posterior(determined: dict[str, Any], tmp_path: Path) -> None:
+def test_a_prediction_takes_turns_with_thetas_of_the_posterior(determined: Any, tmp_path: Path) -> None:
     path = tmp_path / "theta.json"
-    path.write_text(json.dumps(theta_file(determined)), encoding="utf-8")
+    path.write_text(json.dumps(theta_file(determined.found)), encoding="utf-8")
     thetas = load_posterior(path, 4)
     assert len(set(thetas)) > 1
     action = SCENE.action({"angular_velocity": 80 * DEG, "max_angle": 100 * DEG})
@@ -133,8 +133,8 @@ def test_a_prediction_takes_turns_with_thetas_of_the_posterior(determined: dict[
     played = Play(calibration_spill)(several)
     assert [request.parameters for request in played.simulations] == [*thetas, *thetas]
     Play(calibration_spill)(one)
-    spreads: Any = [strategy.result()["over_seeds"] for strategy in (one, several)]
-    assert spreads[1]["spilled"]["deviation"] > spreads[0]["spilled"]["deviation"]
+    spreads: Any = [strategy.result().over_seeds for strategy in (one, several)]
+    assert spreads[1]["spilled"].deviation > spreads[0]["spilled"].deviation
 
 
 def test_thetas_are_drawn_by_their_weights_and_a_file_without_them_says_so(tmp_path: Path) -> None:
