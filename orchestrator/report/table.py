@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.occupancy import occupancy_lines
+from orchestrator.report.posterior import posterior_lines
 from orchestrator.report.results import SPLITS
 from orchestrator.report.risk import risk_line, window_line
 from orchestrator.report.summary import ReceiverSummary, RunSummary
@@ -29,7 +30,7 @@ def summary_table(plan: CampaignPlan, summary: RunSummary) -> RenderableType:
     from rich.text import Text
 
     parts: list[RenderableType] = [Text(f"\n{summary.campaign}  seed {summary.seed}", style="bold")]
-    parts += _theta_lines(summary)
+    parts += _theta_lines(plan, summary)
     discrepancies = {split: row for split, row in summary.discrepancy.items() if _has_numbers(row.values())}
     if discrepancies:
         parts.append(_discrepancy_table(discrepancies))
@@ -49,7 +50,7 @@ def summary_table(plan: CampaignPlan, summary: RunSummary) -> RenderableType:
     return Group(*parts)
 
 
-def _theta_lines(summary: RunSummary) -> list[RenderableType]:
+def _theta_lines(plan: CampaignPlan, summary: RunSummary) -> list[RenderableType]:
     from rich.text import Text
 
     if summary.theta is None:
@@ -58,16 +59,10 @@ def _theta_lines(summary: RunSummary) -> list[RenderableType]:
     if summary.predicted_discrepancy is not None:
         expected = DISCREPANCY.text(summary.predicted_discrepancy, summary.predicted_deviation or 0.0)
         text.append(f"   expected |Δ| {expected}", style="dim")
-    posterior = summary.posterior
-    if posterior is None:
+    if summary.posterior is None or plan.calibration is None:
         return [text]
-    regions = [
-        f"{name.replace('_', ' ')} {style.display_value(name, low)} … {style.display_value(name, high)}"
-        + (" (open)" if name in posterior.open else "")
-        for name, (low, high) in posterior.region.items()
-    ]
-    fitting = f"{100 * posterior.level:.0f} % of θ that fit the pours: {', '.join(regions)}"
-    return [text, *(Text(f"  {line}", style="dim") for line in (fitting, *posterior.directions))]
+    lines = posterior_lines(summary.posterior, plan.calibration.parameters)
+    return [text, *(Text(f"  {line}", style="dim") for line in lines)]
 
 
 def _has_losses(row: ReceiverSummary) -> bool:

@@ -258,6 +258,10 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
         return
     assert isinstance(outcome, UnknownPourError), outcome
     assert stage.heard.index("recover") < stage.heard.index("untilt")
+    if name == "reboot":  # which forgets what the arm did: nobody may make up what became of the liquid
+        assert "can't tell what became of the liquid" in str(outcome)
+        assert "weighed, spilled:" not in stage.said("note")
+        return
     for key in ("pourer_full", "spilled", "pourer_after"):
         assert f"weighed, {key}:" in stage.said("note")
         assert key in str(outcome)

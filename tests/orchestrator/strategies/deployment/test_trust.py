@@ -105,7 +105,7 @@ def test_a_wrong_simulator_is_forgotten_from_the_alarm_on() -> None:
     assert alarm[0].text.startswith("trust alarm: weighed for simulated")
     trust = strategy.result().trust
     assert (trust.alarm, trust.followed) == (True, "D2")
-    assert json.loads(json.dumps(trust, allow_nan=False)) == trust
+    assert type(trust).model_validate_json(trust.model_dump_json()) == trust
     done, total = strategy.progress()
     assert done == total
 
@@ -281,5 +281,4 @@ def test_an_alarm_is_drawn_and_told(tmp_path: Path) -> None:
     assert "after pour 3 its simulations were forgotten" in line
     nothing = TrustCheck(TrustPlan(), worst=1.0).result()
     with pytest.raises(ValueError, match="no pour was compared"):
-        draw_trust(tmp_path / "nothing.png", nothing, unit=deployment_unit(plan.deployment), receiver="cup"),
-        )
+        draw_trust(tmp_path / "nothing.png", nothing, unit=deployment_unit(plan.deployment), receiver="cup")
