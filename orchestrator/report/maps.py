@@ -223,7 +223,7 @@ def _bar(figure: Figure, axes: Axes, mesh: Any, label: str) -> None:
     bar = figure.colorbar(mesh, ax=axes, fraction=0.05, pad=0.03)
     bar.set_label(label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     bar.locator = MaxNLocator(6)
     bar.update_ticks()
 
