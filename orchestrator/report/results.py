@@ -13,7 +13,7 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries
 from orchestrator.report.maps import SurrogatePicture
 from orchestrator.report.names import receiver_name
-from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
+from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
 from orchestrator.results import Results
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
@@ -103,6 +103,7 @@ def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePict
         points=[theta for theta, _ in known],
         costs=[DISCREPANCY.factor * discrepancy for _, discrepancy in known],
         best=None if result.found is None else result.found.theta.model_dump(),
+        largest=DISCREPANCY.factor,
         **_surrogate(shown, DISCREPANCY),
     )
 
@@ -124,6 +125,8 @@ def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture
         best=None if result.recommended is None else result.recommended.action_si,
         best_name="best action",
         numbers=[pour.number for pour, _ in known],
+        simulated=[one.action_si for one in result.simulated],
+        largest=unit.factor * largest_loss(plan.deployment),
         **_surrogate(result.map, unit),
     )
 

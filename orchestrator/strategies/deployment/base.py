@@ -25,7 +25,7 @@ from orchestrator.requests import (
 from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.deployment.compromise import Compromise
 from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.learnt import Deployed, Recommended, RiskFound
+from orchestrator.strategies.deployment.learnt import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.deployment.pours import Foretold, PourTrial, former_pours, trust
 from orchestrator.strategies.deployment.trust import Compared
@@ -339,6 +339,11 @@ class Deployment(ABC):
             simulations_lost=self._trials.lost,
             simulations_refused=sum(trial.refused for trial in self._trials.all),
             pours=tuple(p.row(names) for p in self._pours if p.status != "pouring"),
+            simulated=tuple(
+                SimulatedAction(action_si=self._plan.actions.decode(trial.point), loss=trial.cost)
+                for trial in self._trials.all
+                if trial.closed and trial.cost is not None
+            ),
             former_pours=len(self._former),
             refused_pours=self._refused,
             failed_pours=sum(p.status == "failed" for p in self._pours),

@@ -78,6 +78,16 @@ class FrontAction(Part):
     """How well each is known."""
 
 
+class SimulatedAction(Part):
+    """An action that was simulated, and what came of it."""
+
+    action_si: dict[str, float]
+    """Searched dimensions [SI]."""
+
+    loss: float
+    """Mean over its simulations, in the loss' own unit."""
+
+
 class Deployed(Learnt):
     """What a deployment has learnt in one scene."""
 
@@ -103,6 +113,9 @@ class Deployed(Learnt):
 
     pours: tuple[PourRow, ...]
     """All that are over, in the order made."""
+
+    simulated: tuple[SimulatedAction, ...]
+    """Actions whose simulations gave a loss, in the order of asking."""
 
     former_pours: int
     """Pours of before the campaign that it learnt from."""

@@ -136,6 +136,7 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
         simulations_lost=0,
         simulations_refused=0,
         pours=tuple(pours),
+        simulated=(),
         former_pours=0,
         refused_pours=1,
         failed_pours=0,

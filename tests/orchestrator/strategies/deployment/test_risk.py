@@ -244,7 +244,8 @@ def test_thetas_of_the_calibration_before_are_borne_and_a_campaign_without_says_
     result: Any = strategy.result()
     assert result.risk.expected > true_losses(result.recommended.action_si).mean() + 0.1  # mean cohesion costs 0.2
     with pytest.raises(RunError, match="C4"):
-        with_posterior(plan, {"calibration": {"theta": {}}})
+        pointless = found.model_copy(update={"posterior": None})
+        with_posterior(plan, {"calibration": calibrated.model_copy(update={"found": pointless})})
 
 
 def test_a_prediction_bears_the_errors_and_counts_cups_that_touch_as_the_worst() -> None:
