@@ -21,6 +21,7 @@ from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder
+from tests.depth import examples
 
 SCENE = Scene(
     "calm",
@@ -48,7 +49,7 @@ def begin(speed: float, max_angle: float = 120.0) -> float:
     return calm_until(plan_motion(SCENE, action(speed, max_angle), POURER, RECEIVER), POURER, VOLUME)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.floats(5.0, 180.0))
 def test_nothing_is_near_the_lip_when_the_simulation_begins(speed: float) -> None:
     start = begin(speed)

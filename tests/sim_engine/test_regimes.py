@@ -21,6 +21,7 @@ from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Pivot, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder
+from tests.depth import examples
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.1)
 GLASS = cylinder("glass", inner_radius=0.045, inner_height=0.09)
@@ -78,7 +79,7 @@ def test_water_in_the_standard_pour_has_the_numbers_of_its_flow() -> None:
 factors = st.floats(0.2, 5.0)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(factors, factors, factors)
 def test_liquids_of_one_volume_flow_alike_and_only_their_numbers_scale(
     heavier: float, tenser: float, thicker: float

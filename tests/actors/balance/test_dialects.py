@@ -15,6 +15,7 @@ from actors.balance.dialects.mt_sics import MT_SICS
 from actors.balance.dialects.sbi import SBI, Sbi
 from actors.balance.doors import dialects
 from actors.balance.reading import Acknowledgement, Answer, FrameError, Reading, Status
+from tests.depth import examples
 
 SPEAKERS: tuple[Dialect, ...] = (*dialects().values(), KernSwt(short=True), Sbi(identified=True))
 
@@ -74,7 +75,7 @@ def test_answers_to_commands_are_told_from_weights(line, command, answer):
 
 
 @pytest.mark.parametrize("dialect", SPEAKERS, ids=lambda d: d.name)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(line=st.binary(max_size=40) | st.text('SDITAZ+-. 0123456789gkErohLwM[]"', max_size=22).map(str.encode))
 @example(line=b"")
 @example(line=b"S S 1e5 g")

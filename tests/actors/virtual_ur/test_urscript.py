@@ -17,6 +17,7 @@ from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.lexer import KEYWORDS, Splitter
 from actors.virtual_ur.urscript.program import Command, Program, Steps, waiting
 from actors.virtual_ur.urscript.translate import translate
+from tests.depth import examples
 
 from .conftest import Bench
 
@@ -350,7 +351,7 @@ words = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(text=st.lists(words, max_size=40).map(" ".join))
 def test_any_words_are_a_program_or_an_error(text: str) -> None:
     with contextlib.suppress(ScriptError):
@@ -359,7 +360,7 @@ def test_any_words_are_a_program_or_an_error(text: str) -> None:
             run.program.tick()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(text=st.text(max_size=200))
 def test_any_text_is_a_program_or_an_error(text: str) -> None:
     with contextlib.suppress(ScriptError):
