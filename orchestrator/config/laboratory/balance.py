@@ -33,7 +33,7 @@ VIRTUAL_DIALECT = "kcp"
 """Spoken by a virtual balance unless another dialect is named."""
 
 
-DialectName: Any = Literal[tuple([AUTO, *dialects()])]  # what is installed, ours as everybody's
+DialectName: Any = Literal[(AUTO, *dialects())]  # what is installed, ours as everybody's
 
 
 class SettlingSection(Section):
