@@ -191,8 +191,8 @@ def figure_of(record: Mapping[str, Any]) -> Figure | None:
     if kept is None:
         return None
     series = [
-        Series(**{name: tuple(value) if isinstance(value, list) else value for name, value in one.items()})
-        for one in kept["series"]
+        Series(s["name"], tuple(s["x"]), tuple(s["y"]), s["kind"], s["panel"], tuple(s["spread"]))
+        for s in kept["series"]
     ]
     titles, x_labels, y_labels = (tuple(kept[name]) for name in ("titles", "x_labels", "y_labels"))
     log_x = kept["log_x"] if isinstance(kept["log_x"], bool) else tuple(kept["log_x"])
