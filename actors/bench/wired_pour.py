@@ -249,8 +249,10 @@ class WiredPour:
         """
         if not await self._agreed(question):
             raise RefusedError("the operator did not let the arm move")
-        await self._rooms.questions.say(f"The arm moves in {self._rooms.spec.announcement:g} s. Keep out of its way.")
+        spec = self._rooms.spec
+        text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
         # The driver waits for as long from the release to the first movement.
+        await self._rooms.questions.announce(text, spec.announcement / spec.time_scale)
         await self._rooms.arm.release()
 
     # ---- the way back from a stop
