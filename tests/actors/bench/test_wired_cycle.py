@@ -51,9 +51,7 @@ def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_wh
     assert stage.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
     ((text, seconds),) = stage.operator.announced
     assert "moves in 3 s" in text
-    assert seconds == pytest.approx(
-        spec.announcement / spec.time_scale
-    )  # of the clock
+    assert seconds == pytest.approx(spec.announcement / spec.time_scale)  # of the clock
 
 
 def test_the_record_says_what_was_executed_asked_and_weighed(open_stage):
