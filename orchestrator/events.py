@@ -17,6 +17,7 @@ from actors.protocols import Frames, PourProgress
 from orchestrator.requests import Decision, Outcome, Request
 from orchestrator.results import Results
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
 
 _log = logging.getLogger(__name__)
 
@@ -127,10 +128,9 @@ class PourProgressed(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StrategyProgressed(Event):
-    """The strategy was told something: steps done, steps in all, and what it has learnt so far."""
+    """The strategy was told something: what of its work is done, and what it has learnt so far."""
 
-    done: int
-    total: int
+    progress: Progress
     result: Learnt
 
 
