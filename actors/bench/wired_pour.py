@@ -135,6 +135,8 @@ class WiredPour:
         except asyncio.CancelledError as error:
             await self._leave_safe()
             if self._begun:
+                weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
+                self._rooms.tell(Notice("warning", weighed))
                 raise
             raise NotPouredError("the pour was given up before it began; nothing was poured") from error
         except InvalidActionError:
@@ -252,8 +254,10 @@ class WiredPour:
         """
         if not await self._agreed(question):
             raise RefusedError("the operator did not let the arm move")
-        await self._rooms.questions.say(f"The arm moves in {self._rooms.spec.announcement:g} s. Keep out of its way.")
+        spec = self._rooms.spec
+        text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
         # The driver waits for as long from the release to the first movement.
+        await self._rooms.questions.announce(text, spec.announcement / spec.time_scale)
         await self._rooms.arm.release()
 
     # ---- the way back from a stop
@@ -362,14 +366,16 @@ class WiredPour:
         if not self._begun:
             return NotPouredError(f"{error}. Nothing was poured")
         text = f"{error}. What was poured is unknown"
-        weighed = ", ".join(f"{key} {grams(w.mass)}" for key, w in self._weighings.weighed.items())
         with contextlib.suppress(LaboratoryError):
             m = self._weighings.measurement()
             text = (
                 f"{error}. It was not the pour that was asked for; weighed were {grams(m.loaded)} loaded, "
                 f"{grams(m.spilled)} spilled, {grams(m.retained)} retained"
             )
-        return UnknownPourError(f"{text}. All weighings: {weighed or 'none'}")
+        return UnknownPourError(f"{text}. All weighings: {self._weighed()}")
+
+    def _weighed(self) -> str:
+        return ", ".join(f"{key} {grams(w.mass)}" for key, w in self._weighings.weighed.items()) or "nothing"
 
     def _notes(self, measured: PourMeasurement) -> dict[str, Any]:
         executed = self._executed
