@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from actors.bench.world import World
 from dyna import AFTER, TRUST, Bench, interval
 from machine import describe, pin, say, show
 from skipping_clock import run
 
-from actors.bench.world import World
 from actors.protocols import InvalidActionError, ProgressCallback, SimulationResult
 from orchestrator.campaign import run_campaign
 from orchestrator.config.study.sections import load_study

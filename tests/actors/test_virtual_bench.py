@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from actors.bench.hidden import draw_pose_error, spill_of
 from actors.bench.spec import VirtualBenchSpec
-from actors.bench.world import draw_pose_error, spill_of
 from actors.laboratory import open_laboratory
 from actors.protocols import InvalidActionError, LaboratoryError
 from actors.spec import LaboratorySpec
