@@ -39,8 +39,9 @@ lint: $(READY)
 unit: $(READY)
 	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile
 
+# What takes long, and every property on four times as many examples.
 slow: $(READY)
-	$(BIN)/pytest -m slow
+	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 --dist loadfile
 
 docs: $(READY)
 	$(BIN)/sphinx-build -W --keep-going -q -b html -c docs . build/site

@@ -17,7 +17,8 @@ from actors.arm.protocol import ArmFacts, ArmState, PathReport, Whereabouts
 from actors.arm.spec import ArmSpec
 from actors.pacing import Pace
 from sim_engine.action import Action
-from sim_engine.motion import PourMotion, SampledMotion
+from sim_engine.motion import PourMotion
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Scene
 
 FloatArray = NDArray[np.float64]

@@ -13,8 +13,9 @@ import numpy as np
 
 from actors.bench.spec import VirtualBenchSpec
 from actors.protocols import InvalidActionError, LaboratoryError, SimulatorPool
+from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome
-from sim_engine.task import PoseError, PourTask
+from sim_engine.task import PoseError, PourTask, Scene
 
 ATTEMPTS = 3
 """Initial positions that are tried before the liquid is given up."""
@@ -96,6 +97,22 @@ async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: P
             return outcome
         reason = outcome.invalid
     raise LaboratoryError(f"the virtual bench's liquid could not be simulated: {reason}")
+
+
+async def hidden_spill(
+    spec: VirtualBenchSpec, simulators: SimulatorPool, scene: Scene, action: Action, seed: int
+) -> Spill:
+    """What becomes of the liquid if the arm does what it is told, with this pour's errors; raises as `hidden_pour`.
+
+    Args:
+        spec: of the bench: the hidden θ and errors.
+        simulators: a pool of its own.
+        scene: as intended.
+        action: as commanded.
+        seed: of the pour.
+    """
+    task = PourTask(scene, action, spec.liquid, 0, pose_error=draw_pose_error(spec, seed))
+    return spill_of(await hidden_pour(spec, simulators, task, seed), scene.liquid.mass)
 
 
 def spill_of(outcome: PourOutcome, mass: float) -> Spill:

@@ -17,14 +17,12 @@ from actors.balance.actor import DeviceBalance
 from actors.balance.placement import Placement
 from actors.balance.spec import BalanceSpec
 from actors.balance.virtual_balance import BalanceSettings, Load
-from actors.bench.hidden import Spill, TouchingError, draw_pose_error, hidden_pour, spill_of, stream
+from actors.bench.hidden import Spill, TouchingError, draw_pose_error, hidden_spill, stream
 from actors.bench.questions import Questions
 from actors.bench.spec import VirtualBenchSpec
 from actors.bench.virtual_bench import Nature, PourAsk
 from actors.operator import OperatorSpec, Question
 from actors.protocols import LaboratoryError, PourFailedError, SimulatorPool
-from sim_engine.liquid import SimulationParameters
-from sim_engine.task import PourTask
 
 CARRYING_TIME = 2.0
 """Bench time to put something on the balance or take it off [s]."""
@@ -67,16 +65,12 @@ class NumbersBench(Nature):
     async def prepare(self, pour: PourAsk) -> None:
         """See `Nature.prepare`: the liquid is poured from here on."""
         self._pour = pour
-        self._liquid = asyncio.create_task(self._pour_out(pour))
+        self._liquid = asyncio.create_task(
+            hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed)
+        )
         await self._balance.prepare(stream(pour.seed, "balance"))
         error = draw_pose_error(self._spec, pour.seed)
         await self._arm.device.call("grip", Grip(error.speed_factor, stream(pour.seed, "arm")), deadline=30.0)
-
-    async def _pour_out(self, pour: PourAsk) -> Spill:
-        error = draw_pose_error(self._spec, pour.seed)
-        task = PourTask(pour.scene, pour.action, SimulationParameters(), 0, pose_error=error)
-        outcome = await hidden_pour(self._spec, self._simulators, task, pour.seed)
-        return spill_of(outcome, pour.scene.liquid.mass)
 
     async def tilts(self) -> None:
         """See `Nature.tilts`: the tray must know what falls on it while the arm moves.

@@ -46,8 +46,8 @@ from actors.protocols import (
     UnknownPourError,
 )
 from sim_engine.action import Action
-from sim_engine.motion import SampledMotion
 from sim_engine.outcome import PourMeasurement
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Scene
 
 WEIGHING_TIME = 3.0

@@ -27,7 +27,7 @@ from actors.bench.virtual_operator import Hands
 from actors.protocols import LaboratoryError, SimulatorPool
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
-from sim_engine.motion import SampledMotion
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import PoseError, PourTask, Scene
 
 FloatArray = NDArray[np.float64]

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from actors.arm.look import ArmLook, SafetyRecord
 from actors.checks import Check
-from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, say
 from orchestrator.commands.doctor_balance import look_at_balance
 from orchestrator.commands.hands_on import reached
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
 from orchestrator.safety import SafetyRecordError, read_record, record_path, write_record
 
 if TYPE_CHECKING:

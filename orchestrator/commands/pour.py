@@ -10,16 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from actors.arm.protocol import PathReport, PlannedPour
 from orchestrator.commands.arming import accepted, confirm, report_lines, require_flag
-from orchestrator.commands.common import (
-    BAD_INPUT,
-    FAILED,
-    RefusalError,
-    check_output,
-    print_json,
-    read_campaign,
-    say,
-)
+from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.single import scene_to_simulate
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan

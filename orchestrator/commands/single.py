@@ -9,16 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.common import (
-    BAD_INPUT,
-    FAILED,
-    RefusalError,
-    check_output,
-    print_json,
-    read_campaign,
-    say,
-    stdout_for_results,
-)
+from orchestrator.commands.common import check_output, read_campaign
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -203,6 +195,7 @@ def validate(paths: list[Path]) -> None:
     from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
     from orchestrator.config.study.sections import load_study
     from orchestrator.config.yaml.errors import ConfigError
+    from orchestrator.config.yaml.files import resolved
     from orchestrator.config.yaml.kinds import kind_of
     from orchestrator.config.yaml.source import Document
     from orchestrator.study.cells import cells_of
@@ -213,7 +206,7 @@ def validate(paths: list[Path]) -> None:
     for path in paths:
         problems: list[str] = []
         try:
-            kind = kind_of(Document.read(path.resolve()).data)
+            kind = kind_of(Document.read(resolved(path)).data)
             if kind == "vessel":
                 vessel = build_vessel(load_vessel(path))
                 note = f"vessel, holds {1e6 * vessel.capacity:.4g} mL to the brim"

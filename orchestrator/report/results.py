@@ -14,7 +14,7 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries
 from orchestrator.report.maps import SurrogatePicture
 from orchestrator.report.names import receiver_name
-from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
+from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]
@@ -114,6 +114,7 @@ def calibration_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture 
         points=[t["theta"] for t in trials],
         costs=[DISCREPANCY.factor * t["discrepancy"] for t in trials],
         best=result.get("theta"),
+        largest=DISCREPANCY.factor,
         mean=mean,
         deviation=deviation,
         **_cut(result),
@@ -140,6 +141,8 @@ def deployment_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture |
         mean=mean,
         deviation=deviation,
         numbers=[int(p["number"]) for p in pours],
+        simulated=[one["action_si"] for one in result.get("simulated", ())],
+        largest=unit.factor * largest_loss(plan.deployment),
         **_cut(result),
     )
 

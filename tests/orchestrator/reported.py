@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.collections import PathCollection
+from matplotlib.text import Text
 from rich.console import Console
 
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
@@ -62,3 +64,43 @@ def is_picture(path: Path) -> bool:
 
     pixels = imread(path)
     return path.suffix == ".png" and pixels.shape[0] > 300 and len(np.unique(pixels[::7, ::7, :3])) > 20
+
+
+def strays(figure: Any) -> list[str]:
+    """Texts that leave a figure, and marks that their axes cut off."""
+    figure.draw_without_rendering()
+    renderer, whole, found = figure.canvas.get_renderer(), figure.bbox, []
+    for text in figure.findobj(Text):
+        if not text.get_text().strip() or not text.get_visible() or text in _out_of_view(figure):
+            continue
+        box = text.get_window_extent(renderer)
+        if box.x0 < whole.x0 - 1 or box.y0 < whole.y0 - 1 or box.x1 > whole.x1 + 1 or box.y1 > whole.y1 + 1:
+            found.append(f"'{text.get_text()}' leaves the figure")
+    for axes in figure.axes:
+        for marks in axes.collections:
+            if isinstance(marks, PathCollection) and len(marks.get_offsets()) and marks.get_clip_on():
+                radius = float(np.sqrt(marks.get_sizes().max())) / 2 * figure.dpi / 72
+                found += _cut_off(axes, np.ma.getdata(marks.get_offsets()), radius)
+        for line in axes.lines:
+            if line.get_marker() not in ("None", None, "", "_") and line.get_clip_on() and len(line.get_xdata()):
+                radius = line.get_markersize() / 2 * figure.dpi / 72
+                found += _cut_off(axes, np.column_stack(line.get_data()), radius)
+    return found
+
+
+def _cut_off(axes: Any, places: Any, radius: float) -> list[str]:
+    inner = axes.bbox.padded(-radius)
+    whole = all(inner.contains(x, y) for x, y in axes.transData.transform(places))
+    return [] if whole else [f"marks of '{axes.get_title(loc='left')}' are cut off"]
+
+
+def _out_of_view(figure: Any) -> set[Text]:
+    """Labels of ticks that are not shown."""
+    hidden: set[Text] = set()
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
+                if not axes.get_visible() or not low <= tick.get_loc() <= high:
+                    hidden |= {tick.label1, tick.label2}
+    return hidden

@@ -13,7 +13,7 @@ from actors.arm.geometry import Pose
 from actors.arm.path.kinematics import MODELS, forward
 from actors.arm.spec import UrArmSpec
 from sim_engine.contact import rotations
-from sim_engine.motion import SampledMotion
+from sim_engine.sampled_motion import SampledMotion
 
 FloatArray = NDArray[np.float64]
 

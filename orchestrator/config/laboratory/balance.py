@@ -19,7 +19,8 @@ _SHEET = ScaleSettings()
 _SERIAL = SerialBalanceSpec(port="")
 _BALANCE = BalanceSpec(Placement.TRAY, None)
 
-Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1)]
+Error = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
+"""Of a weighing: a balance that is 10 g out tells nothing about a spill."""
 PositiveMass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1, positive=True)]
 Duration = Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0)]
 PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=True)]
@@ -56,7 +57,7 @@ class VirtualScaleSection(Section):
     capacity: Annotated[float, Quantity("kg", "6.2 kg", 0.0, 1000.0, positive=True)] = _SHEET.capacity
     """Heaviest load."""
 
-    noise: Mass = _SHEET.noise
+    noise: Error = _SHEET.noise
     """Standard deviation of weighing the same thing again."""
 
     drift: Annotated[float, Quantity("kg/s", "0.01 g/s", -0.01, 0.01)] = _SHEET.drift
@@ -93,7 +94,7 @@ class BalanceDeviceSection(Section):
     step: PositiveMass | None = None
     """Step of its display, where that is not one of the last digit."""
 
-    repeatability: Mass = _SERIAL.repeatability
+    repeatability: Error = _SERIAL.repeatability
     """Standard deviation of weighing the same thing again, from its data sheet."""
 
     settling: SettlingSection = SettlingSection()

@@ -28,7 +28,7 @@ _DEFAULT = VirtualBenchSpec(liquid=SimulationParameters())
 Offset = Annotated[float, Quantity("m", "1 mm", -0.05, 0.05)]
 Tilt = Annotated[float, Quantity("rad", "1 deg", -0.2, 0.2)]
 Duration = Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)]
-Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1)]
+Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
 Factor = Annotated[float, Quantity("1", "1.02", 0.5, 1.5)]
 Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
 

@@ -335,6 +335,11 @@ class Deployment(ABC):
             "simulations_lost": self._trials.lost,
             "simulations_refused": sum(trial.refused for trial in self._trials.all),
             "pours": [p.row(self._compromise.names) for p in self._pours if p.status != "pouring"],
+            "simulated": [
+                {"action_si": self._plan.actions.decode(trial.point), "loss": trial.cost}
+                for trial in self._trials.all
+                if trial.closed and trial.cost is not None
+            ],
             "former_pours": len(self._former),
             "refused_pours": self._refused,
             "failed_pours": sum(p.status == "failed" for p in self._pours),

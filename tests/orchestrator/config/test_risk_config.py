@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from orchestrator.commands import campaigns
-from orchestrator.commands.common import RefusalError
+from orchestrator.commands.speaking import RefusalError
 from orchestrator.config.load import load_campaign
 from orchestrator.config.schema import campaign_schema
 from orchestrator.config.yaml.errors import ConfigError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from orchestrator.report import figures as figures_module
 from orchestrator.report import maps as maps_module
 from orchestrator.report.campaign import draw_figures
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
-from orchestrator.report.maps import SurrogatePicture, draw_surrogate
+from orchestrator.report.maps import SurrogatePicture, draw_surrogate, draw_trials
+from orchestrator.report.posterior import draw_posterior
 from orchestrator.report.results import (
     calibration_picture,
     deployment_picture,
@@ -23,14 +25,15 @@ from orchestrator.report.results import (
     evaluation_of,
     pour_series,
 )
-from orchestrator.report.style import display_value, display_values
+from orchestrator.report.style import display_value, display_values, log_ticks
 from orchestrator.report.summary import summarise, summary_table
+from orchestrator.report.trust import draw_trust, trust_title
 from orchestrator.report.units import loss_unit
 from sim_engine.action import DEG, Action
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
 from tests.orchestrator import watched
-from tests.orchestrator.reported import is_picture, shown
+from tests.orchestrator.reported import is_picture, shown, strays
 
 
 def test_run_gets_every_figure_that_its_results_allow(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
@@ -236,3 +239,111 @@ def test_losses_are_shown_in_their_own_unit() -> None:
     assert loss_unit(Loss("grams")).text(2.46) == "2.46 g"
     assert loss_unit(Loss("particles")).text(17.0) == "17 particles"
     assert "0.5 × retained" in loss_unit(Loss(retained_weight=0.5)).label
+
+
+def kept(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Figures as they are saved."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(maps_module.style, "save", lambda figure, path: drawn.append(figure) or path)
+    return drawn
+
+
+def at_the_edges(**changes: Any) -> SurrogatePicture:
+    """Observations and the best in the corners of the box."""
+    corners = [{"particles": n, "cohesion": c} for n in (500.0, 4000.0) for c in (0.0, 0.1)]
+    picture = SurrogatePicture("corners", "loss [%]", watched.THETA, corners, [1.0, 2.0, 3.0, 4.0], best=corners[3])
+    return replace(picture, **changes)
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_what_lies_on_an_edge_of_the_box_is_drawn_whole(mapped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, grid = kept(monkeypatch), np.linspace(0.0, 1.0, 100).reshape(10, 10)
+    numbered = at_the_edges(mean=grid, deviation=grid, numbers=[1, 2, 3, 4], best_name="best action")
+    (draw_surrogate if mapped else draw_trials)(Path("map.png"), numbered)
+    assert strays(drawn[0]) == []
+
+
+def test_a_best_action_at_an_end_of_the_box_is_said_to_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, grid = kept(monkeypatch), np.zeros((5, 5))
+    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, best_name="best action"))
+    inside = {"particles": 1000.0, "cohesion": 0.05}
+    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, best=inside))
+    said = [" ".join(text.get_text() for text in figure.findobj(Text)) for figure in drawn]
+    assert "best action has particles at its upper end (4 000) and cohesion at its upper end (0.1 N/m)" in said[0]
+    assert "end" not in said[1]
+
+
+def test_a_surrogate_that_expects_the_impossible_does_not_stretch_the_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, grid = kept(monkeypatch), np.full((5, 5), 20.0)
+    grid[0, 0] = 500.0
+    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, largest=100.0))
+    bars = [axes for axes in drawn[0].axes if axes.get_label() == "<colorbar>"]
+    assert [bar.get_ylim()[1] for bar in bars] == pytest.approx([100.0, 100.0])
+
+
+def test_simulations_stand_beside_the_pours_of_a_loss_map(
+    results: dict[str, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed, drawn = results["narrow cup"], kept(monkeypatch)
+    picture = deployment_picture(watched.campaign(), deployed)
+    assert picture is not None
+    assert len(picture.simulated) == deployed["simulations"] - deployed["simulations_lost"]
+    draw_surrogate(Path("map.png"), picture)
+    crosses = [c for c in drawn[0].axes[0].collections if c.get_label() == "simulation"]
+    assert [len(c.get_offsets()) for c in crosses] == [len(picture.simulated)]
+    assert strays(drawn[0]) == []
+
+
+def compared(rows: list[tuple[float, float, float]], limit: float = 2.5) -> dict[str, Any]:
+    """A trust result of (simulated, deviation, weighed)."""
+    z = [(weighed - simulated) / deviation for simulated, deviation, weighed in rows]
+    mean = sum(max(one, 0.0) for one in z) / len(z)
+    names = ("simulated", "deviation", "weighed")
+    pours = [{"number": i, **dict(zip(names, row, strict=True))} for i, row in enumerate(rows, start=1)]
+    return {"pours": pours, "z_scores": z, "mean_z": mean, "limit": limit, "alarm": mean > limit, "better": False}
+
+
+def test_the_title_of_the_first_pours_says_which_were_worse_and_which_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    one_bad = compared([(0.016, 0.015, 0.15), (0.028, 0.01, 0.03), (0.027, 0.012, 0.02)])
+    assert trust_title(one_bad) == "pours 2 and 3 as simulated, pour 1 worse by 8.9 σ: alarm"
+    assert trust_title(compared([(0.02, 0.01, 0.021), (0.02, 0.01, 0.015)])) == "pours 1 and 2 as simulated"
+    assert trust_title(compared([(0.5, 0.01, 0.1)])) == "pour 1 better by 40.0 σ"
+    drawn = kept(monkeypatch)
+    draw_trust(Path("trust.png"), one_bad, unit=loss_unit(Loss()), receiver="narrow")
+    assert strays(drawn[0]) == []
+    assert len([line for line in drawn[0].axes[1].lines if line.get_linestyle() == "--"]) == 1  # the mean is a bar
+
+
+def test_predictors_that_have_nothing_to_say_get_no_bar_and_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = kept(monkeypatch)
+    groups = [DiscrepancyGroup("training pours", 7, 0.06), DiscrepancyGroup("test pours", 3, 0.01, [0.02, 0.03], 0.04)]
+    draw_discrepancy(Path("bars.png"), groups, title="bars")
+    said = [text.get_text() for text in drawn[0].findobj(Text)]
+    assert not [text for text in said if "n/a" in text]
+    places = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in drawn[0].axes[0].patches]
+    assert len(places) == 4
+    assert all(end <= begin for (_, end), (begin, _) in itertools.pairwise(sorted(places)))
+    assert strays(drawn[0]) == []
+
+
+def test_ticks_of_a_logarithmic_axis_are_numbers_that_people_read() -> None:
+    assert log_ticks(500.0, 1500.0) == [500.0, 700.0, 1000.0, 1500.0]
+    assert log_ticks(500.0, 4000.0) == [500.0, 1000.0, 2000.0]
+    assert len(log_ticks(250.0, 500.0)) >= 3
+
+
+def test_the_posterior_has_axes_with_plain_numbers_and_nothing_is_cut(
+    results: dict[str, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn, result = kept(monkeypatch), results["calibration"]
+    theta = {**result["theta"], "particles": 4000.0, "cohesion": 0.0}
+    draw_posterior(Path("posterior.png"), result["posterior"], watched.THETA, theta)
+    drawn[0].draw_without_rendering()
+    said = [text.get_text() for text in drawn[0].findobj(Text)]
+    assert not [text for text in said if "10^" in text]
+    assert said.count("draws") == 2
+    assert strays(drawn[0]) == []
+    cloud = drawn[0].axes[2]
+    (star,) = [line for line in cloud.lines if line.get_marker() == "*"]
+    (place,) = cloud.transData.transform(np.column_stack(star.get_data()))
+    assert cloud.bbox.padded(-5).contains(*place)

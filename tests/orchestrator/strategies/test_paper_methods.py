@@ -11,7 +11,7 @@ import yaml
 
 from actors.optimizer.core.problem import SuggestProblem
 from orchestrator.commands.campaigns import RunOptions, run
-from orchestrator.commands.common import RefusalError
+from orchestrator.commands.speaking import RefusalError
 from orchestrator.config.campaign.resolved import campaign_as_file
 from orchestrator.config.load import load_campaign
 from orchestrator.config.study.sections import load_study
