@@ -72,7 +72,7 @@ class LiquidFile(Section):
     name: Text = "water"
     """For people."""
 
-    mass: Annotated[float, Quantity("kg", "200 g", positive=True, lower=1e-4, upper=20.0)] | None = None
+    mass: Annotated[float, Quantity("kg", "200 g", lower=1e-4, upper=20.0)] | None = None
     """Mass that is loaded into the pourer."""
 
     density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] = 998.0

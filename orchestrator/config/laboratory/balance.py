@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from actors.balance.doors import dialects
 from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
 from actors.balance.spec import AUTO, BalanceSpec, SerialBalanceSpec, parse_format
@@ -30,6 +31,9 @@ USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400,
 
 VIRTUAL_DIALECT = "kcp"
 """Spoken by a virtual balance unless another dialect is named."""
+
+
+DialectName: Any = Literal[(AUTO, *dialects())]  # what is installed, ours as everybody's
 
 
 class SettlingSection(Section):
@@ -79,7 +83,7 @@ class BalanceDeviceSection(Section):
     virtual: VirtualScaleSection | None = None
     """A balance that is not there, in place of a port."""
 
-    dialect: Literal["auto", "kcp", "kern-swt", "mt-sics", "sbi"] = AUTO  # type: ignore[assignment]
+    dialect: DialectName = AUTO
     """How it talks; 'auto' finds out."""
 
     baud: PositiveCount | None = None
