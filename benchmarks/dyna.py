@@ -37,16 +37,18 @@ from skipping_clock import SkippingLoop, run
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
-from actors.protocols import ProgressCallback, SimulationResult
+from actors.protocols import ProgressCallback
 from actors.spec import LaboratorySpec
 from orchestrator.campaign import run_campaign
 from orchestrator.events import DecisionMade, Event
 from orchestrator.occupancy import RESTS, Occupancy
 from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan, PricesPlan, TrustPlan
+from orchestrator.strategies.deployment.learnt import Deployed
 from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.simulated import SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
@@ -124,7 +126,7 @@ class Bench:
         if isinstance(event, DecisionMade) and RESTS in event.decision.values:
             self.occupancy.rests(self._clock.time())
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         """One of the pool's members takes its time."""
         rng = np.random.default_rng(task.seed)
         unit = self._space.encode({name: getattr(task.action, name) for name in self._space.names})
@@ -136,7 +138,7 @@ class Bench:
             self.occupancy.simulation_finished(self._clock.time())
         self.simulations += 1
         outcome = PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, seconds, task.seed)
-        return SimulationResult(outcome)
+        return SimulatedPour(outcome)
 
     async def pour(
         self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
@@ -186,6 +188,8 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         result = run(run_campaign(plan, bench, Path(folder) / "run", watchers=[bench.watch]))
     bench.occupancy.finish()
     (stage,) = result.results.values()
+    assert isinstance(stage, Deployed)
+    assert stage.recommended is not None
     values: dict[str, Any] = {
         "before first": bench.before_first,
         "simulations": bench.simulations,
@@ -195,8 +199,8 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         "mean wait, ms": 1e3 * float(np.mean(bench.occupancy.waits)),
         "longest answer, ms": 1e3 * max(bench.answers),
         "CPU, s": time.thread_time() - begun,
-        "alarm": float(bool((stage.get("trust") or {}).get("alarm"))),
-        "reported": bench.true(stage["action_si"]),
+        "alarm": float(stage.trust.alarm),
+        "reported": bench.true(stage.recommended.action_si),
     }
     for pours in (n for n in AFTER if n <= asked.pours):
         values[f"least of {pours}"] = min(bench.poured[:pours])

@@ -11,10 +11,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from actors.protocols import Frames, PourProgress
+from actors.protocols import PourProgress
 from orchestrator.requests import Decision, Outcome, Request
+from orchestrator.results import Results
+from orchestrator.strategies.learnt import Learnt
+from sim_engine.simulated import RecordedFrames
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +74,7 @@ class CampaignClosed(Event):
     """
 
     state: str
-    results: dict[str, dict[str, Any]]
+    results: Results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +88,9 @@ class StageOpened(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StageClosed(Event):
-    """A strategy is done; `result` is what it learnt, JSON-ready."""
+    """A strategy is done; `result` is what it learnt."""
 
-    result: dict[str, Any]
+    result: Learnt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +114,7 @@ class RequestFinished(Event):
     request: Request
     outcome: Outcome
     seconds: float = 0.0
-    frames: Frames | None = None
+    frames: RecordedFrames | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +132,7 @@ class StrategyProgressed(Event):
 
     done: int
     total: int
-    result: dict[str, Any]
+    result: Learnt
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -101,8 +101,15 @@ class VirtualBalance:
             self._advance(seconds / steps)
 
     def interrupt(self) -> None:
-        """End the wait that is under way, until the next `prepare`."""
+        """End the wait that is under way, until the next `prepare` or `resume`."""
         self._pace.interrupt()
+
+    def resume(self) -> None:
+        """Let waits last again after `interrupt`."""
+        self._pace.resume()
+
+    def close(self) -> None:
+        """Nothing has to be let go of."""
 
     def tare(self) -> None:
         """See `Balance.tare`."""
@@ -113,7 +120,7 @@ class VirtualBalance:
     def weigh(self) -> Weight:
         """See `Balance.weigh`."""
         mass = self._stable()
-        return Weight(mass, True, self._time)
+        return Weight(mass, True, self._time, step=self._settings.resolution)
 
     def read(self) -> Weight:
         """See `Balance.read`. Draws its noise from a stream of its own, so that watching changes no measurement."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
@@ -16,8 +15,9 @@ if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from sim_engine.backend import Backend
     from sim_engine.outcome import PourOutcome
-    from sim_engine.pour import PourSimulator, SimulationRun
+    from sim_engine.pour import PourSimulator
     from sim_engine.regimes import Regimes
+    from sim_engine.simulated import SimulatedPour
     from sim_engine.space import Space
     from sim_engine.spread import Spread
     from sim_engine.task import PourTask, Scene
@@ -103,7 +103,7 @@ def simulate(
         raise RefusalError("\n".join(bad), FAILED)
 
 
-def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulationRun]:
+def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:
     """One after the other; Taichi ends with them."""
     from rich.console import Console
 
@@ -173,20 +173,15 @@ def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scen
     return scenes[name]
 
 
-def _show(task: Any, run: Any, rrd: Path | None, png: Path | None) -> None:
-    from actors.protocols import Frames, SimulationResult
-
-    assert run.frames is not None
-    frames = Frames(run.frames.times, run.frames.positions, run.frames.states, run.frames.pourer_poses)
-    result = SimulationResult(run.outcome, frames)
+def _show(task: PourTask, pour: SimulatedPour, rrd: Path | None, png: Path | None) -> None:
     if rrd is not None:
         from orchestrator.monitor.simulation import simulation_rrd
 
-        say(f"recording: {simulation_rrd(rrd, task, result)} (open it with: rerun {rrd})")
+        say(f"recording: {simulation_rrd(rrd, task, pour)} (open it with: rerun {rrd})")
     if png is not None:
         from orchestrator.report.scene import simulation_png
 
-        say(f"picture: {simulation_png(png, task, result)}")
+        say(f"picture: {simulation_png(png, task, pour)}")
 
 
 def validate(paths: list[Path]) -> None:
@@ -233,16 +228,9 @@ def validate(paths: list[Path]) -> None:
 
 
 def schema(which: str) -> None:
-    """The JSON schema that editors complete campaign files with."""
-    from orchestrator.config import schema as schemas
+    """The JSON schema of the files that people write, or of what a run writes."""
+    from orchestrator.config.schema import SCHEMAS, schema_text
 
-    known = {
-        "campaign": schemas.campaign_schema,
-        "vessel": schemas.vessel_schema,
-        "laboratory": schemas.laboratory_schema,
-        "study": schemas.study_schema,
-    }
-    if which not in known:
-        raise RefusalError(f"no schema '{which}'; there are {', '.join(known)}", BAD_INPUT)
-    json.dump(known[which](), sys.stdout, indent=2, ensure_ascii=False)
-    print()
+    if which not in SCHEMAS:
+        raise RefusalError(f"no schema '{which}'; there are {', '.join(SCHEMAS)}", BAD_INPUT)
+    sys.stdout.write(schema_text(SCHEMAS[which]()))

@@ -9,15 +9,15 @@ import argparse
 import asyncio
 import hashlib
 import random
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
-from actors.protocols import PourProgress, ProgressCallback, SimulationResult
+from actors.protocols import PourProgress, ProgressCallback
 from actors.spec import LaboratorySpec
 from orchestrator.campaign import CampaignResult, run_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
@@ -35,11 +35,14 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
+from orchestrator.results import Results, learnt_by
 from orchestrator.stages import StageDefinition
+from orchestrator.strategies.learnt import Learnt
 from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.simulated import SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
@@ -116,7 +119,7 @@ class ToySimulators:
     most_running: int = 0
     fails: Callable[[PourTask], Exception | str | None] = lambda task: None
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         self.tasks.append(task)
         self.running += 1
         self.most_running = max(self.running, self.most_running)
@@ -146,7 +149,7 @@ class ToySimulators:
             task.seed,
             invalid=problem,
         )
-        return SimulationResult(outcome)
+        return SimulatedPour(outcome)
 
 
 @dataclass
@@ -192,6 +195,14 @@ def slow_laboratory(longest: float, rng: random.Random | None = None) -> ToyLabo
         ToyBench(lambda: clock.uniform(0, 3 * longest)),
         ToyOptimizer(lambda: clock.uniform(0, longest / 2)),
     )
+
+
+class Toyed(Learnt):
+    """What the toy strategy learnt."""
+
+    kind: Literal["toy"] = "toy"
+    spillages: tuple[float, ...]
+    simulations: int
 
 
 class ToyStrategy:
@@ -263,8 +274,8 @@ class ToyStrategy:
     def progress(self) -> tuple[int, int]:
         return self._told_pours, self._pours
 
-    def result(self) -> dict[str, object]:
-        return {"spillages": self.spillages, "simulations": self._asked_simulations}
+    def result(self) -> Toyed:
+        return Toyed(spillages=tuple(self.spillages), simulations=self._asked_simulations)
 
     def _seed(self) -> int:
         return int(self._rng.integers(2**31))
@@ -273,8 +284,8 @@ class ToyStrategy:
 def toy_stages(**numbers: int) -> tuple[StageDefinition, ...]:
     """Two stages; the second one's seed depends on the first one's result."""
 
-    def second(results: Mapping[str, Mapping[str, Any]], seed: int) -> ToyStrategy:
-        return ToyStrategy(seed + int(1e6 * results["first"]["spillages"][-1]), **numbers)
+    def second(results: Results, seed: int) -> ToyStrategy:
+        return ToyStrategy(seed + int(1e6 * learnt_by(results, "first", Toyed).spillages[-1]), **numbers)
 
     return (
         StageDefinition("first", lambda results, seed: ToyStrategy(seed, **numbers), pours=True),

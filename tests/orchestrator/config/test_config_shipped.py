@@ -12,10 +12,16 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from actors.bench.planning import planner
 from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-from orchestrator.config.schema import campaign_schema, laboratory_schema, schema_text, study_schema, vessel_schema
+from orchestrator.config.schema import (
+    campaign_schema,
+    laboratory_schema,
+    result_schema,
+    schema_text,
+    study_schema,
+    vessel_schema,
+)
 from orchestrator.config.yaml.source import Document
 from sim_engine.action import DEG, Action
 from sim_engine.vessel.spec import MeshShape
@@ -64,6 +70,10 @@ def test_committed_schema_is_current(kind: str) -> None:
     assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(SCHEMAS[kind]())
 
 
+def test_committed_schema_of_results_is_current() -> None:
+    assert (CONFIGS / "schema" / "result.json").read_text(encoding="utf-8") == schema_text(result_schema())
+
+
 def test_schema_refuses_what_an_editor_should_underline() -> None:
     good = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml").resolved
     validator = jsonschema.Draft202012Validator(campaign_schema())
@@ -92,7 +102,7 @@ def test_first_pours_of_a_real_arm_fit_the_limits_of_its_first_day(tmp_path: Pat
     assert plan.deployment is not None
     assert plan.laboratory.arm is not None
     assert (plan.laboratory.mode, plan.deployment.strategy, plan.deployment.pours) == ("hardware", "D2", 3)
-    scene, plan_path = plan.deployment.scenes[0], planner(plan.laboratory.arm)
+    scene, plan_path = plan.deployment.scenes[0], plan.laboratory.arm.plan
     speeds, offsets = ([axis.lower, axis.upper] for axis in plan.deployment.actions.axes)
     for speed, offset in itertools.product(speeds, offsets):
         action = Action(**scene.fixed, angular_velocity=speed, x_offset=offset)
