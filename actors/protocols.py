@@ -33,6 +33,10 @@ class UnknownPourError(LaboratoryError):
     """
 
 
+class PourFailedError(LaboratoryError):
+    """A pour came to nothing that could be weighed, and everybody knows why: it counts as failed."""
+
+
 class InvalidActionError(LaboratoryError):
     """The vessels would touch, or the motion can't be made: refused before anything moved or was simulated."""
 

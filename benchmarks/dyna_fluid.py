@@ -25,7 +25,7 @@ from dyna import AFTER, TRUST, Bench, interval
 from machine import describe, pin, say, show
 from skipping_clock import run
 
-from actors.bench.world import World
+from actors.bench.hidden import hidden_spill
 from actors.protocols import InvalidActionError, ProgressCallback, SimulationResult
 from orchestrator.campaign import run_campaign
 from orchestrator.config.study.sections import load_study
@@ -56,7 +56,7 @@ class Fluid(Bench):
         self.answers: list[float] = []
         self.priced: list[float] = []
         self.apart = 0.0
-        self._real = World(study.level(level).bench, _Apart(self))
+        self._hidden, self._beside = study.level(level).bench, _Apart(self)
 
     def _run(self, task: PourTask) -> tuple[SimulationResult, float]:
         """A simulation, and the CPU time that this thread spent on it."""
@@ -94,7 +94,7 @@ class Fluid(Bench):
         self.before_first = self.before_first if self.poured else self.simulations
         self.occupancy.pour_started(self._clock.time())
         try:
-            spill = await self._real.pour(scene, action, seed)
+            spill = await hidden_spill(self._hidden, self._beside, scene, action, seed)
             await asyncio.sleep(self._asked.pour)
         finally:
             self.occupancy.pour_finished(self._clock.time())

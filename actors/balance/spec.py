@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,10 +10,14 @@ from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.doors import dialects
 from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
+from actors.balance.virtual_balance import BalanceSettings
 from actors.balance.virtual_serial.scale import ScaleSettings
 
 AUTO = "auto"
 """Dialect that is found out."""
+
+DRIFTING = 60.0
+"""From a tare to the weighing after it, at most, on a bench of numbers [s of bench time]."""
 
 Handshake = Literal["none", "software", "hardware"]
 
@@ -89,6 +94,7 @@ class BalanceSpec:
         virtual: what its data sheet would say, where there is none: it is started, and `serial.port` set to its port.
         pourer_elsewhere: the pourer is weighed on another balance, and typed.
         load_tolerance: how far a load may lie from the one asked for [kg].
+        numbers: what a balance of numbers is like; in place of a line.
     """
 
     placement: Placement
@@ -96,6 +102,14 @@ class BalanceSpec:
     virtual: ScaleSettings | None = None
     pourer_elsewhere: bool = False
     load_tolerance: float = 5e-3
+    numbers: BalanceSettings | None = None
+
+    @property
+    def repeatability(self) -> float:
+        """Standard deviation of weighing the same thing again [kg]."""
+        if self.numbers is not None:
+            return math.hypot(self.numbers.noise, self.numbers.drift * DRIFTING)
+        return 0.0 if self.serial is None else self.serial.repeatability
 
 
 def parse_format(text: str) -> tuple[int, str, int]:

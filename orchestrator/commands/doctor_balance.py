@@ -9,7 +9,7 @@ from pathlib import Path
 from actors.balance.errors import BalanceError
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.spec import BalanceSpec
-from orchestrator.commands.doctor_look import Check
+from actors.checks import Check
 
 COARSE = 0.5e-3
 """A display with larger steps tells little of small spills [kg]."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, create_model
 
-from actors.arm.spec import UrArmSpec
+from actors.arm.spec import ArmSpec, UrArmSpec
 from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
@@ -309,9 +309,10 @@ def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
     return table | {"bench": bench}
 
 
-def _wires_as_file(arm: UrArmSpec | None, spec: LaboratorySpec) -> dict[str, object]:
+def _wires_as_file(arm: ArmSpec | None, spec: LaboratorySpec) -> dict[str, object]:
     if arm is None:
         return {}
+    assert isinstance(arm, UrArmSpec)
     return {
         **arm_as_file(arm),
         **({} if spec.balance is None else {"balance": balance_as_file(spec.balance)}),

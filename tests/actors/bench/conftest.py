@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from actors.balance.placement import Placement
-from actors.bench.place import Site
+from actors.bench.device_stand_ins import DeviceStandIns
+from actors.bench.pouring_bench import PouringBench
 from actors.bench.things import Things
+from actors.bench.virtual_bench import VirtualBench
 from actors.bench.virtual_operator import VirtualOperator
-from actors.bench.wired import WiredBench
 from actors.laboratory import InProcessLaboratory
 from actors.operator import OperatorSpec, Question
 from actors.protocols import Notice
@@ -93,8 +94,8 @@ class Stage:
     """A laboratory that is open, and everything that was said in it."""
 
     laboratory: InProcessLaboratory
-    bench: WiredBench = field(init=False)
-    site: Site = field(init=False)
+    bench: PouringBench = field(init=False)
+    site: DeviceStandIns = field(init=False)
     operator: VirtualOperator = field(init=False)
     things: Things = field(init=False)
     notices: list[Notice] = field(default_factory=list)
@@ -110,13 +111,13 @@ class Stage:
 
     def attend(self) -> None:
         """Stand beside the operator, and look at the controller whenever it is asked something."""
-        rooms = self.laboratory.wired
-        assert rooms is not None
-        assert rooms.site is not None
-        assert rooms.bench.reality is not None
-        assert isinstance(rooms.operator, VirtualOperator)
-        self.bench, self.site, self.operator = rooms.bench, rooms.site, rooms.operator
-        self.things = rooms.bench.reality.things
+        opened = self.laboratory.opened
+        assert opened is not None
+        assert opened.stand_ins is not None
+        assert isinstance(opened.bench.nature, VirtualBench)
+        assert isinstance(opened.operator, VirtualOperator)
+        self.bench, self.site, self.operator = opened.bench, opened.stand_ins, opened.operator
+        self.things = opened.bench.nature.things
         ask = self.operator.ask
 
         async def attended(question: Question) -> str:

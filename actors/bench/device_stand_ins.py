@@ -1,18 +1,18 @@
-"""A virtual site from the event loop: the same calls, awaited."""
+"""The stand-ins of a virtual bench from the event loop: the same calls, awaited."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from actors.bench.site import Addresses, History
+from actors.bench.stand_ins import Found, History
 from actors.device import Device
 
 DEADLINE = 30.0
 """Longest wait for any answer [s]; its process may still be starting."""
 
 
-class Site:
-    """`actors.bench.site.VirtualSite` over a `Device`.
+class DeviceStandIns:
+    """`actors.bench.stand_ins.StandIns` over a `Device`.
 
     Args:
         device: that holds it.
@@ -21,10 +21,10 @@ class Site:
     def __init__(self, device: Device) -> None:
         self.device = device
 
-    async def addresses(self) -> Addresses:
-        """Where controller and balance are."""
-        addresses: Addresses = await self.device.call("addresses", deadline=4.0 * DEADLINE)
-        return addresses
+    async def found(self) -> Found:
+        """Where they are."""
+        found: Found = await self.device.call("found", deadline=4.0 * DEADLINE)
+        return found
 
     async def prepare(self, seed: tuple[int, ...]) -> None:
         """A new pour."""
