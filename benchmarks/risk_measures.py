@@ -28,6 +28,7 @@ from orchestrator.plan import DeploymentPlan, RiskPlan
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.learnt import Recommended
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
@@ -110,14 +111,16 @@ def answer(request: Request, toy: Callable[..., Floats]) -> Outcome:
     return Simulated(PourOutcome(1.0 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.0, 1.0, 1, 0.0, request.seed))
 
 
-def play(strategy: OneShotPlanning, toy: Callable[..., Floats]) -> dict[str, Any]:
-    """A campaign to its end; its result."""
+def play(strategy: OneShotPlanning, toy: Callable[..., Floats]) -> Recommended:
+    """A campaign to its end; what it recommends."""
     waiting: list[Request] = []
     while not strategy.finished:
         waiting += strategy.ask(Slots(1 - sum(isinstance(one, Simulate) for one in waiting), 0))
         request = waiting.pop(0)
         strategy.tell(request, answer(request, toy))
-    return strategy.result()
+    recommended = strategy.result().recommended
+    assert recommended is not None, "nothing was learnt"
+    return recommended
 
 
 def truth(toy: Callable[..., Floats], level: float, places: Floats) -> Floats:
@@ -156,7 +159,7 @@ def main() -> None:
                     risk=risk,
                 )
                 chosen = [
-                    SPACE.encode(play(strategy(plan, SCENE, SimulationParameters(), seed), TOYS[name])["action_si"])
+                    SPACE.encode(play(strategy(plan, SCENE, SimulationParameters(), seed), TOYS[name]).action_si)
                     for seed in range(asked.seeds)
                 ]
                 regrets = truth(TOYS[name], level, np.array(chosen)) - least

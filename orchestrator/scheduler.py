@@ -30,12 +30,14 @@ from orchestrator.events import (
     Watchers,
 )
 from orchestrator.flights import Flight, Order, free_slots, is_recorded, next_to_tell
-from orchestrator.journal import Draft, Journal, Kind
+from orchestrator.journal import Draft, Journal, JournalError, Kind
 from orchestrator.lanes import Lanes
 from orchestrator.replay import StageHistory, replay, replayed_events
-from orchestrator.requests import Ask, Decision, Outcome, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.requests import Ask, Decision, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.results import encode_result
+from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.unknown import needs_answer
+from orchestrator.unknown import needs_answer, weighed_by_hand
 
 _REPORT_INTERVAL = 0.3
 """Least time between two reports of a strategy's progress to watchers, unless one matters [s]."""
@@ -120,11 +122,11 @@ class StageScheduler:
         if history.steps:
             self._report_progress()
 
-    async def run(self) -> dict[str, Any]:
+    async def run(self) -> Learnt:
         """Ask, run and tell until the strategy is finished.
 
         Returns:
-            Its result, JSON-ready, as it is in the journal.
+            What it has learnt, as it is in the journal.
 
         Raises:
             StrategyError: it asks for more than it may, or for nothing while there is nothing to wait for.
@@ -148,8 +150,8 @@ class StageScheduler:
         except BaseException as error:
             await self._wind_down(error)
             raise
-        result = cast("dict[str, Any]", to_json(self._strategy.result()))
-        self._journal.append(Kind.STAGE_CLOSED, {"result": result}, stage=self._stage)
+        result = self._strategy.result()
+        self._journal.append(Kind.STAGE_CLOSED, {"result": encode_result(result)}, stage=self._stage)
         return result
 
     def _ask(self) -> None:
@@ -214,6 +216,7 @@ class StageScheduler:
                     self._append(Kind.POUR_WITHDRAWN, {"id": flight.id, "reason": reason})
                     flight.started = False
 
+                self._journal.check_space_for_pour()
                 outcome = await self._lanes.pour(request, started=started, withdrawn=withdrawn, progress=progress)
             case Suggest():
 
@@ -230,7 +233,12 @@ class StageScheduler:
     def _finish(self, flight: Flight, outcome: Outcome, seconds: float, frames: Frames | None) -> None:
         written = encode_outcome(outcome)
         kind = Kind.POUR_FINISHED if isinstance(flight.request, Pour) else Kind.FINISHED
-        self._append(kind, {"id": flight.id, "outcome": written, "seconds": seconds})
+        try:
+            self._append(kind, {"id": flight.id, "outcome": written, "seconds": seconds})
+        except JournalError as error:
+            if isinstance(flight.request, Pour) and isinstance(outcome, Poured):
+                raise JournalError(f"{error}. {weighed_by_hand(flight.request, outcome.measurement)}") from error
+            raise
         # The strategy is told what the journal holds, so that a replay can't tell it anything else.
         flight.outcome = decode_outcome(written)
         self._finished += 1
@@ -290,7 +298,7 @@ class StageScheduler:
             return
         self._reported = time.monotonic()
         done, total = self._strategy.progress()
-        result = cast("dict[str, Any]", to_json(self._strategy.result()))
+        result = self._strategy.result()
         self._watchers.emit(StrategyProgressed(stage=self._stage, done=done, total=total, result=result))
 
     def _append(self, kind: Kind, body: dict[str, Any]) -> None:

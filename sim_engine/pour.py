@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from sim_engine.backend import Backend
 from sim_engine.calm import calm_until, liquid_velocity
-from sim_engine.contact import describe_contact, first_contact, rotations
+from sim_engine.contact import contact_during, describe_contact, rotations
 from sim_engine.course import LONGEST_TAIL, Course, follow, outcome
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fill import fill, spacing
@@ -45,8 +45,6 @@ __all__ = [
 
 SETTLING = 0.15
 """The lattice may settle so long before the motion begins [s]."""
-
-CONTACT_POSES = 121
 
 PLANES_KEPT = 16
 
@@ -84,12 +82,9 @@ def check_motion(
     Raises:
         InvalidSceneError: with where, how deep and at which tilt.
     """
-    times = np.linspace(0.0, motion.duration, CONTACT_POSES)
-    poses = motion.sample(times)
-    poses[:, :2] -= (error.x, error.y)
-    contact = first_contact(pourer, receiver, poses)
-    if contact is not None:
-        tilt = float(motion.tilt(times[contact.index : contact.index + 1])[0])
+    found = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y))
+    if found is not None:
+        contact, tilt = found
         text = describe_contact(contact, tilt=tilt)
         raise InvalidSceneError(f"{text} ({action.display('x_offset', 'y_offset', 'height')})")
 

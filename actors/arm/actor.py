@@ -102,8 +102,7 @@ class DeviceArm:
 
     def _deadline(self, seconds: float) -> float:
         """For something that takes so long on the controller [s]: twice that, for a lost arm must be noticed."""
-        scale = self._spec.time_scale
-        return PATIENCE + (2.0 * seconds / scale if scale > 0.0 else 0.0)
+        return PATIENCE + 2.0 * self._spec.on_clock(seconds)
 
     async def _watch(self, follow: Follow) -> None:
         while True:

@@ -74,6 +74,10 @@ class ArmSpec(ABC):
         """Longest time that bringing a stopped pourer upright may take [s]."""
         return 4.0 * math.radians(140.0) / self.untilt_speed
 
+    def on_clock(self, seconds: float) -> float:
+        """Bench time on the clock [s]; none where nothing is waited for."""
+        return seconds / self.time_scale if self.time_scale > 0.0 else 0.0
+
     def missing(self) -> str | None:
         """What its driver needs that isn't installed, in words; None if nothing is missing."""
         return None

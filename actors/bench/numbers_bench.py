@@ -152,11 +152,8 @@ class NumbersOperator(Questions):
             raise LaboratoryError(question.problem)  # nobody can mend numbers
         return "done" if question.wants == "done" else "no" if question.about in ("balance", "unsafe") else "yes"
 
-    async def tell(self, text: str) -> None:
-        """See `Operator.tell`."""
-
-    async def say(self, text: str) -> None:
-        """See `Questions.say`."""
+    async def announce(self, text: str, seconds: float) -> None:
+        """See `Operator.announce`."""
 
 
 async def _together(first: Awaitable[T], second: Awaitable[Any]) -> tuple[T, Any]:

@@ -133,6 +133,8 @@ class OnePour:
         except asyncio.CancelledError as error:
             await self._leave_safe()
             if self._begun:
+                weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
+                self._rooms.tell(Notice("warning", weighed))
                 raise
             raise NotPouredError("the pour was given up before it began; nothing was poured") from error
         except (InvalidActionError, PourFailedError):
@@ -252,8 +254,10 @@ class OnePour:
         """
         if not await self._agreed(question):
             raise RefusedError("the operator did not let the arm move")
-        await self._setup.questions.say(f"The arm moves in {self._setup.spec.announcement:g} s. Keep out of its way.")
+        spec = self._setup.spec
+        text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
         # The driver waits for as long from the release to the first movement.
+        await self._setup.questions.announce(text, spec.on_clock(spec.announcement))
         await self._setup.arm.release()
 
     # ---- the way back from a stop
@@ -340,14 +344,16 @@ class OnePour:
         if not self._begun:
             return NotPouredError(f"{error}. Nothing was poured")
         text = f"{error}. What was poured is unknown"
-        weighed = ", ".join(f"{key} {grams(w.mass)}" for key, w in self._weighings.weighed.items())
         with contextlib.suppress(LaboratoryError):
             m = self._weighings.measurement()
             text = (
                 f"{error}. It was not the pour that was asked for; weighed were {grams(m.loaded)} loaded, "
                 f"{grams(m.spilled)} spilled, {grams(m.retained)} retained"
             )
-        return UnknownPourError(f"{text}. All weighings: {weighed or 'none'}")
+        return UnknownPourError(f"{text}. All weighings: {self._weighed()}")
+
+    def _weighed(self) -> str:
+        return ", ".join(f"{key} {grams(w.mass)}" for key, w in self._weighings.weighed.items()) or "nothing"
 
     def _notes(self, measured: PourMeasurement) -> dict[str, Any]:
         executed = self._executed

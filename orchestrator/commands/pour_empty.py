@@ -18,7 +18,6 @@ from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, prin
 
 if TYPE_CHECKING:
     from actors.arm.protocol import Arm, Executed, PlannedPour
-    from actors.arm.spec import ArmSpec
     from orchestrator.plan import CampaignPlan
     from sim_engine.action import Action
 
@@ -58,7 +57,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
             # this command announces each movement itself, by counting down before it lets the arm move
             driver = dataclasses.replace(ready, arm=ready.arm.announced(0.0))
             with connected(driver, checksum) as (arm, facts):
-                cycle = _Cycle(arm, path, _announcement(ready.arm, laboratory.arm.announcement), ask=hardware)
+                cycle = _Cycle(arm, path, ready.arm.on_clock(laboratory.arm.announcement), ask=hardware)
                 executed = cycle.run()
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None
@@ -81,11 +80,6 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     else:
         print(_told(executed))
     say(f"record: {directory / RECORD}")
-
-
-def _announcement(arm: ArmSpec, seconds: float) -> float:
-    """On the clock [s]."""
-    return seconds / arm.time_scale if arm.time_scale > 0.0 else 0.0
 
 
 class _Cycle:

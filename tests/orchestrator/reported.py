@@ -16,6 +16,7 @@ from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.learnt import Learnt
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from tests.orchestrator import watched
@@ -27,7 +28,7 @@ def spilled(action: Action, parameters: SimulationParameters) -> float:
     return min(0.02 + 0.3 * miss + 2.0 * abs(parameters.cohesion - 0.02), 0.9)
 
 
-def played_results() -> dict[str, dict[str, Any]]:
+def played_results() -> dict[str, Learnt]:
     """Results of the real strategies, in a world whose spillage is a formula."""
     plan = watched.campaign(pours=4)
     assert plan.calibration is not None
@@ -40,7 +41,7 @@ def played_results() -> dict[str, dict[str, Any]]:
         split = "test" if number >= 6 else "train"
         pours.append(MeasuredPour(action, spilled(action, SimulationParameters()), 0.98, split))
     calibrated = watched.played(ContinuousBayesianCalibration(_with_height(plan.calibration), pours, 1), spilled)
-    thetas = {"calibrated": SimulationParameters.model_validate(calibrated["theta"])}
+    thetas = {"calibrated": calibrated.found.theta}
     thetas |= random_parameters(watched.THETA, {}, 3, 2)
     evaluated = watched.played(Evaluation(thetas, [ScoredPour("tumbler", pour) for pour in pours], 3), spilled)
     poured = watched.played(Hybrid(plan.deployment, watched.NARROW, SimulationParameters(), 4), spilled)
@@ -49,6 +50,11 @@ def played_results() -> dict[str, dict[str, Any]]:
 
 def _with_height(plan: Any) -> Any:
     return replace(plan, scene=replace(plan.scene, fixed={"height": 0.05}))
+
+
+def changed(part: Any, **updates: Any) -> Any:
+    """A result, or a piece of one, with other values."""
+    return type(part).model_validate({**dict(part), **updates})
 
 
 def shown(renderable: Any) -> str:

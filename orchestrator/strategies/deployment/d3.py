@@ -9,8 +9,8 @@ from actors.optimizer.core.problem import Data, MeanName, Suggestion, SuggestPro
 from orchestrator.plan import DeploymentPlan, ModelName
 from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.deployment.pours import PourTrial
-from orchestrator.strategies.deployment.trust import TrustCheck
+from orchestrator.strategies.deployment.pours import Foretold, PourTrial
+from orchestrator.strategies.deployment.trust import Compared, TrustCheck
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
@@ -162,7 +162,7 @@ class Hybrid(Deployment):
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> dict[str, object]:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
         return super()._trusted(weighed) if self._check is None else self._check.result()
 
     def progress(self) -> tuple[int, int]:

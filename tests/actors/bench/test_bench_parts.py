@@ -92,7 +92,7 @@ class Person:
         await asyncio.sleep(self.after)
         return "done"
 
-    async def tell(self, text: str) -> None:
+    async def announce(self, text: str, seconds: float) -> None:
         pass
 
 
