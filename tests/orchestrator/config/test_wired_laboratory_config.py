@@ -11,7 +11,6 @@ import pytest
 
 from actors.balance.placement import Placement
 from actors.spec import LaboratorySpec
-from orchestrator.codec import from_json, to_json
 from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.laboratory.sections import laboratory_as_file
 from orchestrator.config.load import load_campaign, load_laboratory
@@ -78,7 +77,6 @@ def test_hardware_differs_from_virtual_in_addresses_and_limits_only(tmp_path):
 def test_a_laboratory_as_written_out_loads_to_the_same(tmp_path, text):
     spec = load(tmp_path, text)
     assert load(tmp_path, json.dumps(laboratory_as_file(spec))) == spec
-    assert from_json(json.loads(json.dumps(to_json(spec, LaboratorySpec))), LaboratorySpec) == spec
 
 
 BENCH = "bench:\n  liquid: {particles: 4000}\n  time_scale: 30\n"
