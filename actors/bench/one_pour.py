@@ -56,6 +56,9 @@ WEIGHING_TIME = 3.0
 SETTLING_TIME = 2.0
 """From the arm's return home to the first weighing [s of bench time]: the last drops fall."""
 
+LOOK_INTERVAL = 0.1
+"""Between two looks at the balance's display [s of the clock]."""
+
 _BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
 _STUCK = (ArmError, DeviceLostError)
 
@@ -134,7 +137,7 @@ class OnePour:
             await self._leave_safe()
             if self._begun:
                 weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
-                self._rooms.tell(Notice("warning", weighed))
+                self._setup.tell(Notice("warning", weighed))
                 raise
             raise NotPouredError("the pour was given up before it began; nothing was poured") from error
         except (InvalidActionError, PourFailedError):
@@ -383,7 +386,7 @@ class OnePour:
                 weight = await balance.read()
                 if math.isfinite(weight.mass):
                     self._report.show(weight.mass)
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(LOOK_INTERVAL)
 
 
 def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
