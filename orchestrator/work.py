@@ -90,7 +90,7 @@ def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float
     liquid = 0.0 if bench is None else PRICE * bench.liquid.particles  # that of a virtual bench is simulated
     if laboratory.arm is not None:
         whole = laboratory.operator.time + laboratory.arm.announcement + WAYS + motion + WEIGHINGS
-        return whole / laboratory.arm.time_scale + liquid
+        return laboratory.arm.on_clock(whole) + liquid
     if bench is None or bench.time_scale <= 0.0:
         return liquid
     return (bench.operator_time + WAYS + motion + WEIGHINGS) / bench.time_scale + liquid

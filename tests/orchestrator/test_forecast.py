@@ -8,6 +8,8 @@ from itertools import pairwise
 
 import pytest
 
+from actors.bench.spec import VirtualBenchSpec
+from actors.spec import LaboratorySpec
 from orchestrator.events import Event, RequestFinished, RequestStarted, StageClosed, StageOpened, StrategyProgressed
 from orchestrator.forecast import Forecast, Work
 from orchestrator.requests import Failed, Pour, Simulate, Simulated
@@ -134,11 +136,10 @@ def test_a_person_s_pour_takes_the_time_that_was_set_for_it_and_a_fast_bench_a_p
     }
     campaign = watched.campaign()
     assert campaign.deployment is not None
-    bench = campaign.laboratory.bench
-    assert bench is not None
+    bench = VirtualBenchSpec(SimulationParameters(particles=4000))
     scene, actions = campaign.deployment.scenes[0], campaign.deployment.actions
-    slow = pour_time(replace(campaign.laboratory, bench=replace(bench, time_scale=1.0)), scene, actions)
-    fast = pour_time(replace(campaign.laboratory, bench=replace(bench, time_scale=10.0)), scene, actions)
+    slow = pour_time(LaboratorySpec("slow", bench=replace(bench, time_scale=1.0)), scene, actions)
+    fast = pour_time(LaboratorySpec("fast", bench=replace(bench, time_scale=10.0)), scene, actions)
     liquid = 1.2e-3 * bench.liquid.particles
     assert bench.operator_time + 15.0 < slow - liquid < bench.operator_time + 45.0
     assert fast - liquid == pytest.approx((slow - liquid) / 10.0)

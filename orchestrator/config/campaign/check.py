@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from actors.arm.spec import UrArmSpec
+from actors.arm.spec import ArmSpec
 from actors.protocols import InvalidActionError
 from orchestrator.config.yaml.errors import ConfigError, Problem
 from orchestrator.config.yaml.files import why_not_writable
@@ -51,7 +51,7 @@ class _Role:
 
 @dataclass
 class _Checker:
-    arm: UrArmSpec | None = None
+    arm: ArmSpec | None = None
     document: Document | None = None
     problems: list[Problem | str] = field(default_factory=list)
     vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
@@ -122,10 +122,11 @@ class _Checker:
 
     def _payload(self, scene: Scene) -> None:
         """What the arm believes to carry can't weigh less than the liquid alone."""
-        if self.arm is None or self.arm.payload >= scene.liquid.mass:
+        carries = None if self.arm is None else self.arm.payload_limit
+        if carries is None or carries >= scene.liquid.mass:
             return
         text = (
-            f"the arm is set to carry {self.arm.payload * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
+            f"the arm is set to carry {carries * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
             f"alone, {scene.liquid.mass * 1e3:g} g; the payload is gripper and filled pourer, in the laboratory's file "
             "and on the pendant"
         )
@@ -156,10 +157,8 @@ class _Checker:
         """Why the laboratory's arm, if it has one, can't make it; '' if it can."""
         if self.arm is None:
             return ""
-        from actors.arm.path.plan import plan_path
-
         try:
-            plan_path(plan_motion(scene, action, pourer, receiver), self.arm, pourer, receiver)
+            self.arm.plan(scene, action)
         except InvalidActionError as error:
             return f"{action.display(*actions.names)}: {error}"
         return ""

@@ -7,8 +7,9 @@ import math
 import re
 from typing import Any
 
+from actors.arm.geometry import ArmLimits, Cell, Plane, Pose, Vector
 from actors.arm.path.kinematics import MODELS
-from actors.arm.spec import ArmLimits, Cell, Plane, Pose, UrArmSpec, Vector
+from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arm_sections import (
     JOINTS,
     ArmSection,
