@@ -9,7 +9,7 @@
             arm.close()
 
 The arm stands at home, holds an empty pourer, and has not been connected. It moves in most of these tests: try a
-stand-in first, and stand beside a real one with a finger on the emergency stop. What a bench can't do (`jog`, `trip`) is
+stand-in first, and stand beside a real one with a finger on the emergency stop. What a bench lacks (`jog`, `trip`) is
 left out, and pytest says what was skipped.
 """
 
