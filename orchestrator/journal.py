@@ -26,7 +26,7 @@ from orchestrator.codec import canonical, digest, first_difference
 from orchestrator.errors import RunError
 from orchestrator.states import State
 
-FORMAT = 1
+FORMAT = 2
 """Version of the tables and of the entries' bodies. A journal of another version is refused, never guessed at."""
 
 JOURNAL_NAME = "journal.sqlite"

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+from sim_engine.marks import FREE
 
 Vector = tuple[float, float, float]
 Joints = tuple[float, float, float, float, float, float]
@@ -118,7 +120,7 @@ class UrArmSpec:
     limits: ArmLimits
     cell: Cell
     home: Joints
-    address: str = ""
+    address: Annotated[str, FREE] = ""
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0
     payload_centre: Vector = (0.0, 0.0, 0.0)

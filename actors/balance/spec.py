@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from actors.balance.dialects import DIALECTS, LineSettings
 from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
 from actors.balance.virtual_serial.scale import ScaleSettings
+from sim_engine.marks import FREE
 
 AUTO = "auto"
 """Dialect that is found out."""
@@ -35,17 +36,17 @@ class SerialBalanceSpec:
         time_scale: bench seconds per second of the clock; 1 for everything real.
     """
 
-    port: str
+    port: Annotated[str, FREE]
     dialect: str = AUTO
-    baud: int | None = None
-    format: str | None = None
-    handshake: Handshake = "none"
+    baud: Annotated[int | None, FREE] = None
+    format: Annotated[str | None, FREE] = None
+    handshake: Annotated[Handshake, FREE] = "none"
     settling: SettlingRule = field(default_factory=SettlingRule)
     step: float | None = None
     repeatability: float = 0.0
     interval: float = 0.15
     answer_time: float = 1.0
-    reconnect_time: float = 20.0
+    reconnect_time: Annotated[float, FREE] = 20.0
     time_scale: float = 1.0
 
     def __post_init__(self) -> None:

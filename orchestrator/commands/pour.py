@@ -294,7 +294,8 @@ def _only(chosen: Chosen) -> CampaignPlan:
     """The campaign without everything that this pour isn't of."""
     plan = chosen.plan
     if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
-        deployment = dataclasses.replace(plan.deployment, scenes=(chosen.scene,), pours=1)
+        settings = plan.deployment.settings.model_copy(update={"pours": 1})
+        deployment = dataclasses.replace(plan.deployment, scenes=(chosen.scene,), settings=settings)
         return dataclasses.replace(plan, calibration=None, deployment=deployment)
     return dataclasses.replace(plan, deployment=None)
 

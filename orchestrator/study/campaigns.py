@@ -23,6 +23,7 @@ from orchestrator.stages import (
     stage_seed,
     with_posterior,
 )
+from orchestrator.strategies.calibration.c1 import C1Settings
 from orchestrator.strategies.calibration.design import DesignedPours, draw_allowed, stratified
 from orchestrator.strategies.calibration.prior import region_of
 from orchestrator.strategies.calibration.scorecard import Scorecard
@@ -92,7 +93,9 @@ def _actions(study: StudyPlan) -> list[Action]:
 
 def _table(study: StudyPlan, seed: int) -> Strategy:
     plan = study.calibration("C1").plan
-    middles = [[(i + 0.5) / plan.grid[name] for i in range(plan.grid[name])] for name in plan.parameters.names]
+    assert isinstance(plan.settings, C1Settings)
+    cells = plan.settings.cells
+    middles = [[(i + 0.5) / cells[name] for i in range(cells[name])] for name in plan.parameters.names]
     thetas = [
         SimulationParameters.from_values({**plan.fixed_parameters, **plan.parameters.decode(point)})
         for point in itertools.product(*middles)

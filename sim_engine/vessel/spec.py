@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from sim_engine.marks import BY_CONTENT
+
 LengthUnit = Literal["m", "cm", "mm", "in"]
 
 
@@ -32,7 +34,7 @@ class MeshShape(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["mesh"] = "mesh"
-    path: Path
+    path: Annotated[Path, BY_CONTENT]
     unit: LengthUnit | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
 

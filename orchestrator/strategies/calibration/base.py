@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Generic, TypeVar, cast
 
 from actors.optimizer.core.problem import Point, Suggestion
 from orchestrator.errors import LearningError
@@ -13,6 +14,7 @@ from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.display import displayed_map
 from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.settings import CalibrationSettings
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.liquid import SimulationParameters
@@ -20,15 +22,16 @@ from sim_engine.losses import MINIMUM_POURED, normalised_spillage
 
 MAP_RESOLUTION = 30
 
+S = TypeVar("S", bound=CalibrationSettings)
+"""Settings of a calibration."""
 
-class Calibration(ABC):
+
+class Calibration(ABC, Generic[S]):
     """Base of C1 to C4. Subclasses say what to try next (`_next`) and what a simulation tells (`_discrepancy`).
 
     Only pours of the split 'train' are used. A simulation that failed, or poured too little for c_s to be defined, says
     nothing and is dropped.
     """
-
-    NAME = ""
 
     def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
         """Plan the campaign.
@@ -44,7 +47,8 @@ class Calibration(ABC):
                 f"{len(self._usable)} of {len(self._train)}; make more pours, or let them tilt farther (max_angle)"
             )
         self._plan = plan
-        self._seeds = SeedStream(seed, self.NAME)
+        self._settings = cast(S, plan.settings)
+        self._seeds = SeedStream(seed, plan.strategy)
         self._questions = Questions(self._seeds)
         self._trials = Trials()
         self._width_known = False
@@ -162,7 +166,7 @@ class Calibration(ABC):
         """θ* with its expected discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
         trials = [(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed]
         result: dict[str, object] = {
-            "strategy": self.NAME,
+            "strategy": self._plan.strategy,
             "simulations": self._trials.answered,
             "lost": self._trials.lost,
             "undefined": self._undefined,
