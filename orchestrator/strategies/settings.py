@@ -33,7 +33,7 @@ class Complaints(Protocol):
             text: what is wrong, and what would be right.
             at: keys from the section down to the place; none: the section itself.
             key: point at the key and not at its value.
-            of: the key that is missing, for problems of the section: nothing is noted if something is wrong with it.
+            of: a key that it is about: nothing is noted if something is wrong with it, or below it.
         """
 
     @property

@@ -20,7 +20,7 @@ class PlacedComplaints:
     def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
         """Note a problem, unless something is wrong there already."""
         where = self._place.at(*at)
-        if (at and self._broken_below(where.loc)) or (of and self._report.is_broken(self._place.at(of))):
+        if (at and self._below(where.loc)) or (of and self._below(self._place.at(of).loc)):
             return
         self._report.add(where, text, key=key)
 
@@ -31,9 +31,6 @@ class PlacedComplaints:
             return True
         start = len(self._place.loc)
         return any(loc[start] not in self._common for loc in self._below(self._place.loc) if len(loc) > start)
-
-    def _broken_below(self, loc: Loc) -> bool:
-        return bool(self._below(loc))
 
     def _below(self, loc: Loc) -> list[Loc]:
         path = self._place.document.path

@@ -71,7 +71,8 @@ def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
     fields: Any = {}
     for key in keys:
         info = settings.model_fields[key]
-        fields[key] = (Annotated[(info.annotation, *info.metadata)] | None, Field(None, description=info.description))
+        value: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
+        fields[key] = (value | None, Field(None, description=info.description))
     name = f"{settings.model_fields['strategy'].default}ArmSection"
     model = create_model(name, __base__=ArmSection, __doc__=ArmSection.__doc__, **fields)
     model.required = ArmSection.required | required

@@ -9,8 +9,6 @@ from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import qmc
 
 from actors.optimizer.core.problem import Disturbance, Point, Risk
 from orchestrator.config.pose import PoseNoiseSection
@@ -69,7 +67,9 @@ class RiskSettings(Section):
     def check(self, complaints: Complaints) -> None:
         """A level belongs to CVaR, and something has to be uncertain."""
         if self.level is not None and self.measure != "cvar":
-            complaints.add("belongs to 'measure: cvar'; remove it, or ask for cvar", "risk", "level", key=True)
+            complaints.add(
+                "belongs to 'measure: cvar'; remove it, or ask for cvar", "risk", "level", key=True, of="risk"
+            )
         if self.errors == EXACT and self.theta == "best":
             complaints.add(
                 "names nothing that could go wrong; add 'pose_error: {x: 3 mm, speed_factor: 0.02}', or "
@@ -141,11 +141,15 @@ class Disturbances:
         dimension = len(self.errors) + bool(self._thetas)
         if dimension == 0:
             return [self.nominal] * count
+        from scipy.stats import qmc
+
         sampler = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng([self._seed, stream]))
         uniform = sampler.random_base2(max(math.ceil(math.log2(count)), 0))[:count]
         return [self._draw(row) for row in uniform]
 
     def _draw(self, row: Sequence[float]) -> Draw:
+        from scipy.special import ndtri
+
         z = tuple(float(np.clip(ndtri(u), -FARTHEST, FARTHEST)) for u in row[: len(self.errors)])
         drawn = {name: getattr(self._deviations, name) * value for name, value in zip(self.errors, z, strict=True)}
         drawn["speed_factor"] = min(max(1.0 + drawn.get("speed_factor", 0.0), SLOWEST), FASTEST)

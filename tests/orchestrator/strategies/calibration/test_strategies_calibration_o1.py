@@ -14,7 +14,7 @@ from tests.orchestrator.play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
 
 STRATEGIES = {"C1": UniformGrid, "C2": StratifiedSampling, "C3": BayesianCalibration}
-BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"thetas": 18}, "C3": {"thetas": 16}}
+BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"samples": 18}, "C3": {"iterations": 16}}
 
 
 def measured(seed=0, count=12, holdout=2):

@@ -133,7 +133,7 @@ def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
 
 
 def test_d3_simulates_freely_while_a_pour_is_under_way():
-    strategy = make("D3", pours=3, per_pour=None)
+    strategy = make("D3", pours=3, per_pour="free")
     played = Play(narrow_cup, slots=2, beside=9)(strategy)
     assert len(played.pours) == 3
     assert sum(r.purpose == "refine" for r in played.simulations) > 8
