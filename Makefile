@@ -1,13 +1,15 @@
 # Everything that a fresh machine needs is Python 3.11 to 3.13, git and make.
 #   make install   sets up, and nothing else
 #   make demo      sets up and runs the quickstart campaign on the virtual bench
-#   make test      sets up and runs all checks and tests
+#   make test      sets up and runs all checks and the quick tests
+#   make slow      the long tests
+#   make docs      the documentation as a site, in build/site
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: install demo test lint unit slow lock clean
+.PHONY: install demo test lint unit slow docs coverage oldest lock clean
 .DEFAULT_GOAL := demo
 
 $(READY): requirements.lock pyproject.toml
@@ -37,8 +39,24 @@ lint: $(READY)
 unit: $(READY)
 	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile
 
+# What takes long, and every property on four times as many examples.
 slow: $(READY)
-	$(BIN)/pytest -m slow
+	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 --dist loadfile
+
+docs: $(READY)
+	$(BIN)/sphinx-build -W --keep-going -q -b html -c docs . build/site
+	@echo "open build/site/index.html"
+
+# Which lines the quick tests run, in this process and in those that they start.
+coverage: $(READY)
+	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow" -n 3 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+
+# The tests that start nothing, with the oldest dependencies that pyproject.toml allows (needs uv).
+OLDEST := build/oldest
+oldest:
+	uv venv -q --python 3.11 $(OLDEST)
+	uv pip install -q --python $(OLDEST)/bin/python --resolution lowest-direct --group dev -e .
+	$(OLDEST)/bin/python -m pytest -q -m "not slow and not realtime and not ray" tests/orchestrator tests/sim_engine
 
 # After a change of the dependencies in pyproject.toml (needs uv).
 lock:

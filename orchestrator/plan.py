@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
@@ -136,6 +136,10 @@ class CalibrationPlan:
         """Name of the strategy."""
         return self.settings.strategy
 
+    def with_settings(self, **changes: Any) -> Self:
+        """The plan with other settings of the same strategy."""
+        return replace(self, settings=self.settings.model_copy(update=changes))
+
     @property
     def simulations(self) -> int:
         """Single simulated pours that the strategy may spend; of pours still to be made some may be lost."""
@@ -173,6 +177,10 @@ class DeploymentPlan:
     def strategy(self) -> str:
         """Name of the strategy."""
         return self.settings.strategy
+
+    def with_settings(self, **changes: Any) -> Self:
+        """The plan with other settings of the same strategy."""
+        return replace(self, settings=self.settings.model_copy(update=changes))
 
     @property
     def pours(self) -> int:

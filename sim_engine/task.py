@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from sim_engine.action import Action
 from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.vessel.spec import VesselSpec
-
-if TYPE_CHECKING:
-    from sim_engine.motion import SampledMotion
 
 
 @dataclass(frozen=True)

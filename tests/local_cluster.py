@@ -19,11 +19,12 @@ from pathlib import Path
 import psutil
 
 from actors.ray_warden import MARK, cluster_processes, end_cluster
+from tests.patience import PATIENCE
 
 NOT_OURS = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 """Titles of Ray's own processes and of workers that wait for work."""
 
-START_DEADLINE = 120.0
+START_DEADLINE = PATIENCE
 """For one node on a busy machine [s]."""
 
 

@@ -1,12 +1,12 @@
-"""What the pages say must be so: commands parse, links and paths lead somewhere, tables are the code's."""
+"""What the pages say must be so: commands parse, named files exist, tables are the code's (`make docs`: links)."""
 
 from __future__ import annotations
 
 import importlib.util
 import re
 import shlex
+import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -26,7 +26,7 @@ from sim_engine.task import Scene
 from sim_engine.vessel.build import build_vessel
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "configs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").rglob("*.md")])
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
@@ -47,11 +47,6 @@ def commands_of(page: Path) -> list[str]:
     spans = re.findall(r"`([^`\n]+)`", prose_of(page))
     known = (re.sub(r"^(\.venv/bin/)", "", line.strip()) for line in [*blocks, *spans])
     return [line for line in known if line.startswith("decant ") and not line.startswith("decant …")]
-
-
-def anchors_of(page: Path) -> set[str]:
-    headings = re.findall(r"^#+ (.+)$", prose_of(page), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.fixture(scope="module")
@@ -82,18 +77,6 @@ def test_shown_commands_are_understood(page: Path) -> None:
         for argument in arguments:
             if argument.startswith("configs/"):
                 assert (ROOT / argument).exists(), line
-
-
-@each_page
-def test_links_lead_somewhere(page: Path) -> None:
-    for link in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
-        if link.startswith(("https://", "http://")):
-            continue
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        assert target.exists(), link
-        if anchor:
-            assert anchor in anchors_of(target), link
 
 
 @each_page
@@ -209,6 +192,9 @@ def test_quickstart_is_what_the_guide_says() -> None:
     assert said in " ".join(text_of(ROOT / "docs" / "user-guide.md").split())
 
 
-def test_changelog_has_this_version() -> None:
-    project = tomllib.loads(text_of(ROOT / "pyproject.toml"))["project"]
-    assert f"## [{project['version']}]" in text_of(ROOT / "CHANGELOG.md")
+def test_changelog_has_every_version_that_was_released() -> None:
+    """The version comes from the tag, so that a tag needs its chapter before the next change."""
+    tags = subprocess.run(["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    headings = set(re.findall(r"^## \[([^\]]+)\]", text_of(ROOT / "CHANGELOG.md"), re.MULTILINE))
+    assert {tag.removeprefix("v") for tag in tags.split()} <= headings
+    assert "Unreleased" in headings

@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.motion import PourMotion, SampledMotion
+from sim_engine.motion import PourMotion
+from sim_engine.sampled_motion import SampledMotion
 
 FloatArray = NDArray[np.float64]
 

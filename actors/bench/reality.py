@@ -25,7 +25,7 @@ from actors.bench.virtual_operator import Hands
 from actors.bench.world import ATTEMPTS, draw_pose_error, spill_of, stream
 from actors.protocols import InvalidActionError, LaboratoryError, SimulatorPool
 from sim_engine.action import Action
-from sim_engine.motion import SampledMotion
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import PoseError, PourTask, Scene
 
 AT_START = 2e-3
@@ -43,6 +43,9 @@ LONGEST_REST = 6.0
 
 NOTING_INTERVAL = 40.0
 """Between two looks at what the controller did [s of its time]; it remembers two minutes."""
+
+LONGEST_GAP = 0.1
+"""Between two samples of a history without a gap [s of controller time]; it is sampled at 125 Hz."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ class Reality:
         self._joints: list[tuple[float, ...]] = []
         self._since = self._earlier = 0.0
         self._settled = False
+        self._gap = ""
 
     async def prepare(self, pour: PourAsk) -> None:
         """A pour is about to be prepared by the operator."""
@@ -92,17 +96,24 @@ class Reality:
 
     async def begin(self) -> None:
         """The arm is about to leave home."""
-        self._times, self._joints, self._settled = [], [], False
+        self._times, self._joints, self._settled, self._gap = [], [], False, ""
         self._earlier, self._since = 0.0, (await self.site.history(math.inf)).now
 
     async def note(self) -> None:
-        """Take down what the arm did since; to be called within two minutes of the controller's time."""
+        """Take down what the arm did since.
+
+        The controller remembers two minutes of its time: whoever comes later, because its process was held up, misses
+        part of the motion. That is kept in mind, and `settle` then doesn't say what became of the liquid.
+        """
         async with self._noting:
             history = await self.site.history(self._since)
             if history.now < self._since:  # the controller was switched off, and its clock begins anew
+                self._gap = self._gap or "the controller was switched off, and forgot what its arm had done before"
                 self._earlier += self._since
                 self._since = 0.0
                 history = await self.site.history(0.0)
+            if (missed := _missed(history, self._since)) > LONGEST_GAP:
+                self._gap = self._gap or f"{missed:.0f} s of its arm's motion are forgotten by the controller"
             self._take(history)
 
     async def follow(self) -> None:
@@ -124,10 +135,15 @@ class Reality:
         """Let the liquid follow what the arm did, once, and have the balance carry what became of it.
 
         Raises:
-            LaboratoryError: with the errors of this pour's placement the vessels would touch, or the liquid could not
-                be simulated.
+            LaboratoryError: with the errors of this pour's placement the vessels would touch, the liquid could not be
+                simulated, or part of the motion is not known: then nobody can say what became of the liquid.
         """
         assert self._pour is not None
+        if self._gap:
+            raise LaboratoryError(
+                f"the virtual bench can't tell what became of the liquid: {self._gap}, because a process of the bench "
+                "was stopped or starved meanwhile"
+            )
         if self._settled:
             return
         self._settled = True
@@ -170,6 +186,11 @@ class Reality:
                 return spill.spilled, spill.retained
             reason = outcome.invalid
         raise LaboratoryError(f"the virtual bench's liquid could not be simulated: {reason}")
+
+
+def _missed(history: History, since: float) -> float:
+    """How long nothing is known of the motion, from a time on that was asked for until what was kept of it [s]."""
+    return max((history.times[0] if history.times else history.now) - since, 0.0)
 
 
 def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray] | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -166,8 +166,11 @@ class WiredPour:
         """Out, pour, home: all of it after one consent, unless something stops it."""
         rooms, path = self._rooms, self._path
         await self._consent(start_question(rooms.spec, path))
-        if rooms.reality is not None:
-            await rooms.reality.begin()
+        async with self._followed():
+            await self._out_and_home()
+
+    async def _out_and_home(self) -> None:
+        rooms, path = self._rooms, self._path
         self._report.enter("approach")
         try:
             await rooms.arm.move_to_start(path)
@@ -257,20 +260,14 @@ class WiredPour:
 
     async def _bring_upright(self, error: Exception) -> None:
         """After a stop with the pourer tilted: nothing moves before somebody has looked at it and said so, twice."""
-        following = None if self._rooms.reality is None else asyncio.create_task(self._rooms.reality.follow())
-        try:
-            while True:
-                await self._recover(error)
-                await self._consent(upright_question(self._rooms.spec))
-                try:
-                    await self._rooms.arm.untilt(self._path)
-                    return
-                except _STUCK as again:
-                    error = again
-        finally:
-            if following is not None:
-                following.cancel()
-                await asyncio.gather(following, return_exceptions=True)
+        while True:
+            await self._recover(error)
+            await self._consent(upright_question(self._rooms.spec))
+            try:
+                await self._rooms.arm.untilt(self._path)
+                return
+            except _STUCK as again:
+                error = again
 
     async def _bring_home(self, error: Exception) -> None:
         """After a stop on the way to the pour or from it."""
@@ -320,6 +317,21 @@ class WiredPour:
             await asyncio.shield(stopping)
 
     # ---- the liquid
+
+    @contextlib.asynccontextmanager
+    async def _followed(self) -> AsyncIterator[None]:
+        """On a virtual bench, take down what the arm does for as long as this, however long anybody needs."""
+        reality = self._rooms.reality
+        if reality is None:
+            yield
+            return
+        await reality.begin()
+        following = asyncio.create_task(reality.follow())
+        try:
+            yield
+        finally:
+            following.cancel()
+            await asyncio.gather(following, return_exceptions=True)
 
     async def _note(self) -> None:
         """What the virtual bench's arm did so far."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from actors.ur.models import Joints
+from actors.virtual_ur.commands import commands_of
 from actors.virtual_ur.exchange import Registers, Signals
 from actors.virtual_ur.messages import Listener, Message
 from actors.virtual_ur.models import HOME, ControlledModel
@@ -14,7 +15,8 @@ from actors.virtual_ur.power import Power, RobotMode
 from actors.virtual_ur.robot import Robot
 from actors.virtual_ur.safety import Safety, SafetyConfiguration, SafetyMode
 from actors.virtual_ur.urscript.errors import ScriptError
-from actors.virtual_ur.urscript.program import Program
+from actors.virtual_ur.urscript.program import Program, waiting
+from actors.virtual_ur.urscript.translate import Translated, translate
 from actors.virtual_ur.watchdogs import Watchdogs
 
 
@@ -32,6 +34,8 @@ class RuntimeState(IntEnum):
 _POWERLESS = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.FAULT)
 """Modes in which the arm has no power."""
 
+MOST_SECONDARY = 10
+"""Secondary programs beside the main one."""
 
 Watcher = Callable[[], bool]
 """Called each cycle until it returns True."""
@@ -51,6 +55,7 @@ class Controller:
 
     Attributes:
         now: controller time [s].
+        known_commands: what the translator has to know of the commands that programs may call.
         switches: how often somebody switched between remote and local control.
     """
 
@@ -65,8 +70,6 @@ class Controller:
         joints: Joints = HOME,
         configuration: SafetyConfiguration | None = None,
     ) -> None:
-        from actors.virtual_ur.commands import commands_of
-
         self.model = model
         self.frequency = frequency or model.frequency
         self.dt = 1.0 / self.frequency
@@ -92,6 +95,7 @@ class Controller:
         self.safety_popup = False
         self._resumes = False
         self._commands = commands_of(self)
+        self.known_commands = waiting(self._commands)
 
     # ---- telling
 
@@ -111,11 +115,21 @@ class Controller:
     def upload(self, text: str) -> None:
         """Run a program; one that runs is ended. What can't be run is refused with a message."""
         try:
-            program = Program(text, self._commands)
+            self.begin(translate(text, self.known_commands))
         except ScriptError as error:
-            self.tell("exception", f"compile error: {error.text}", error.line)
-            return
+            self.refuse(error)
+
+    def refuse(self, error: ScriptError) -> None:
+        """Say why a program can't be run."""
+        self.tell("exception", f"compile error: {error.text}", error.line)
+
+    def begin(self, translated: Translated) -> None:
+        """Run a program that has been translated; see `upload`."""
+        program = Program(translated, self._commands)
         if program.secondary:
+            if len(self.secondary) >= MOST_SECONDARY:
+                self.tell("key", f"program {program.name} not started: {MOST_SECONDARY} secondary programs run already")
+                return
             self.secondary.append(program)
             return
         if not (self.power.running and self.safety.may_move):

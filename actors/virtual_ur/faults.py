@@ -191,6 +191,7 @@ class Faults:
 
         def begin() -> None:
             self._controller.reboot()
+            self._host.connections.uploads.forget()
             self.refuse(seconds)
 
         self._when(begin, **when)

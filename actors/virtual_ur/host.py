@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import faulthandler
 import os
 import time
 import traceback
@@ -153,6 +154,7 @@ class Host:
                     self.timing.ticks += 1
                     controller.tick()
             if not self.halted:
+                self.connections.uploads.work(0.5 * max(period, SLOWEST_WAKE))
                 clock = controller.now / max(1.0, controller.time_scale)
                 self.rtde.publish(clock)
                 self.primary.publish(clock)
@@ -163,10 +165,21 @@ class Host:
         self._clock = loop.call_at(max(self._next, now + min(period, SLOWEST_WAKE)), self._wake)
 
 
-async def until_orphaned(parent: int, interval: float = 0.5) -> None:
+HUNG = 20.0
+"""Wall time after which a process whose interpreter doesn't get on is ended [s]."""
+
+
+async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG) -> None:
     """Wait for a parent process to end: by its standard input, which ends with it, and by its number.
 
-    The pipe alone isn't enough: a grandchild that was forked may hold its other end open.
+    The pipe alone isn't enough: a grandchild that was forked may hold its other end open. Neither is noticed by an
+    interpreter that hangs; so a thread without Python in it ends the process, with a traceback, unless it is put
+    off again and again.
+
+    Args:
+        parent: its number.
+        interval: between two looks [s].
+        hung: longest time that the interpreter may hang [s].
     """
     loop = asyncio.get_running_loop()
     gone = asyncio.Event()
@@ -179,6 +192,7 @@ async def until_orphaned(parent: int, interval: float = 0.5) -> None:
     with contextlib.suppress(OSError):  # not every standard input can be waited for: /dev/null can't
         loop.add_reader(0, readable)
     while not gone.is_set() and os.getppid() == parent:
+        faulthandler.dump_traceback_later(hung, exit=True)
         try:
             await asyncio.wait_for(gone.wait(), interval)
         except TimeoutError:

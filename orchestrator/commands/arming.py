@@ -15,7 +15,7 @@ from actors.arm.joint_path import PathReport
 from actors.arm.spec import UrArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
-from orchestrator.commands.common import BAD_INPUT, RefusalError, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
 from orchestrator.config.yaml.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
 from orchestrator.strategies.calibration.prior import actions_all_over

@@ -9,16 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.commands.common import (
-    BAD_INPUT,
     Finished,
-    RefusalError,
     check_campaign_can_run,
     check_laboratory_answers,
-    print_json,
     read_campaign,
     run_in_front_of_people,
-    say,
 )
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, print_json, say
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan

@@ -8,11 +8,11 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, say
 from orchestrator.commands.doctor_arm import judge
 from orchestrator.commands.doctor_balance import look_at_balance
 from orchestrator.commands.doctor_look import Check, Findings, look_at
 from orchestrator.commands.hands_on import reached
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
 from orchestrator.safety import SafetyRecord, SafetyRecordError, read_record, record_path, write_record
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from actors.arm.checksum import ChecksumError
-from orchestrator.commands.common import BAD_INPUT, RefusalError, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
 from orchestrator.safety import SafetyRecordError, read_record
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ import numpy as np
 from actors.arm.spec import UrArmSpec
 from actors.protocols import LaboratoryError
 from orchestrator.commands.arming import confirm, require_flag
-from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, say
 from orchestrator.commands.doctor import read_laboratory
 from orchestrator.commands.hands_on import accepted_for, connected, reached, stoppable, typed_line
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, say
 
 if TYPE_CHECKING:
     from actors.arm.ur.driver import UrArm

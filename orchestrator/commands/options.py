@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.commands.common import INTERRUPTED, RefusalError, fail
+from orchestrator.commands.speaking import INTERRUPTED, RefusalError, fail
 
 Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]

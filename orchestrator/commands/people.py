@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
-from orchestrator.commands.common import BAD_INPUT, RefusalError, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
 
 if TYPE_CHECKING:
     from actors.operator import Operator

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
 
 if TYPE_CHECKING:
     from rich.progress import TaskID

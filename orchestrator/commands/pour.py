@@ -10,16 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from actors.arm.joint_path import JointPath, PathReport, PourPath
 from orchestrator.commands.arming import accepted, confirm, report_lines, require_flag
-from orchestrator.commands.common import (
-    BAD_INPUT,
-    FAILED,
-    RefusalError,
-    check_output,
-    print_json,
-    read_campaign,
-    say,
-)
+from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.single import scene_to_simulate
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -294,8 +287,7 @@ def _only(chosen: Chosen) -> CampaignPlan:
     """The campaign without everything that this pour isn't of."""
     plan = chosen.plan
     if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
-        settings = plan.deployment.settings.model_copy(update={"pours": 1})
-        deployment = dataclasses.replace(plan.deployment, scenes=(chosen.scene,), settings=settings)
+        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(chosen.scene,))
         return dataclasses.replace(plan, calibration=None, deployment=deployment)
     return dataclasses.replace(plan, deployment=None)
 

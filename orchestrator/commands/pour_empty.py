@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from actors.arm.joint_path import ExecutedPath, PourPath
 from actors.protocols import LaboratoryError
 from orchestrator.commands.arming import accepted, confirm, report_lines
-from orchestrator.commands.common import BAD_INPUT, FAILED, RefusalError, print_json, say
 from orchestrator.commands.hands_on import connected, reached, stoppable, typed_line
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
 
 if TYPE_CHECKING:
     from actors.arm.ur.driver import UrArm

@@ -9,16 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.common import (
-    BAD_INPUT,
-    FAILED,
-    RefusalError,
-    check_output,
-    print_json,
-    read_campaign,
-    say,
-    stdout_for_results,
-)
+from orchestrator.commands.common import check_output, read_campaign
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.common import BAD_INPUT, INTERRUPTED, RefusalError, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, INTERRUPTED, RefusalError, print_json, say
 
 if TYPE_CHECKING:
     from orchestrator.study.cells import Cell

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,6 +117,82 @@ def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "", grid: str | 
         axes.grid(True, color=PALE, linewidth=0.6)
     elif grid in ("x", "y"):
         axes.grid(True, axis="x" if grid == "x" else "y", color=PALE, linewidth=0.6)
+
+
+MARGIN = 0.045
+"""Room of a searched axis beyond either of its bounds, as a share of its length: what lies on a bound is seen whole."""
+
+FEWEST_TICKS = 3
+
+_LOG_STEPS = (
+    (1.0,),
+    (1.0, 2.0, 5.0),
+    (1.0, 1.5, 2.0, 3.0, 5.0, 7.0),
+    (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0),
+)
+
+
+def frame(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
+    """Scale, limits and ticks of a searched axis; its line ends where the search did. Call it after `dress`.
+
+    Args:
+        axis: searched, its bounds in SI.
+        which: of the picture's axes.
+    """
+    from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+    factor = display_factor(axis.name)
+    low, high = axis.lower / factor, axis.upper / factor
+    handle, side = (axes.xaxis, "bottom") if which == "x" else (axes.yaxis, "left")
+    limits = axes.set_xlim if which == "x" else axes.set_ylim
+    if axis.scale == "log":
+        (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+        places, room = log_ticks(low, high), (high / low) ** MARGIN
+        limits(low / room, high * room)
+        handle.set_minor_locator(NullLocator())
+    else:
+        slack = 1e-9 * (high - low)
+        places = [t for t in MaxNLocator(6).tick_values(low, high) if low - slack <= t <= high + slack]
+        limits(low - MARGIN * (high - low), high + MARGIN * (high - low))
+    handle.set_major_locator(FixedLocator(places))
+    handle.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.spines[side].set_bounds(low, high)
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Round numbers between two positive ones, `FEWEST_TICKS` or more where there are so many: 500, 700, 1000, 1500."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    places: list[float] = []
+    for steps in _LOG_STEPS:
+        candidates = sorted(step * 10.0**decade for decade in decades for step in steps)
+        places = [place for place in candidates if low * (1 - 1e-9) <= place <= high * (1 + 1e-9)]
+        if len(places) >= FEWEST_TICKS:
+            break
+    return places
+
+
+def number(value: float) -> str:
+    """As people write it on an axis: '0.05', '1 500'."""
+    return f"{value:.6g}" if abs(value) < 1000 else f"{value:,.0f}".replace(",", " ")
+
+
+def at_ends(values: dict[str, float | None], axes: tuple[Axis, ...]) -> list[str]:
+    """Which searched values lie at an end of what was searched: 'angular velocity at its upper end (150 deg/s)'.
+
+    Args:
+        values: of a point [SI].
+        axes: searched.
+    """
+    said = []
+    for axis in axes:
+        value = values.get(axis.name)
+        if value is None:
+            continue
+        unit = axis.encode(value)
+        if min(unit, 1.0 - unit) < 1e-3:
+            end = "upper" if unit > 0.5 else "lower"
+            said.append(f"{axis.name.replace('_', ' ')} at its {end} end ({display_value(axis.name, value)})")
+    return said
 
 
 def save(figure: Figure, path: Path) -> Path:

@@ -11,6 +11,7 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_names
 from orchestrator.report.occupancy import occupancy_lines
+from orchestrator.report.posterior import posterior_lines
 from orchestrator.report.results import (
     SPLITS,
     Result,
@@ -172,7 +173,7 @@ def summary_table(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableT
     parts: list[RenderableType] = [Text(f"\n{summary['campaign']}  seed {summary['seed']}", style="bold")]
     if summary["theta"] is not None:
         parts.append(_theta_line(plan, summary))
-        parts += _posterior_lines(summary)
+        parts += _posterior_lines(plan, summary)
     discrepancies = {split: row for split, row in summary["discrepancy"].items() if _has_numbers(row.values())}
     if discrepancies:
         parts.append(_discrepancy_table(discrepancies))
@@ -205,19 +206,13 @@ def _theta_line(plan: CampaignPlan, summary: Mapping[str, Any]) -> RenderableTyp
     return text
 
 
-def _posterior_lines(summary: Mapping[str, Any]) -> list[RenderableType]:
+def _posterior_lines(plan: CampaignPlan, summary: Mapping[str, Any]) -> list[RenderableType]:
     from rich.text import Text
 
-    posterior = summary["posterior"]
-    if posterior is None:
+    if summary["posterior"] is None or plan.calibration is None:
         return []
-    regions = [
-        f"{name.replace('_', ' ')} {style.display_value(name, low)} … {style.display_value(name, high)}"
-        + (" (open)" if name in posterior["open"] else "")
-        for name, (low, high) in posterior["region"].items()
-    ]
-    text = f"  {100 * posterior['level']:.0f} % of θ that fit the pours: {', '.join(regions)}"
-    return [Text(text, style="dim"), *(Text(f"  {line}", style="dim") for line in posterior["directions"])]
+    lines = posterior_lines(summary["posterior"], plan.calibration.parameters)
+    return [Text(f"  {line}", style="dim") for line in lines]
 
 
 _LOSSES = ("first_loss", "best_loss", "predicted_loss")

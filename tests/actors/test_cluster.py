@@ -16,6 +16,7 @@ import pytest
 
 from tests.end_to_end.small import CAMPAIGN, write_campaign
 from tests.local_cluster import LocalCluster
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.ray
 
@@ -72,7 +73,7 @@ def decant(folder: Path, address: str, environment: dict[str, str]) -> subproces
         env={**environment, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
     )
 
 
@@ -111,13 +112,13 @@ def test_when_a_node_dies_its_simulations_are_repeated_elsewhere_and_people_are_
         text=True,
     )
     try:
-        end = time.monotonic() + 60.0
+        end = time.monotonic() + PATIENCE
         while not (log.exists() and log.read_text().count("end") >= 6 and busy_on_both(log)):
             assert time.monotonic() < end, program.poll()
             time.sleep(0.05)
         hold_amid_a_simulation(cluster.workers(1), log)
         cluster.kill_node(1)
-        output, errors = program.communicate(timeout=120)
+        output, errors = program.communicate(timeout=PATIENCE)
     finally:
         program.kill()
     said = [json.loads(line) for line in output.splitlines() if line.startswith("[")]
@@ -137,7 +138,7 @@ def test_when_a_node_dies_its_simulations_are_repeated_elsewhere_and_people_are_
 
 def hold_amid_a_simulation(workers: list[psutil.Process], log: Path) -> None:
     """Stop the simulator among a node's processes between the begin and the end of a simulation."""
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         for worker in workers:
             if not under_way(log, worker.pid):

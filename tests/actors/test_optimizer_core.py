@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.optimizer.core.propose import propose
 from sim_engine.space import Axis, Space
+from tests.depth import examples
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 
@@ -29,7 +30,7 @@ coordinate = st.sampled_from([0.0, 0.25, 0.5, 0.5000001, 1.0]) | st.floats(0.0, 
 cost = st.sampled_from([0.0, 1.0, 1.0]) | st.floats(-1e6, 1e6)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     observed=st.lists(st.tuples(coordinate, coordinate, cost), max_size=12),
     simulated=st.lists(st.tuples(coordinate, coordinate, cost), max_size=8),

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from actors.optimizer.core.problem import Data, Effort, Linear, SuggestProblem
 from actors.optimizer.core.propose import propose
 from sim_engine.space import Axis, Space
+from tests.depth import examples
 
 MEANS = ("constant", "zero", "simulated", "pooled", "scaled")
 axes = st.sampled_from(
@@ -68,7 +69,7 @@ def questions(draw):
     )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 @given(question=questions())
 def test_proposals_are_finite_and_keep_to_bounds_whole_numbers_and_constraints(question):
     answer = propose(question)
@@ -89,7 +90,7 @@ def test_proposals_are_finite_and_keep_to_bounds_whole_numbers_and_constraints(q
     assert all(0.0 <= value <= 20.0 * most for value in worth)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(question=questions(), shuffle=st.randoms(use_true_random=False))
 def test_who_answers_first_changes_nothing(question, shuffle):
     def shuffled(data):
@@ -114,7 +115,7 @@ def test_who_answers_first_changes_nothing(question, shuffle):
     assert first.best_mean == second.best_mean
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(question=questions(), where=st.integers(0, 1000), bad=st.sampled_from([math.nan, math.inf, -math.inf, 1e300]))
 def test_a_number_that_is_none_is_refused_and_never_fitted(question, where, bad):
     places = []

@@ -17,6 +17,7 @@ import pytest
 from actors import ray_private, ray_runtime
 from actors.protocols import LaboratoryError
 from actors.spec import LaboratorySpec
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.ray
 
@@ -48,7 +49,7 @@ async def main(how):
     actor.spin.remote()
     pids = [p.pid for p in psutil.Process().children(recursive=True)]
     print(json.dumps({"pids": pids, "folder": str(ray_folder()), "listens": open_ports()}), flush=True)
-    await asyncio.wait_for(caught.wait(), 60)
+    await asyncio.wait_for(caught.wait(), PATIENCE)
     print(json.dumps("caught"), flush=True)
 
 asyncio.run(main(sys.argv[1]))
@@ -67,7 +68,7 @@ def start(how: str, home: Path) -> tuple[subprocess.Popen[str], dict[str, list[i
         start_new_session=True,
     )
     line = program.stdout.readline()
-    assert line, program.communicate(timeout=30)[1]
+    assert line, program.communicate(timeout=PATIENCE)[1]
     return program, json.loads(line)
 
 
@@ -94,14 +95,14 @@ def assert_clean(facts, home: Path, seconds: float = 15.0) -> None:
 def test_kill_9_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
     program.kill()
-    program.communicate(timeout=30)
+    program.communicate(timeout=PATIENCE)
     assert_clean(facts, tmp_path)
 
 
 def test_ctrl_c_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
     os.killpg(program.pid, signal.SIGINT)
-    _, errors = program.communicate(timeout=60)
+    _, errors = program.communicate(timeout=PATIENCE)
     assert "KeyboardInterrupt" in errors
     assert_clean(facts, tmp_path)
 
@@ -109,7 +110,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
 def test_sigterm_ends_in_order_without_a_frightening_stack(tmp_path):
     program, facts = start("wait", tmp_path)
     program.terminate()
-    _, errors = program.communicate(timeout=60)
+    _, errors = program.communicate(timeout=PATIENCE)
     assert program.returncode == 128 + signal.SIGTERM
     assert "SIGTERM received" not in errors
     assert_clean(facts, tmp_path)
@@ -118,7 +119,7 @@ def test_sigterm_ends_in_order_without_a_frightening_stack(tmp_path):
 def test_a_normal_end_leaves_nothing_was_closed_to_the_network_and_kept_the_loops_own_signal_handler(tmp_path):
     program, facts = start("own handler", tmp_path)
     program.terminate()
-    output, errors = program.communicate(timeout=60)
+    output, errors = program.communicate(timeout=PATIENCE)
     assert json.loads(output) == "caught"
     assert errors == ""
     assert program.returncode == 0

@@ -19,9 +19,10 @@ from actors.device import RayDevice
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.pool import RaySimulatorPool
+from tests.patience import PATIENCE
 
 
-async def until(what, timeout=20.0):
+async def until(what, timeout=PATIENCE):
     end = time.monotonic() + timeout
     while not what():
         assert time.monotonic() < end, "waited in vain"

@@ -20,6 +20,7 @@ from actors.spec import LaboratorySpec
 from sim_engine.action import DEG
 from sim_engine.outcome import PourOutcome
 from sim_engine.task import PoseError
+from tests.patience import PATIENCE
 
 
 @pytest.fixture
@@ -160,7 +161,7 @@ def test_a_load_beyond_the_brim_is_refused(open_bench, scene, action):
 
 
 async def reach(seen, checkpoint):
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + PATIENCE
     while not seen or seen[-1].checkpoint != checkpoint:
         assert time.monotonic() < end, f"never reached {checkpoint}"
         await asyncio.sleep(0.02)
@@ -168,7 +169,7 @@ async def reach(seen, checkpoint):
 
 async def tilting(arm):
     """Wait until the arm itself moves: the bench tells of a tilt just before it asks for one."""
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + PATIENCE
     while (state := await arm.state()).phase != "tilt" or not state.moving:
         assert time.monotonic() < end, "the arm never tilted"
         await asyncio.sleep(0.02)

@@ -18,11 +18,9 @@ from typing import Any
 import psutil
 
 from orchestrator.journal import JOURNAL_NAME, Entry, JournalError, JournalReader, Kind
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]
-
-PATIENCE = 240.0
-"""Longest time for anything in these tests [s]; a busy machine needs a minute."""
 
 NOT_LOGICAL = frozenset({"cpu_s", "seconds", "pid"})
 """What differs between two runs that are the same."""

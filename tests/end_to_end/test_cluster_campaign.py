@@ -27,7 +27,7 @@ from tests.end_to_end.command import (
 )
 from tests.local_cluster import LocalCluster
 
-pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
 RUN = ("run", "small.yaml")
 RESUME = (*RUN, "--resume")

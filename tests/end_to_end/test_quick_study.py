@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.orchestrator.study_files import ROOT, read, written
+from tests.patience import PATIENCE
 
 
 @pytest.mark.slow
@@ -21,7 +22,7 @@ def test_the_quick_study_runs_and_a_second_call_has_nothing_left_to_do(tmp_path:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     answers = []
     for _ in range(2):
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=1800)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE)
         assert done.returncode == 0, done.stderr
         answers.append(json.loads(done.stdout.splitlines()[-1]))
     assert answers[0] == answers[1]

@@ -22,8 +22,9 @@ from tests.end_to_end.command import (
     pour_under_way,
     started_after_they_were_finished,
 )
+from tests.patience import PATIENCE
 
-pytestmark = [pytest.mark.ray, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.ray]
 
 RUN = ("run", "small.yaml")
 RESUME = (*RUN, "--resume")
@@ -142,7 +143,7 @@ def assert_a_person_is_asked(place: Workplace) -> None:
     before = len(place.entries())
     process = place.start(*RESUME)
     with ended(process):
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 3
     assert "pour 2 of stage pours" in errors
     assert "what came of it?" in errors
@@ -185,7 +186,7 @@ def test_a_simulator_killed_under_way_is_replaced_and_nobody_notices(
         for victim in victims:
             os.kill(victim.pid, signal.SIGKILL)
         process.send_signal(signal.SIGCONT)
-        output, errors = process.communicate(timeout=240)
+        output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     (line,) = output.splitlines()
     assert json.loads(line)["receivers"] == undisturbed.summary["receivers"]

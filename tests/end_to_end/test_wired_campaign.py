@@ -14,7 +14,7 @@ from orchestrator.journal import Entry, Kind
 from tests.end_to_end import small
 from tests.end_to_end.command import Workplace, finished_in, pour_under_way, started_after_they_were_finished
 
-pytestmark = [pytest.mark.ray, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.ray]
 
 LABORATORIES = Path(__file__).parents[2] / "configs" / "laboratories"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, Literal
 
 from orchestrator.config.pose import PoseNoiseSection
@@ -26,11 +26,6 @@ def deployment(strategy: str = "D3", **values: Any) -> DeploymentPlan:
     """A deployment by one strategy."""
     settings, rest = _settings(strategy, values)
     return DeploymentPlan(settings, **rest)
-
-
-def changed(plan: Any, **changes: Any) -> Any:
-    """A plan of either kind with other settings of its strategy."""
-    return replace(plan, settings=plan.settings.model_copy(update=changes))
 
 
 def risk(

@@ -13,6 +13,8 @@ import time
 from pathlib import Path
 from types import TracebackType
 
+from tests.patience import PATIENCE
+
 
 class Terminal:
     """A command at a pseudo-terminal of its own; a context manager.
@@ -59,7 +61,7 @@ class Terminal:
         os.kill(self.process.pid, signal.SIGHUP)
         os.close(self._keys)
 
-    def expect(self, text: str, patience: float = 40.0) -> None:
+    def expect(self, text: str, patience: float = PATIENCE) -> None:
         """Read until the screen shows it, after what was expected before."""
         end = time.monotonic() + patience
         while text not in self.screen[self._seen :]:
@@ -76,7 +78,7 @@ class Terminal:
         """Ctrl-C, as the terminal would send it."""
         os.kill(self.process.pid, signal.SIGINT)
 
-    def end(self, patience: float = 40.0) -> int:
+    def end(self, patience: float = PATIENCE) -> int:
         """Wait for the command's end, and give its exit code."""
         end = time.monotonic() + patience
         while time.monotonic() < end:

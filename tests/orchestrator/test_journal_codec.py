@@ -29,6 +29,7 @@ from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.space import Axis, Space
+from tests.depth import examples
 from tests.orchestrator.toy import toy_plan
 
 # Numbers below 2e-308 are no numbers of a laboratory, and a process in which Taichi has run takes them for 0.
@@ -108,7 +109,7 @@ def through_json(written: Any) -> Any:
     return json.loads(canonical(written))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     st.one_of(
         st.builds(Simulate, st.text(), actions, parameters, seed, st.text()),
@@ -132,7 +133,7 @@ def test_requests_survive_bit_for_bit(request: Simulate | Pour | Suggest) -> Non
     assert canonical(encode_request(read)) == canonical(written)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     st.one_of(
         st.builds(Simulated, outcomes),

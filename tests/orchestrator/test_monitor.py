@@ -18,6 +18,7 @@ from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.monitor.simulation import simulation_rrd
 from orchestrator.monitor.worker import Worker
 from tests.orchestrator import watched
+from tests.patience import PATIENCE
 
 
 class Contents:
@@ -53,7 +54,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Contents:
     monitor = RerunMonitor(path, plan)
     for event in watched.events(plan):
         monitor(event)
-    assert monitor.close(timeout=30.0)
+    assert monitor.close(timeout=PATIENCE)
     assert (monitor.failed, monitor.dropped) == (0, 0)
     return Contents(path)
 
@@ -112,7 +113,7 @@ def test_map_of_two_out_of_three_parameters_is_a_cut_with_the_trials_projected_o
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
     for event in watched.three_parameters():
         monitor(event)
-    assert monitor.close(timeout=30.0)
+    assert monitor.close(timeout=PATIENCE)
     assert (monitor.failed, monitor.dropped) == (0, 0)
     contents = Contents(monitor.path)
     assert contents.rows("/maps/calibration/mean/picture") == 1
@@ -141,10 +142,13 @@ def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_pat
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
     for event in watched.events(plan):
         monitor(event)
-    assert monitor.close(timeout=30.0)
+    assert monitor.close(timeout=PATIENCE)
     assert Contents(monitor.path).blueprints == 1
     checked = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "verify", str(monitor.path)], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(monitor.path)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
     )
     assert checked.returncode == 0, checked.stderr
 
@@ -181,7 +185,7 @@ def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None
             break
     for event in told:
         monitor(event)
-    assert monitor.close(timeout=30.0)
+    assert monitor.close(timeout=PATIENCE)
     assert monitor.failed == 1
     assert Contents(monitor.path).rows("/pours/narrow_cup/measured") == 3
 
@@ -222,7 +226,7 @@ def test_dropped_events_are_said_in_the_recording(tmp_path: Path, monkeypatch: p
         monitor(LogLine(level="info", text=f"line {number}"))
     assert monitor.dropped > 0
     dropped = monitor.dropped
-    assert monitor.close(timeout=30.0)
+    assert monitor.close(timeout=PATIENCE)
     said = Contents(monitor.path).values("/events/recording", "TextLog:text")
     assert said == [[f"{dropped} events are missing: the recording could not keep up"]]
 

@@ -23,6 +23,7 @@ from orchestrator.stages import StageDefinition
 from tests.orchestrator import toy
 from tests.orchestrator.killed import SMALL, finished_times, killed_at, killed_when_last, run
 from tests.orchestrator.toy import ToyLaboratory, ToyStrategy, logical_record, toy_plan, toy_stages
+from tests.patience import PATIENCE
 
 
 @pytest.mark.parametrize("after_commit", [False, True], ids=["before the write", "after the write"])
@@ -91,7 +92,7 @@ def test_killed_from_outside_with_everything_under_way_it_goes_on_in_another_pro
         killed_hanging(simulations, directory)
         before = entries_written(directory)
         resumed = process(directory, "--resume", "--on-unknown", "repeat", "--slow", "0.002")
-        _, complaints = resumed.communicate(timeout=100)
+        _, complaints = resumed.communicate(timeout=PATIENCE)
         assert resumed.returncode == 0, complaints
         assert entries_written(directory) > before
         assert logical_record(directory) == logical_record(tmp_path / "undisturbed")
@@ -106,7 +107,7 @@ def test_two_processes_can_not_run_one_campaign(tmp_path: Path) -> None:
             time.sleep(0.01)
         before = entries_written(directory)
         second = process(directory, "--resume")
-        _, complaints = second.communicate(timeout=60)
+        _, complaints = second.communicate(timeout=PATIENCE)
         assert second.returncode != 0
         assert f"process {first.pid} is running this campaign" in complaints
         with pytest.raises(JournalLockedError, match=str(first.pid)):

@@ -16,6 +16,7 @@ from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
+from tests.patience import PATIENCE
 
 SCENE = Scene(
     "batch",
@@ -140,6 +141,6 @@ def test_engine_ends_cleanly_without_having_simulated() -> None:
         [sys.executable, "-c", "from sim_engine.pour import PourSimulator; PourSimulator().close()"],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
     )
     assert (done.returncode, done.stderr) == (0, "")

@@ -15,11 +15,13 @@ from sim_engine.action import DEG, Action
 from sim_engine.calm import CALM, FREEBOARD, STEP, calm_until, liquid_velocity, wave_height
 from sim_engine.hydrostatics import level
 from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.motion import SampledMotion, plan_motion
+from sim_engine.motion import plan_motion
 from sim_engine.pour import PourSimulator
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder
+from tests.depth import examples
 
 SCENE = Scene(
     "calm",
@@ -47,7 +49,7 @@ def begin(speed: float, max_angle: float = 120.0) -> float:
     return calm_until(plan_motion(SCENE, action(speed, max_angle), POURER, RECEIVER), POURER, VOLUME)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.floats(5.0, 180.0))
 def test_nothing_is_near_the_lip_when_the_simulation_begins(speed: float) -> None:
     start = begin(speed)

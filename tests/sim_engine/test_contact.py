@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sim_engine.contact import clearance, describe_contact, first_contact, rotations
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder
+from tests.depth import examples
 
 A = build_vessel(cylinder("a", inner_radius=0.04, inner_height=0.1, wall=0.002, floor=0.002))
 B = build_vessel(cylinder("b", inner_radius=0.05, inner_height=0.08, wall=0.002, floor=0.002))
@@ -83,7 +84,7 @@ def test_pouring_motion_that_hits_the_rim_is_described_with_its_tilt() -> None:
     assert clearance(A, B, poses[: contact.index]).min() > -0.0005
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     st.floats(-0.11, 0.11), st.floats(-0.11, 0.11), st.floats(-0.02, 0.12),
     st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: sum(v * v for v in q) > 0.1),
@@ -101,7 +102,7 @@ def test_contact_does_not_depend_on_which_vessel_stands_still(
     assert clearance(A, B, poses) == pytest.approx(clearance(B, A, inverse(poses)), abs=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(st.floats(0.0, 2 * math.pi), st.floats(-0.08, 0.075), st.floats(0.02, 0.95))
 def test_crossing_thin_walls_never_go_unseen(direction: float, z: float, inside: float) -> None:
     # two upright thin cups whose walls cross: the axes are closer than twice the outer radius, farther than the play

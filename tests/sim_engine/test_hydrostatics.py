@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from sim_engine.hydrostatics import level, predicted_end_of_flow, retained_volume, tilting_cup_outflow
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder
+from tests.depth import examples
 
 CUP = build_vessel(cylinder("cup", inner_radius=0.04, inner_height=0.1))
 BOTTLE = build_vessel(
@@ -62,7 +63,7 @@ def test_bottle_past_the_horizontal_keeps_liquid_in_its_shoulder() -> None:
     assert retained_volume(BOTTLE, math.radians(175)) < 1e-6
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.floats(0.0, math.pi), st.floats(0.0, math.pi), st.sampled_from([CUP, CONE]))
 def test_more_tilt_never_retains_more(first: float, second: float, vessel) -> None:  # type: ignore[no-untyped-def]
     low, high = sorted((first, second))
@@ -119,7 +120,7 @@ def test_slow_tilt_pours_down_to_what_the_vessel_retains() -> None:
     assert 200e-6 - poured[-1] == pytest.approx(retained_volume(CUP, math.radians(70)), abs=0.005 * CUP.capacity)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     st.floats(0.05, 1.0),
     st.floats(5.0, 300.0),

@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid
-from sim_engine.motion import PourMotion, SampledMotion, plan_motion
+from sim_engine.motion import PourMotion, plan_motion
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Pivot, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder
+from tests.depth import examples
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.10)
 GLASS = cylinder("glass", inner_radius=0.045, inner_height=0.09)
@@ -73,7 +75,7 @@ def test_the_cup_holds_and_comes_back_upright() -> None:
     assert m.tilt(np.array([back.end, back.end + 5.0])) == pytest.approx([0, 0], abs=1e-9)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(
     speed=st.floats(5, 300),
     angle=st.floats(10, 170),

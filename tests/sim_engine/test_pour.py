@@ -11,8 +11,8 @@ import pytest
 from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import retained_volume
 from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.motion import SampledMotion
 from sim_engine.pour import InvalidSceneError, PourSimulator, SimulationCancelled, SimulationRun
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.validation.at_rest import tall_column
 from sim_engine.vessel.build import build_vessel

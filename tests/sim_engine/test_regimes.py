@@ -15,11 +15,13 @@ from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.lip import FlowNumbers, bond, capillary_length
 from sim_engine.liquid import Liquid
-from sim_engine.motion import SampledMotion, plan_motion
+from sim_engine.motion import plan_motion
 from sim_engine.regimes import DRIBBLING_WEBER, VISCOUS_REYNOLDS, WETTING_BOND, Regimes, regimes
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Pivot, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder
+from tests.depth import examples
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.1)
 GLASS = cylinder("glass", inner_radius=0.045, inner_height=0.09)
@@ -77,7 +79,7 @@ def test_water_in_the_standard_pour_has_the_numbers_of_its_flow() -> None:
 factors = st.floats(0.2, 5.0)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(factors, factors, factors)
 def test_liquids_of_one_volume_flow_alike_and_only_their_numbers_scale(
     heavier: float, tenser: float, thicker: float

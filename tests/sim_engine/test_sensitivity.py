@@ -27,6 +27,7 @@ from sim_engine.validation.sensitivity import (
     grid,
     sensitivity,
 )
+from tests.depth import examples
 
 INFOS = SimulationParameters.info()
 NOISE = 0.01
@@ -53,7 +54,7 @@ def test_a_grid_has_the_default_and_both_ends(name: str, count: int) -> None:
     assert all(SimulationParameters.from_values({name: v}) for v in values)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(st.floats(0.1, 0.6), st.booleans(), st.integers(0, 10_000))
 def test_a_monotone_effect_is_found_over_the_whole_range_with_its_size_and_slope(
     size: float, falls: bool, seed: int

@@ -214,7 +214,6 @@ NOT_MET: dict[str, str] = {}
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", [case.name for case in suite.CASES])
 def test_full_case(simulator: PourSimulator, name: str) -> None:
     result = suite.case(name).run(simulator, suite.Effort(full=True))

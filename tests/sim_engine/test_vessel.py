@@ -14,6 +14,7 @@ from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.sdf import MARGIN, MAXIMUM_NODES
 from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder
 from sim_engine.vessel.vessel import Vessel, check_holds
+from tests.depth import examples
 
 BEAKER = build_vessel(cylinder("beaker", inner_radius=0.04, inner_height=0.1))
 
@@ -102,7 +103,7 @@ def test_grid_leaves_room_around_the_solid() -> None:
     assert np.all(BEAKER.grid.upper >= high + MARGIN - 1e-9)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(spec=profiles())
 def test_any_profile_gives_a_sound_vessel(spec: VesselSpec) -> None:
     vessel = build_vessel(spec)

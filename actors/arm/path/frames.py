@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from actors.arm.path.kinematics import MODELS, forward
 from actors.arm.spec import Pose, UrArmSpec
 from sim_engine.contact import rotations
-from sim_engine.motion import SampledMotion
+from sim_engine.sampled_motion import SampledMotion
 
 FloatArray = NDArray[np.float64]
 

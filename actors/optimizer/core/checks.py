@@ -37,6 +37,7 @@ def check(problem: SuggestProblem) -> None:
     _check_points("refused", problem.refused, dimension)
     _check_points("failed", problem.failed, dimension)
     _check_points("predict_at", problem.predict_at, dimension)
+    _check_points("map_at", (problem.map_at,) if problem.map_at else (), dimension)
     _check_points("pouring", problem.pouring, dimension)
     for name, data in (("data", problem.data), ("simulated", problem.simulated)):
         for index, cost in enumerate(data.costs):

@@ -62,7 +62,8 @@ def describe(
             description["risk"] = model.surrogate.answer(known, WORST)
     if problem.map_resolution and problem.space.dimension >= 2:
         sought = problem.acquisition == "posterior_minimum" and len(points) > 0
-        description["surrogate"] = _map(problem, asked.region, model, points[0] if sought else known[best])
+        at = np.array(problem.map_at) if problem.map_at else points[0] if sought else known[best]
+        description["surrogate"] = _map(problem, asked.region, model, at)
     return description
 
 

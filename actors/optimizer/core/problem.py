@@ -160,6 +160,8 @@ class SuggestProblem:
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has at least two dimensions, the answer carries the surrogate on a square
             grid over the two axes that matter most.
+        map_at: place of the unit cube that the grid goes through; without one it is the least that is known, see
+            `SurrogateMap.at`.
         predict_at: further points at which the posterior is wanted (a regression, with `count=0`).
         context: if given, the observations are signed differences that also depend on coordinates which nobody chooses
             (in calibration: c_r − c_s, and the action that was simulated), and what is minimised is the mean of their
@@ -193,6 +195,7 @@ class SuggestProblem:
     acquisition: AcquisitionName = "lcb"
     kappa: float = 2.0
     map_resolution: int = 0
+    map_at: Point = ()
     predict_at: tuple[Point, ...] = ()
     context: tuple[Point, ...] = ()
     infeasible: tuple[Point, ...] = ()
@@ -224,8 +227,9 @@ class SurrogateMap:
         deviation: their standard deviations.
         axes: names of the two axes, in the space's order: those with the shortest fitted lengthscales. Empty for a
             space that has no others.
-        at: point of the unit cube that the grid goes through: every other axis is held at its value there. It is where
-            the posterior mean is least: the minimiser that 'posterior_minimum' found, else `Suggestion.best_point`.
+        at: point of the unit cube that the grid goes through: every other axis is held at its value there. It is
+            `SuggestProblem.map_at`, or where the posterior mean is least: the minimiser that 'posterior_minimum' found,
+            else `Suggestion.best_point`.
     """
 
     mean: tuple[tuple[float, ...], ...]

@@ -70,6 +70,12 @@ def norm(a: Any) -> float:
     return abs(number(a))
 
 
+def normalize(v: Any) -> list[float]:
+    """A list divided by its length."""
+    given, size = numbers(v, length(v)), norm(v)
+    return [x / size for x in given]
+
+
 def rpy2rotvec(rpy: Any) -> list[float]:
     """Roll, pitch, yaw to a rotation vector [rad]."""
     r, p, y = numbers(rpy, 3)
@@ -122,7 +128,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "log": lambda b, f: math.log(number(f), number(b)),
     "random": random.random,
     "norm": norm,
-    "normalize": lambda v: [x / norm(v) for x in numbers(v, len(v))],
+    "normalize": normalize,
     "point_dist": lambda p_from, p_to: distance(six(p_from), six(p_to)),
     "pose_trans": pose_trans,
     "pose_inv": pose_inv,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from actors.ur.models import Joints
 from actors.virtual_ur.commands.arguments import LONGEST, is_pose, positive, rate, six
+from actors.virtual_ur.commands.machine import Machine
 from actors.virtual_ur.motion.actions import Action
 from actors.virtual_ur.motion.lines import JointLine, Line, ToolLine, UnreachableError
 from actors.virtual_ur.motion.mover import ControlledElsewhereError
@@ -14,9 +15,6 @@ from actors.virtual_ur.poses import Frame, compose, distance, frame_of, norm3, r
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.program import Command, Steps
 from actors.virtual_ur.urscript.values import number
-
-if TYPE_CHECKING:
-    from actors.virtual_ur.controller import Controller
 
 UNSUPPORTED = (
     "force_mode",
@@ -38,7 +36,7 @@ class Motion:
         controller: whose arm moves.
     """
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Machine) -> None:
         self._controller = controller
         self._robot = controller.robot
         self._mover = controller.robot.mover

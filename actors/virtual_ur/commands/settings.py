@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from actors.virtual_ur.commands.arguments import positive, six
+from actors.virtual_ur.commands.machine import Machine
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.program import Command
 from actors.virtual_ur.urscript.values import number, numbers, show
-
-if TYPE_CHECKING:
-    from actors.virtual_ur.controller import Controller
 
 FARTHEST = 10.0
 """Entries of a tool centre point [m], [rad]: more is a mistake of units."""
@@ -37,7 +35,7 @@ class Settings:
         controller: what is set.
     """
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Machine) -> None:
         self._controller = controller
         self._robot = controller.robot
 

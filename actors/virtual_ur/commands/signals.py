@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from actors.virtual_ur.commands.arguments import whole
+from actors.virtual_ur.commands.machine import Machine
 from actors.virtual_ur.exchange import REGISTERS
 from actors.virtual_ur.urscript.program import Command
 from actors.virtual_ur.urscript.values import number
-
-if TYPE_CHECKING:
-    from actors.virtual_ur.controller import Controller
 
 _GROUPS = {"standard_digital": (0, 7), "configurable_digital": (8, 7), "tool_digital": (16, 1), "digital": (0, 15)}
 """First bit and highest number of each group of digital signals."""
@@ -24,7 +22,7 @@ class Signalling:
         controller: whose registers and signals.
     """
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Machine) -> None:
         self._registers = controller.registers
         self._signals = controller.signals
 

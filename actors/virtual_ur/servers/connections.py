@@ -6,6 +6,7 @@ import asyncio
 import socket
 
 from actors.virtual_ur.controller import Controller
+from actors.virtual_ur.uploads import Uploads
 
 MOST_UNSENT = 1_000_000
 """Bytes that a client may leave unread before it is cut off."""
@@ -16,10 +17,14 @@ class Connections:
 
     Args:
         controller: what they talk to.
+
+    Attributes:
+        uploads: programs that came over them.
     """
 
     def __init__(self, controller: Controller) -> None:
         self.controller = controller
+        self.uploads = Uploads(controller)
         self.open: set[Connection] = set()
         self._silent = False
 
@@ -49,11 +54,13 @@ class Connection(asyncio.Protocol):
     """
 
     def __init__(self, connections: Connections) -> None:
-        self._connections = connections
+        self.connections = connections
         self.controller = connections.controller
         self._transport: asyncio.Transport | None = None
         self._privileged = not self.controller.local
         self._switches = self.controller.switches
+        self._held = False
+        self._waits = False
 
     @property
     def privileged(self) -> bool:
@@ -66,8 +73,8 @@ class Connection(asyncio.Protocol):
         assert isinstance(transport, asyncio.Transport)
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._transport = transport
-        self._connections.open.add(self)
-        if self._connections.silent:
+        self.connections.open.add(self)
+        if self.connections.silent:
             self.hold(True)
         else:
             self.greet()
@@ -77,12 +84,12 @@ class Connection(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See `asyncio.Protocol`."""
-        self._connections.open.discard(self)
+        self.connections.open.discard(self)
         self._transport = None
 
     def send(self, data: bytes) -> None:
         """Send bytes; a client that doesn't read is cut off before they pile up."""
-        if self._transport is None or self._transport.is_closing() or self._connections.silent:
+        if self._transport is None or self._transport.is_closing() or self.connections.silent:
             return
         if self._transport.get_write_buffer_size() > MOST_UNSENT:
             self.drop()
@@ -90,10 +97,19 @@ class Connection(asyncio.Protocol):
             self._transport.write(data)
 
     def hold(self, active: bool) -> None:
-        """Read no more, or again."""
+        """Fall silent: read no more; or again."""
+        self._held = active
+        self._read()
+
+    def wait(self, active: bool) -> None:
+        """Read no more while what was read is being worked off; or again."""
+        self._waits = active
+        self._read()
+
+    def _read(self) -> None:
         if self._transport is None or self._transport.is_closing():
             return
-        if active:
+        if self._held or self._waits:
             self._transport.pause_reading()
         else:
             self._transport.resume_reading()

@@ -22,12 +22,10 @@ class ScriptConnection(Connection):
             programs = self._splitter.feed(data.decode("utf-8", "replace"))
         except ScriptError as error:
             self.controller.tell("exception", error.text)
+            self.drop()  # what follows can't be told from programs
             return
         for program in programs:
-            if self.privileged:
-                self.controller.upload(program)
-            else:
-                self.refuse()
+            self.connections.uploads.put(program, self)
 
     def refuse(self) -> None:
         """A program came over a connection that may only read."""

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from actors.virtual_ur.urscript.errors import ScriptError
 
+LONGEST = 1_000_000
+"""Characters that a program may have."""
+
 KEYWORDS = frozenset(
     (
         *("def", "thread", "sec", "end", "if", "elif", "else", "while", "return", "break", "continue", "halt", "pass"),
@@ -85,7 +88,7 @@ class Splitter:
         limit: longest text without an end that is kept [characters].
     """
 
-    def __init__(self, limit: int = 4_000_000) -> None:
+    def __init__(self, limit: int = LONGEST) -> None:
         self._limit = limit
         self._rest = ""
         self._lines: list[str] = []

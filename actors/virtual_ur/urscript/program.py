@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
-from types import CodeType
 from typing import Any
+
+import psutil
 
 from actors.virtual_ur.urscript import values
 from actors.virtual_ur.urscript.errors import ScriptError
-from actors.virtual_ur.urscript.parser import parse
-from actors.virtual_ur.urscript.translator import Translation
+from actors.virtual_ur.urscript.translate import Translated
 
-LOOPS_PER_CYCLE = 20_000
-"""Turns of loops in one control cycle after which a thread counts as stuck. A controller gives up likewise."""
+WORK_PER_CYCLE = 100_000
+"""Work in one control cycle after which a program counts as stuck, as on a controller. It is counted in parts of
+expressions, which take some 0.3 µs each."""
+
+COMMAND_WORK = 30
+"""What calling a command costs beside the entries of lists that it is given and gives back."""
+
+LOOK_AT_MEMORY = 1_000_000
+"""Work between two looks at how much memory the process holds."""
+
+MOST_MEMORY = 300_000_000
+"""What the process may grow by while a program runs [bytes]."""
 
 MOST_THREADS = 50
+
+_PROCESS = psutil.Process()
 
 Steps = Generator[None, None, Any]
 
@@ -29,36 +39,42 @@ class Command:
     """What a program may call.
 
     Args:
-        function: given the thread's number first if it `waits`; a generator function then.
+        function: a generator function if it `waits`.
         waits: whether it gives way.
+        work: what a call costs beside its lists, in parts of expressions.
     """
 
-    def __init__(self, function: Callable[..., Any], *, waits: bool = False) -> None:
+    def __init__(self, function: Callable[..., Any], *, waits: bool = False, work: int = COMMAND_WORK) -> None:
         self.function = function
         self.waits = waits
+        self.work = work
+
+
+def waiting(commands: Mapping[str, Command]) -> frozenset[tuple[str, bool]]:
+    """What the translator has to know of commands: their names, and whether they give way."""
+    return frozenset((name, command.waits) for name, command in commands.items())
 
 
 class Program:
     """One uploaded program. Made whole or not at all; run by `tick`.
 
     Args:
-        text: the program.
+        translated: the program, by `translate`.
         commands: what it may call.
 
     Attributes:
         name: from its first line.
         secondary: it was sent as `sec`: it runs beside the main program, may not move the arm, and ends soon.
 
-    Raises:
-        ScriptError: it can't be read.
     """
 
-    def __init__(self, text: str, commands: Mapping[str, Command]) -> None:
-        translated = _translate(text, frozenset((name, command.waits) for name, command in commands.items()))
+    def __init__(self, translated: Translated, commands: Mapping[str, Command]) -> None:
         self.name = translated.name
         self.secondary = translated.secondary
         self._lines = translated.lines
-        self._loops = 0
+        self._work = 0
+        self._unseen = 0
+        self._memory = _PROCESS.memory_info().rss
         self._threads: dict[int, Steps] = {}
         self._started = 0
         self._critical: int | None = None
@@ -72,10 +88,13 @@ class Program:
             "_mod": values.modulo,
             "_xor": values.exclusive_or,
             "_neg": values.negate,
-            "_copy": values.copy,
+            "_copy": self._copy,
+            "_list": self._list,
+            "_entry": self._list,
+            "_same": self._same,
             "_index": values.index,
             "_pose": values.pose,
-            "_loop": self._loop,
+            "_spend": self._spend,
             "_run": self._run,
             "_kill": self._kill,
             "_join": self._join,
@@ -83,7 +102,7 @@ class Program:
             "_enter_critical": self._enter_critical,
             "_exit_critical": self._exit_critical,
         }
-        space.update({f"c_{name}": command.function for name, command in commands.items()})
+        space.update({f"c_{name}": self._counted(command) for name, command in commands.items()})
         exec(translated.code, space)
         self._threads[0] = space["main"]()
 
@@ -101,6 +120,7 @@ class Program:
         Raises:
             ScriptError: it can't go on.
         """
+        self._work = WORK_PER_CYCLE
         for number in list(self._threads):
             if self._critical is not None and self._critical != number and self._critical in self._threads:
                 continue
@@ -108,7 +128,6 @@ class Program:
             if steps is None:
                 continue
             self._current = number
-            self._loops = LOOPS_PER_CYCLE
             try:
                 next(steps)
             except StopIteration:
@@ -131,12 +150,42 @@ class Program:
             trace = trace.tb_next
         return line
 
-    # ---- what programs say that concerns threads
+    # ---- bounds of time and memory
 
-    def _loop(self) -> None:
-        self._loops -= 1
-        if self._loops < 0:
-            raise ScriptError("a loop without sync() doesn't give way: the runtime is too much behind")
+    def _spend(self, work: int) -> None:
+        self._work -= work
+        if self._work < 0:
+            raise ScriptError("too much in one cycle without sync(): the runtime is too much behind")
+        self._unseen += work
+        if self._unseen > LOOK_AT_MEMORY:
+            self._unseen = 0
+            if _PROCESS.memory_info().rss - self._memory > MOST_MEMORY:
+                raise ScriptError(f"the program holds more than {MOST_MEMORY // 1_000_000} MB")
+
+    def _copy(self, value: Any) -> Any:
+        if not isinstance(value, list):
+            return value
+        self._spend(values.size(value))
+        return values.copy(value)
+
+    def _list(self, value: Any) -> Any:
+        if isinstance(value, list):
+            self._spend(values.size(value))
+        return value
+
+    def _same(self, a: Any, b: Any) -> bool:
+        if isinstance(a, list) and isinstance(b, list):
+            self._spend(values.size(a))
+        return bool(a == b)
+
+    def _counted(self, command: Command) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            self._spend(command.work + sum(len(a) for a in arguments if isinstance(a, list)))
+            return self._list(command.function(*arguments, **named))
+
+        return call
+
+    # ---- what programs say that concerns threads
 
     def _run(self, function: Callable[..., Any], *arguments: Any) -> int:
         if len(self._threads) >= MOST_THREADS:
@@ -165,27 +214,6 @@ class Program:
 
     def _exit_critical(self) -> None:
         self._critical = None
-
-
-@dataclass(frozen=True)
-class _Translated:
-    name: str
-    secondary: bool
-    lines: list[int]
-    code: CodeType
-
-
-@lru_cache(maxsize=8)  # clients send the same program again and again
-def _translate(text: str, commands: frozenset[tuple[str, bool]]) -> _Translated:
-    try:
-        tree = parse(text)
-        translation = Translation(tree, dict(commands))
-        code = compile(translation.source, "<program>", "exec")
-    except RecursionError:
-        raise ScriptError("nested too deeply") from None
-    except (SyntaxError, ValueError, MemoryError) as error:
-        raise ScriptError(f"can't be translated: {error}") from error
-    return _Translated(tree.name, tree.kind == "sec", translation.lines, code)
 
 
 def _explain(error: Exception) -> str:

@@ -30,8 +30,12 @@ from actors.virtual_ur.urscript.tree import (
     Statement,
 )
 
-_OPERATORS = {"and": "and", "or": "or", "==": "==", "!=": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
-_HELPERS = {"+": "_add", "-": "_sub", "*": "_mul", "/": "_div", "%": "_mod", "xor": "_xor"}
+_OPERATORS = {"and": "and", "or": "or", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
+_HELPERS = {"+": "_add", "-": "_sub", "*": "_mul", "/": "_div", "%": "_mod", "xor": "_xor", "==": "_same"}
+
+
+_CHUNK = 20
+"""Statements in a row whose work is counted at once."""
 
 
 class Translation:
@@ -63,14 +67,18 @@ class Translation:
     # ---- which functions wait
 
     def _find_waiting(self) -> set[str]:
-        calls = {name: set(_calls(f.body)) for name, f in self._functions.items()}
+        callers: dict[str, set[str]] = {}
+        for name, function in self._functions.items():
+            for called in _calls(function.body):
+                callers.setdefault(called, set()).add(name)
         waiting = {name for name, f in self._functions.items() if f.kind == "thread" or _pauses(f.body)}
         waiting |= {name for name, waits in self._commands.items() if waits and name not in self._functions}
-        while True:
-            more = {name for name, called in calls.items() if called & waiting} - waiting
-            if not more:
-                return waiting
+        fresh = list(waiting)
+        while fresh:
+            more = callers.get(fresh.pop(), set()) - waiting
             waiting |= more
+            fresh += more
+        return waiting
 
     # ---- statements
 
@@ -93,8 +101,9 @@ class Translation:
         shared = sorted((assigned & self._globals) - own)
         if shared:
             self._emit(depth + 1, "global " + ", ".join(f"v_{name}" for name in shared))
+        changed = _changed_entries(function)
         for name, _ in function.parameters:
-            if name in _changed_entries(function):
+            if name in changed:
                 self._emit(depth + 1, f"v_{name} = _copy(v_{name})")
         for inner in _own_functions(function.body):
             self._define(inner, f"f_{inner.name}", depth + 1)
@@ -103,12 +112,17 @@ class Translation:
             self._emit(depth + 1, "return")
             self._emit(depth + 1, "yield")
 
-    def _body(self, statements: tuple[Statement, ...], depth: int) -> None:
-        for statement in statements:
-            if not isinstance(statement, Function):
+    def _body(self, statements: tuple[Statement, ...], depth: int, more: int = 1) -> None:
+        """Write a block; it begins with what its statements cost, `more` than they say themselves."""
+        own = [s for s in statements if not isinstance(s, Function)]
+        for first in range(0, max(len(own), 1), _CHUNK):
+            chunk = own[first : first + _CHUNK]
+            self._line = chunk[0].line if chunk else self._line
+            self._emit(depth, f"_spend({more + sum(_work(s) for s in chunk)})")
+            more = 0
+            for statement in chunk:
                 self._line = statement.line
                 self._statement(statement, depth)
-        self._emit(depth, "pass")
 
     def _statement(self, statement: Statement, depth: int) -> None:
         match statement:
@@ -119,6 +133,8 @@ class Translation:
                 given = self._value(value)
                 if isinstance(value, Name | Index):
                     given = f"_copy({given})"
+                if isinstance(target, Index):
+                    given = f"_entry({given})"
                 self._emit(depth, f"{self._target(target)} = {given}")
             case Evaluate(value):
                 self._emit(depth, self._value(value))
@@ -131,8 +147,7 @@ class Translation:
                     self._body(body, depth + 1)
             case Loop(condition, body):
                 self._emit(depth, f"while {self._value(condition)}:")
-                self._emit(depth + 1, "_loop()")
-                self._body(body, depth + 1)
+                self._body(body, depth + 1, 1 + _nodes(condition))
             case Simple():
                 self._simple(statement, depth)
 
@@ -168,7 +183,7 @@ class Translation:
                 return f"v_{name}"
             case Items(items, pose):
                 inner = ", ".join(f"_copy({self._value(i)})" if isinstance(i, Name) else self._value(i) for i in items)
-                return f"_pose([{inner}])" if pose else f"[{inner}]"
+                return f"_pose([{inner}])" if pose else f"_list([{inner}])"
             case Index():
                 return self._entry(expression)
             case Operation(operator, operands):
@@ -188,6 +203,8 @@ class Translation:
     def _operation(self, operator: str, operands: list[str]) -> str:
         if len(operands) == 1:
             return f"(not {operands[0]})" if operator == "not" else f"_neg({operands[0]})"
+        if operator == "!=":
+            return f"(not _same({operands[0]}, {operands[1]}))"
         if operator in _HELPERS:
             return f"{_HELPERS[operator]}({operands[0]}, {operands[1]})"
         return f"({operands[0]} {_OPERATORS[operator]} {operands[1]})"
@@ -210,6 +227,28 @@ class Translation:
 
 
 # ---- what stands where in a tree
+
+
+def _work(statement: Statement) -> int:
+    """What a statement costs, without blocks within it."""
+    return 1 + sum(_nodes(e) for e in _expressions(statement))
+
+
+def _nodes(expression: Expression) -> int:
+    return 1 + sum(_nodes(e) for e in _parts(expression))
+
+
+def _parts(expression: Expression) -> tuple[Expression, ...]:
+    match expression:
+        case Call(_, arguments, named):
+            return (*arguments, *(value for _, value in named))
+        case Items(items):
+            return items
+        case Index(value, at):
+            return (value, *at)
+        case Operation(_, operands):
+            return operands
+    return ()
 
 
 def _names(assignments: Iterable[Assign]) -> set[str]:
@@ -286,18 +325,7 @@ def _expressions(statement: Statement) -> Iterator[Expression]:
 
 
 def _called(expression: Expression) -> Iterator[str]:
-    match expression:
-        case Call(name, arguments, named, thread):
-            if not thread:
-                yield name
-            for inner in (*arguments, *(value for _, value in named)):
-                yield from _called(inner)
-        case Items(items):
-            for inner in items:
-                yield from _called(inner)
-        case Index(value, at):
-            for inner in (value, *at):
-                yield from _called(inner)
-        case Operation(_, operands):
-            for inner in operands:
-                yield from _called(inner)
+    if isinstance(expression, Call) and not expression.thread:
+        yield expression.name
+    for part in _parts(expression):
+        yield from _called(part)

@@ -13,6 +13,12 @@ from actors.virtual_ur.urscript.errors import ScriptError
 LONGEST_STRING = 1023
 """Characters that a string may have, as on a controller."""
 
+MOST_ENTRIES = 10_000
+"""Entries that a list may have, those of lists within it included."""
+
+DEEPEST_LIST = 20
+"""Levels of lists within lists."""
+
 
 class Pose(list[float]):
     """p[x, y, z, rx, ry, rz]. A list that motion commands know for a pose."""
@@ -53,6 +59,27 @@ def copy(value: Any) -> Any:
         fresh = [copy(item) if isinstance(item, list) else item for item in value]
         return Pose(fresh) if isinstance(value, Pose) else fresh
     return value
+
+
+def size(value: Any, depth: int = 0) -> int:
+    """Entries of a value, those of lists within lists included; 0 for what is not a list.
+
+    Raises:
+        ScriptError: there are too many, or the lists are nested too deeply.
+    """
+    if not isinstance(value, list):
+        return 0
+    if depth >= DEEPEST_LIST:
+        raise ScriptError(f"lists within lists, more than {DEEPEST_LIST} levels deep")
+    count = len(value)
+    for item in value:
+        if isinstance(item, list):
+            count += size(item, depth + 1)
+            if count > MOST_ENTRIES:
+                break
+    if count > MOST_ENTRIES:
+        raise ScriptError(f"a list of more than {MOST_ENTRIES} entries")
+    return count
 
 
 def index(value: Any) -> int:

@@ -174,7 +174,7 @@ def deployment_arms(
         if rounds is None:
             arms.append(DeploymentArm(_label(key), common, repetitions))
         for n in sorted(set(rounds or ())):
-            plan = replace(common, settings=settings.model_copy(update={"iterations": n}))
+            plan = common.with_settings(iterations=n)
             arms.append(DeploymentArm(f"{key}-{n}", plan, repetitions))
     return tuple(arms)
 

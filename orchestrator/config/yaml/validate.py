@@ -111,7 +111,7 @@ def _owners(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
     variants = {section for section in _sections_at(model, loc[:-1], data) if section.tag}
     if not variants and len(loc) > 1 and any(section.variant for section in _sections_at(model, loc[:-1], data)):
         for parent in _sections_at(model, loc[:-2], data):
-            variants |= {s for info in parent.model_fields.values() for s in _sections_in(info.annotation) if s.variant}
+            variants |= {s for info in parent.model_fields.values() for s in sections_in(info.annotation) if s.variant}
     return {section for section in variants if loc[-1] in section.written_keys()}
 
 
@@ -243,16 +243,17 @@ def _sections_at(model: type[Section], loc: Loc, data: Any) -> set[type[Section]
             below: set[type[Section]] = set()
             for candidate in _variant(candidates, data):
                 if part in candidate.written_keys():
-                    below |= _sections_in(candidate.model_fields[candidate.written_keys()[part]].annotation)
+                    below |= sections_in(candidate.model_fields[candidate.written_keys()[part]].annotation)
             candidates = below
         data = data[part]
     return candidates
 
 
-def _sections_in(annotation: Any) -> set[type[Section]]:
+def sections_in(annotation: Any) -> set[type[Section]]:
+    """The sections that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return {annotation} if issubclass(annotation, Section) else set()
-    return {section for argument in typing.get_args(annotation) for section in _sections_in(argument)}
+    return {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
 
 
 def _one_of(value: Any, expected: str) -> str:

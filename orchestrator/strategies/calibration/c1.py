@@ -30,7 +30,7 @@ class C1Settings(DesignSettings):
     """Values of every searched parameter: {particles: 5, cohesion: 6}."""
 
     per_axis: PositiveCount | None = None
-    """As many values of each, in place of 'grid'."""
+    """Values of each searched parameter, in place of 'grid'."""
 
     @property
     def cells(self) -> dict[str, int]:

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal, Self
 
-import numpy as np
-
 from actors.optimizer.core.problem import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
 from orchestrator.config.yaml.sections import PositiveCount
 from orchestrator.errors import LearningError
@@ -15,7 +13,7 @@ from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, described
 from orchestrator.strategies.calibration.design import MeasuredPour
-from orchestrator.strategies.calibration.posterior import directions, posterior_result
+from orchestrator.strategies.calibration.posterior import central, left_open, posterior_result
 from orchestrator.strategies.calibration.prior import actions_of_prior
 from orchestrator.strategies.calibration.settings import Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
@@ -97,8 +95,12 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
     g is uniform over the box of actions unless they have a `prior`, but limited to where c_r is defined: actions at
     which less than 5 % is expected to be poured are left out. A simulation that failed, or poured too little for c_s to
-    be defined, says nothing about its neighbours and is dropped. θ* minimises the posterior mean over the whole box:
-    the lowest observation would only be the luckiest.
+    be defined, says nothing about its neighbours and is dropped.
+
+    θ* is the most central of the θ that fit the weighed pours: of the posterior's draws the one that is nearest to all
+    others. Where O2 is flat, its minimiser is a matter of chance, mostly at an edge of the box, and often excluded by
+    the very pours that it was found from. With 'noise' θ* minimises the surrogate's mean over the whole box, as in the
+    paper; the lowest observation would only be the luckiest.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); a surrogate over both arguments of an expected cost:
     Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
@@ -177,9 +179,11 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         """The next θ, or θ* once the budget is spent."""
         remaining = self._settings.budget - len(self._trials)
         if remaining <= 0:
-            if self._trials.idle:
+            if self._trials.idle and self._knows_actions:
+                self._ask_posterior()
+            elif self._trials.idle:
                 problem = self._problem(everything=True, acquisition="posterior_minimum", resolution=MAP_RESOLUTION)
-                self._questions.put(problem, "conclude", self._conclude)
+                self._questions.put(problem, "conclude", self._settle_at_minimum)
             return
         if len(self._trials) == 0:
             count = min(max(self._settings.initial, 1), remaining)
@@ -187,12 +191,6 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._questions.put(problem, "start", self._queue)
         elif self._trials.ready:
             self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
-
-    def _conclude(self, suggestion: Suggestion) -> None:
-        """θ* is known; what the pours say about θ beside it is asked."""
-        self._settle_at_minimum(suggestion)
-        if self._knows_actions:
-            self._ask_posterior()
 
     def _ask_posterior(self) -> None:
         """Draws of θ given the training pours: first what the regression says at them, for it is in the differences."""
@@ -202,9 +200,10 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
         def drawn(suggestion: Suggestion) -> None:
             self._posterior = suggestion.posterior
-            if self._posterior is not None:
-                for text in directions(np.array(self._posterior.points), self._plan.parameters.names):
-                    self.decisions.append(Decision(text))
+            if self._posterior is None:
+                raise self._nothing_learnt()
+            self.decisions += [Decision(text) for text in left_open(self._posterior, self._plan.parameters.names)]
+            self._ask_expected(central(self._posterior))
 
         def regressed(regression: Suggestion) -> None:
             offsets = tuple(
@@ -219,6 +218,16 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
         data = Data(places, weighed)
         self._questions.put(SuggestProblem(self._plan.actions, data, count=0, predict_at=places), "regress", regressed)
+
+    def _ask_expected(self, point: Point) -> None:
+        """What is expected of θ*, and the map through it."""
+
+        def settle(suggestion: Suggestion) -> None:
+            self._final = suggestion
+            self._settle(point, suggestion.predictions[0], suggestion.prediction_deviations[0])
+
+        problem = self._problem(everything=True, resolution=MAP_RESOLUTION)
+        self._questions.put(replace(problem, count=0, predict_at=(point,), map_at=point), "conclude", settle)
 
     def _live_resolution(self) -> int:
         """Resolution of the map that the next answer carries for those who watch; mostly 0, for none."""

@@ -15,6 +15,7 @@ from actors.arm.path.plan import plan_path
 from actors.arm.spec import Pose
 from sim_engine.action import DEG
 from sim_engine.contact import rotations
+from tests.depth import examples
 
 from .cell import SPEC, motion, placed, turned, vessel
 
@@ -34,7 +35,7 @@ poses = st.tuples(st.floats(-0.2, 0.0), st.floats(-0.1, 0.1), st.floats(0.05, 0.
 
 
 @given(pose=poses, roll=st.floats(-3, 3))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_joints_for_a_pose_put_the_pourer_there(pose, roll):
     x, y, z, tilt = pose
     spec = replace(SPEC, grip=Pose(0.01, -0.05, 0.02, -1.2 + 0.1 * roll, 0.3, 0.1))

@@ -18,6 +18,7 @@ from actors.arm.path.kinematics import (
     singularities,
 )
 from actors.virtual_ur.kinematics import Kinematics
+from tests.depth import examples
 
 from .cell import SPEC, turned
 
@@ -27,7 +28,7 @@ joints = arrays(float, 6, elements=st.floats(-3.1, 3.1))
 
 @pytest.mark.parametrize("name", MODELS)
 @given(q=joints)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 def test_the_flange_is_where_the_controller_has_it(name, q):
     rotation, position = forward(q, MODELS[name])
     theirs, at = Kinematics(MODELS[name]).flange(q)
@@ -37,7 +38,7 @@ def test_the_flange_is_where_the_controller_has_it(name, q):
 
 @pytest.mark.parametrize("name", MODELS)
 @given(q=joints)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 def test_all_postures_that_the_controller_finds_are_found(name, q):
     model = MODELS[name]
     rotation, position = forward(q[None], model)
@@ -51,7 +52,7 @@ def test_all_postures_that_the_controller_finds_are_found(name, q):
 
 
 @given(q=joints)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_what_is_within_reach_has_joints_and_nothing_else_has(q):
     assume(singularities(q, MODEL).min() > 1e-4)
     rotation, position = forward(q[None], MODEL)
@@ -65,7 +66,7 @@ def test_what_is_within_reach_has_joints_and_nothing_else_has(q):
 
 
 @given(q=joints)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_every_posture_leads_back_to_the_pose(q):
     assume(singularities(q, MODEL).min() > 1e-4)  # there joint 6 may be anything, and 0 need not be in reach
     rotation, position = forward(q[None], MODEL)
@@ -76,7 +77,7 @@ def test_every_posture_leads_back_to_the_pose(q):
 
 
 @given(q=joints)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_a_posture_is_the_one_that_the_joints_are_in(q):
     assume(singularities(q, MODEL).min() > 1e-3)  # two postures meet there
     found = inverse(*forward(q[None], MODEL), MODEL)[0]
@@ -120,7 +121,7 @@ def test_a_straight_elbow_and_a_straight_wrist_are_singular(joint, angle, which)
 
 
 @given(q=joints)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_singular_is_where_no_joint_moves_the_flange_some_way(q):
     # a Jacobian by differences: near a singularity it loses rank, and only there
     h = 1e-6

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from actors.arm.path.pace import STEEPEST, followable, pour_times, trapezoid
 from sim_engine.action import DEG
 from sim_engine.motion import Phase, PourMotion, Segment
+from tests.depth import examples
 
 from .cell import ACTION, motion
 
@@ -60,7 +61,7 @@ def test_a_pour_that_ends_tilted_still_does():
     speed=st.floats(2, 150), angle=st.floats(10, 135), acceleration=st.floats(15, 990),
     hold=st.just(0.0) | st.floats(1e-3, 10), back=st.floats(5, 150),
 )  # fmt: skip
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_phases_end_at_waypoints_and_chords_stay_close(speed, angle, acceleration, hold, back):
     made = motion(
         ACTION.with_values(
@@ -83,7 +84,7 @@ def test_phases_end_at_waypoints_and_chords_stay_close(speed, angle, acceleratio
 
 
 @given(length=st.floats(1e-3, 2.0), speed=st.floats(0.01, 2.0), acceleration=st.floats(0.1, 5.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_a_way_is_made_from_rest_to_rest_within_speed_and_acceleration(length, speed, acceleration):
     times, way = trapezoid(length, speed, acceleration, 0.02)
     assert (times[0], way[0], way[-1]) == (0.0, 0.0, length)

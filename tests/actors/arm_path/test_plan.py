@@ -26,6 +26,7 @@ from sim_engine.contact import clearance, first_contact, rotations
 from sim_engine.motion import plan_motion
 from sim_engine.task import Pivot
 from sim_engine.vessel.build import build_vessel
+from tests.depth import examples
 
 from .cell import ACTION, CONFIGS, LIMITS, SPEC, limited, motion, turned, vessel, waiting_at
 
@@ -56,7 +57,7 @@ def dense(path: JointPath) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(action=actions)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 def test_the_encoders_would_see_the_pour_that_was_asked_for(action):
     asked = motion(action)
     pour = plan_path(asked, SPEC, vessel("beaker"), vessel("tumbler")).pour
@@ -69,7 +70,7 @@ def test_the_encoders_would_see_the_pour_that_was_asked_for(action):
 
 
 @given(action=actions, direction=st.sampled_from([75, 90, 100]), tilt=st.floats(60, 140))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(12), deadline=None)
 def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):
     limits = replace(LIMITS, tilt=tilt * DEG, joint_speed=140 * DEG, tool_speed=0.45, box_low=(0.3, -0.4, 0.1),
                      planes=(Plane((0.0, -1.0, 0.0), -0.02), Plane((-0.6, 0.0, -0.8), -0.9)))  # fmt: skip
@@ -103,7 +104,7 @@ def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):
 
 
 @given(action=actions)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 def test_the_three_parts_join_from_home_to_home(action):
     path = planned(action)
     np.testing.assert_allclose(path.approach.joints[0], SPEC.home, atol=1e-9)
@@ -120,7 +121,7 @@ def test_the_three_parts_join_from_home_to_home(action):
 
 
 @given(action=actions)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 def test_a_full_pourer_travels_upright_and_gently(action):
     path = planned(action)
     for part in (path.approach, path.retreat):
@@ -212,7 +213,7 @@ def test_where_the_straight_way_would_sweep_through_the_receiver_the_pourer_is_l
 
 
 @given(action=actions)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 def test_the_nearest_approach_of_the_vessels_is_found_among_few_poses(action):
     spec = limited(clearance=0.0)
     try:

@@ -15,6 +15,7 @@ import pytest
 from actors.arm.joint_path import PourPath
 from actors.arm.ur.driver import UrArm
 from actors.virtual_ur import VirtualController
+from tests.patience import PATIENCE
 
 from .pours import HOME, START, pour_path, settings
 
@@ -44,7 +45,7 @@ class Call(threading.Thread):
         except Exception as error:
             self.error = error
 
-    def result(self, patience: float = 60.0) -> Any:
+    def result(self, patience: float = PATIENCE) -> Any:
         self.join(patience)
         assert not self.is_alive(), "the call did not come back"
         if self.error is not None:
@@ -106,7 +107,7 @@ class Rig:
         time.sleep(0.1)  # joints follow their targets a few milliseconds late
 
     @staticmethod
-    def await_that(condition: Callable[[], bool], what: str, patience: float = 20.0) -> None:
+    def await_that(condition: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
         end = time.monotonic() + patience
         while not condition():
             assert time.monotonic() < end, f"{what} did not come"

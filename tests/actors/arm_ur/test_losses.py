@@ -26,6 +26,7 @@ from actors.arm.ur.errors import ArmError, ArmLostError, ArmNotReleasedError, Ar
 from actors.arm.ur.messages import Settings
 from actors.arm.ur.script import path_program
 from actors.protocols import LaboratoryError
+from tests.patience import PATIENCE
 
 from .conftest import Call, Rig, next_address
 from .pours import START, pour_path, settings
@@ -341,7 +342,7 @@ def test_the_driver_does_not_load_the_client_library() -> None:
         "import sys, actors.arm.ur.driver; "
         "print([m for m in sys.modules if m.startswith('rtde') or m.startswith('dashboard_client')])"
     )
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE)
     assert said.stdout.strip() == "[]"
 
 

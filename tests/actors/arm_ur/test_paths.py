@@ -20,6 +20,7 @@ from actors.arm.ur.primary import PrimaryError, split
 from actors.arm.ur.script import path_program, thinned
 from actors.arm.ur.tracking import executed_path
 from actors.arm.ur.ways import leans, rejoin, upright_way, way_home
+from tests.depth import examples
 
 from .pours import HOME, START, pour_path, settings, smooth
 
@@ -31,7 +32,7 @@ POUR = pour_path()
 
 
 @given(seed=st.integers(0, 10_000))
-@example_settings(max_examples=30, deadline=None)
+@example_settings(max_examples=examples(30), deadline=None)
 def test_leaving_points_out_changes_no_joint_by_more_than_the_tolerance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     times = np.concatenate([[0.0], np.cumsum(rng.uniform(0.001, 0.05, 200))])
@@ -64,7 +65,7 @@ def test_the_older_generation_is_not_asked_for_what_it_does_not_know() -> None:
 
 
 @given(share=st.floats(0.0, 1.0), noise=st.integers(0, 100))
-@example_settings(max_examples=60, deadline=None)
+@example_settings(max_examples=examples(60), deadline=None)
 def test_un_tilting_ends_upright_never_tilts_further_and_is_slow(share: float, noise: int) -> None:
     spec = settings()
     here = share * POUR.pour.duration

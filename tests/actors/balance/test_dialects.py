@@ -13,6 +13,7 @@ from actors.balance.dialects.dialect import Dialect
 from actors.balance.dialects.kern_swt import KernSwt
 from actors.balance.dialects.sbi import Sbi
 from actors.balance.reading import Acknowledgement, Answer, FrameError, Reading, Status
+from tests.depth import examples
 
 SPEAKERS: tuple[Dialect, ...] = (*DIALECTS.values(), KernSwt(short=True), Sbi(identified=True))
 
@@ -72,7 +73,7 @@ def test_answers_to_commands_are_told_from_weights(line, command, answer):
 
 
 @pytest.mark.parametrize("dialect", SPEAKERS, ids=lambda d: d.name)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(line=st.binary(max_size=40) | st.text('SDITAZ+-. 0123456789gkErohLwM[]"', max_size=22).map(str.encode))
 @example(line=b"")
 @example(line=b"S S 1e5 g")

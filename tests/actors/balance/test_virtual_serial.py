@@ -18,6 +18,7 @@ from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.handle import VirtualSerialBalance
 from actors.balance.virtual_serial.scale import Scale, ScaleSettings
 from actors.protocols import LaboratoryError
+from tests.patience import PATIENCE
 
 from .conftest import spec_for
 
@@ -240,7 +241,7 @@ def test_it_dies_with_a_parent_that_was_killed():
     os.kill(parent.pid, 9)
     parent.wait()
     parent.stdout.close()
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + PATIENCE
     while time.monotonic() < end and psutil.pid_exists(child) and psutil.Process(child).status() != "zombie":
         time.sleep(0.05)
     assert not psutil.pid_exists(child) or psutil.Process(child).status() == "zombie"

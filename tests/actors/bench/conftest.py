@@ -29,6 +29,7 @@ from sim_engine.liquid import Liquid
 from sim_engine.outcome import PourOutcome
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
+from tests.patience import PATIENCE
 
 LABORATORIES = Path(__file__).parents[3] / "configs" / "laboratories"
 
@@ -221,7 +222,7 @@ def open_stage() -> OpenStage:
     return open_it
 
 
-async def reach(seen: list[Any], checkpoint: str, patience: float = 60.0) -> None:
+async def reach(seen: list[Any], checkpoint: str, patience: float = PATIENCE) -> None:
     """Wait until a pour's progress has come to a checkpoint."""
     end = time.monotonic() + patience
     while not seen or seen[-1].checkpoint != checkpoint:

@@ -16,7 +16,7 @@ from actors.protocols import Notice, UnknownPourError
 
 from .conftest import ACTION, SCENE, Trickle, reach, wired_spec
 
-pytestmark = [pytest.mark.ray, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.ray]
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from actors.virtual_ur.fields import output_fields
 from actors.virtual_ur.models import HOME
 from actors.virtual_ur.safety import Plane, SafetyConfiguration, SafetyMode
 from actors.virtual_ur.wire.recipes import OutputRecipe
+from tests.depth import examples
 
 from .conftest import Bench
 
@@ -297,7 +298,7 @@ _commands = st.one_of(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(commands=st.lists(_commands, min_size=1, max_size=6), cut=st.floats(0.1, 4.0), what=st.integers(0, 4))
 def test_whatever_a_program_commands_no_joint_s_target_ever_jumps(commands: list[str], cut: float, what: int) -> None:
     bench = Bench(frequency=125)
@@ -341,7 +342,7 @@ _wild = st.one_of(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(commands=st.lists(_wild, min_size=1, max_size=4), slider=st.sampled_from([0.0, 1e-9, 1.0]))
 def test_the_wildest_numbers_neither_move_an_arm_wildly_nor_stop_the_controller(
     commands: list[str], slider: float

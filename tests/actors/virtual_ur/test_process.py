@@ -8,7 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 
 import psutil
 import pytest
@@ -16,6 +18,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from actors.virtual_ur import VirtualController, VirtualControllerError
+from tests.depth import examples
+from tests.patience import PATIENCE
 
 from .conftest import next_address
 
@@ -29,7 +33,7 @@ def alive(pid: int) -> bool:
         return False
 
 
-def gone(pid: int, seconds: float = 5.0) -> bool:
+def gone(pid: int, seconds: float = 60.0) -> bool:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if not alive(pid):
@@ -118,10 +122,74 @@ def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
         parent.stdout.close()
 
 
+HANGING = """
+import asyncio, os, re, sys
+from actors.virtual_ur.host import until_orphaned
+
+async def main():
+    asyncio.get_running_loop().call_later(1.0, lambda: re.match("(a+)+$", "a" * 60 + "b"))  # holds the interpreter
+    print(os.getpid(), flush=True)
+    await until_orphaned(os.getppid(), interval=0.1, hung=2.0)
+
+asyncio.run(main())
+"""
+
+
+def test_an_interpreter_that_hangs_ends_all_the_same() -> None:
+    with tempfile.TemporaryFile() as complaints:
+        process = subprocess.Popen(
+            [sys.executable, "-c", HANGING], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints
+        )
+        try:
+            assert process.stdout is not None
+            assert int(process.stdout.readline()) == process.pid
+            assert process.wait(60) == 1
+        finally:
+            process.kill()
+            process.communicate()
+        complaints.seek(0)
+        assert b"Timeout" in complaints.read()
+
+
+def send(controller: VirtualController, text: bytes, most: float = 60.0) -> float:
+    """Send text as a program. Returns the latest wake-up of the clock so far [s]."""
+    with (
+        contextlib.suppress(ConnectionError),
+        socket.create_connection((controller.address, 30003), timeout=most) as port,
+    ):
+        port.sendall(text)
+    greeting(controller.address)
+    return float(controller.fault("state", patience=most)["timing"]["worst"])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"x=1\n" * 6_000 + b'textmsg("all of them")\n', "all of them"),
+        (b"def f():\n" + b"  x = 1\n" * 20_000 + b"  sleep(100)\nend\n", "program f started"),
+        (b"def f():\n" + b"  x = 1\n" * 400_000, "without an end"),
+        (b"a = [0]\n" + b"def f():\n a = [0]\n while True:\n  a = [a, a]\n end\nend\n", "more than 10000 entries"),
+    ],
+    ids=["many", "long", "endless", "growing"],
+)
+def test_no_program_takes_the_clock_its_time(fresh: Callable[..., VirtualController], text: bytes, says: str) -> None:
+    controller = fresh(time_scale=1.0, frequency=125.0)
+    late = send(controller, text)
+    end = time.monotonic() + PATIENCE
+    while True:
+        state = controller.fault("state", patience=20.0)
+        late = max(late, state["timing"]["worst"])
+        if any(says in message for message in state["messages"]):
+            break
+        assert time.monotonic() < end, state["messages"]
+        time.sleep(0.1)
+    assert late < 1.0, f"the clock was {late:.2f} s late"
+
+
 sizes = st.integers(0, 70_000)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(port=st.sampled_from((*PORTS, 0)), data=st.one_of(st.binary(max_size=200), sizes.map(os.urandom)))
 def test_no_bytes_on_any_port_bring_it_down(shared: VirtualController, port: int, data: bytes) -> None:
     try:

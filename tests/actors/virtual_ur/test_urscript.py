@@ -6,14 +6,18 @@ import contextlib
 import time
 from typing import Any
 
+import psutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.virtual_ur.commands.maths import COMMANDS
+from actors.virtual_ur.urscript import program
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.lexer import KEYWORDS, Splitter
-from actors.virtual_ur.urscript.program import Command, Program, Steps
+from actors.virtual_ur.urscript.program import Command, Program, Steps, waiting
+from actors.virtual_ur.urscript.translate import translate
+from tests.depth import examples
 
 from .conftest import Bench
 
@@ -30,7 +34,7 @@ class Run:
         commands = {**COMMANDS, "out": Command(self.found.append), "sync": Command(sync, waits=True)}
         if wrap:
             text = "def test():\n" + text + "\nend\n"
-        self.program = Program(text, commands)
+        self.program = Program(translate(text, waiting(commands)), commands)
         self.cycles = 0
 
     def all(self, limit: int = 1000) -> list[Any]:
@@ -268,14 +272,55 @@ def test_what_goes_wrong_while_it_runs_is_told_with_its_line(text: str, line: in
         "while True:\n" * 50 + "sync()\n" + "end\n" * 50,
         "x = " + "9" * 100000,
         "x = pow(10, 400)",
+        "a = [0]\nwhile True:\n  a = [a, a]\nend",
+        "a = [0]\nwhile True:\n  a = [a, a]\n  sync()\nend",
+        "a = [0, 0]\nwhile True:\n  a[0] = a\n  a[1] = a\n  sync()\nend",
+        "a = [0]\nwhile True:\n  a = [a]\n  sync()\nend",
+        "def f(n):\n  if n == 0:\n    return 1\n  end\n  return f(n - 1) + f(n - 1)\nend\nout(f(60))",
+        "while True:\n" + "x = 1\n" * 3000 + "end",
+        "a = make_list(10000, 1)\nwhile True:\n  x = normalize(a)\nend",
+        "a = make_list(10000, 1)\nb = a\nwhile True:\n  x = a == b\nend",
+        "def f0():\n  sync()\nend\n" + "".join(f"def f{i}():\n  f{i - 1}()\nend\n" for i in range(1, 2500)) + "f1()",
+        "def f(" + ", ".join(f"p{i}" for i in range(4000)) + "):\n" + "x = 1\n" * 4000 + "end",
     ],
-    ids=range(15),
+    ids=range(25),
 )
 def test_a_program_that_would_hang_or_fill_the_controller_is_ended(text: str) -> None:
-    began = time.perf_counter()
+    before, began = psutil.Process().memory_info().rss, time.process_time()
     with contextlib.suppress(ScriptError):
         result(text)
-    assert time.perf_counter() - began < 5.0
+    assert time.process_time() - began < 5.0
+    assert psutil.Process().memory_info().rss - before < 4e8
+
+
+def test_a_program_that_keeps_more_and_more_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(program, "MOST_MEMORY", 50_000_000)
+    text = """
+a = make_list(10000, 0)
+i = 0
+while True:
+  i = i + 1
+  a[i] = [make_list(4000, 1.5), make_list(4000, 2.5)]
+  sync()
+end
+"""
+    before = psutil.Process().memory_info().rss
+    with pytest.raises(ScriptError, match="holds more than 50 MB"):
+        Run(text).all(limit=3_000)
+    assert psutil.Process().memory_info().rss - before < 2e8
+
+
+def test_one_cycle_of_the_maddest_program_is_no_pause_that_a_clock_would_drop() -> None:
+    for text in ("while True:\nend", "p = p[.5, .2, .3, 0, 3, 0]\nwhile True:\n  x = pose_trans(p, p)\nend"):
+        run = Run(text)
+        began = time.process_time()
+        with pytest.raises(ScriptError, match="without sync"):
+            run.program.tick()
+        assert time.process_time() - began < 0.5
+
+
+def test_lists_are_compared_by_their_entries() -> None:
+    assert result("a = [1, 2]\nout(a == [1, 2])\nout(a != [1, 3])\nout(a == 1)") == [True, True, False]
 
 
 @pytest.mark.parametrize(
@@ -306,7 +351,7 @@ words = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(text=st.lists(words, max_size=40).map(" ".join))
 def test_any_words_are_a_program_or_an_error(text: str) -> None:
     with contextlib.suppress(ScriptError):
@@ -315,7 +360,7 @@ def test_any_words_are_a_program_or_an_error(text: str) -> None:
             run.program.tick()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(text=st.text(max_size=200))
 def test_any_text_is_a_program_or_an_error(text: str) -> None:
     with contextlib.suppress(ScriptError):

@@ -20,6 +20,7 @@ from actors.virtual_ur.servers.primary_server import PrimaryConnection, PrimaryS
 from actors.virtual_ur.servers.rtde_server import RtdeConnection, RtdeServer
 from actors.virtual_ur.servers.script_server import ScriptConnection
 from actors.virtual_ur.wire import primary
+from tests.depth import examples
 
 
 class _Socket:
@@ -64,6 +65,7 @@ class Wire(asyncio.Transport):
     def say(self, data: bytes) -> None:
         if not self.cut:
             self._connection.data_received(data)
+            self._connection.connections.uploads.work(1.0)  # as the host does at its next wake-up
 
     def take(self) -> bytes:
         data = bytes(self.got)
@@ -270,7 +272,7 @@ anything = st.lists(st.one_of(known, st.binary(max_size=40)), max_size=12)
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 @given(pieces=anything)
 def test_no_bytes_whatever_disturb_a_controller(kind: str, pieces: list[bytes]) -> None:
     controller = Controller(UR10E)

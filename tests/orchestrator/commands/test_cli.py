@@ -25,6 +25,7 @@ from orchestrator.unknown import LOST, REPEAT
 from sim_engine.spread import spreads
 from tests.end_to_end import small
 from tests.orchestrator import watched
+from tests.patience import PATIENCE
 
 CSV = """\
 angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,split
@@ -266,7 +267,7 @@ def process(command: str, folder: Path, program: str = PROGRAM) -> subprocess.Co
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
     )
 
 

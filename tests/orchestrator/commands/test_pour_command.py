@@ -31,6 +31,7 @@ from tests.end_to_end import small
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal
 from tests.orchestrator.toy import ToyBench, ToyLaboratory
+from tests.patience import PATIENCE
 
 ADDRESS = "127.84.3.2"
 ACTION = ("--set", "angular_velocity=30", "--set", "x_offset=80")
@@ -263,7 +264,7 @@ def test_terminal_that_is_closed_in_a_pour_leaves_the_arm_at_home_and_the_pour_u
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.05)

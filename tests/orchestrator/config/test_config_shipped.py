@@ -19,6 +19,7 @@ from orchestrator.config.schema import campaign_schema, laboratory_schema, schem
 from orchestrator.config.yaml.source import Document
 from sim_engine.action import DEG, Action
 from sim_engine.vessel.spec import MeshShape
+from tests.patience import PATIENCE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 CAMPAIGNS = sorted((CONFIGS / "campaigns").glob("*.yaml"))
@@ -147,5 +148,5 @@ def test_loading_a_campaign_starts_nothing_heavy() -> None:
         "heavy = ('ray', 'taichi', 'rerun', 'sklearn', 'scipy.stats', 'matplotlib', 'trimesh');"
         "print([m for m in heavy if m in sys.modules])"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
     assert result.stdout.strip() == "[]", result.stderr

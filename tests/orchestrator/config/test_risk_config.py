@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from orchestrator.commands import campaigns
-from orchestrator.commands.common import RefusalError
+from orchestrator.commands.speaking import RefusalError
 from orchestrator.config.load import load_campaign
 from orchestrator.config.schema import campaign_schema
 from orchestrator.config.yaml.errors import ConfigError
@@ -73,7 +73,7 @@ def test_a_run_may_not_be_gone_on_with_under_another_risk_or_window(tmp_path: Pa
     assert plain.deployment is not None
     assert isinstance(plain.deployment.settings, D1Settings)
     assert (plain.deployment.settings.rounds, plain.deployment.settings.simulations_per_iteration) == (15, 2)
-    other = plans.changed(plain.deployment, window=plans.window(0.02))
+    other = plain.deployment.with_settings(window=plans.window(0.02))
     assert fingerprint(replace(plain, deployment=other)) != fingerprint(plain)
 
 

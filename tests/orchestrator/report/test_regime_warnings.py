@@ -144,7 +144,8 @@ def test_a_campaign_begins_with_what_is_not_simulated_in_it_each_kind_once(verb:
 
 
 def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from orchestrator.commands.common import RefusalError, run_in_front_of_people
+    from orchestrator.commands.common import run_in_front_of_people
+    from orchestrator.commands.speaking import RefusalError
 
     plan = load_campaign(folder / "small.yaml")
     for resume, times in ((False, 1), (True, 0)):

@@ -11,7 +11,7 @@ import yaml
 
 from actors.optimizer.core.problem import SuggestProblem
 from orchestrator.commands.campaigns import RunOptions, run
-from orchestrator.commands.common import RefusalError
+from orchestrator.commands.speaking import RefusalError
 from orchestrator.config.load import load_campaign
 from orchestrator.config.study.sections import load_study
 from orchestrator.config.yaml.errors import ConfigError
@@ -30,7 +30,6 @@ from orchestrator.study.report.drawing import colour
 from orchestrator.study.report.gather import gather
 from orchestrator.study.report.tables import tables
 from orchestrator.study.worker import run_cell
-from tests.orchestrator import plans
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
 from tests.orchestrator.play import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, Play
 from tests.orchestrator.study_files import read, written
@@ -51,7 +50,7 @@ def questions(strategy: RealOnly | Hybrid, purpose: str) -> list[SuggestProblem]
 
 def on_the_toy(plan: DeploymentPlan | None) -> DeploymentPlan:
     assert plan is not None
-    plan = plans.changed(plan, pours=1, prior_simulations=8)
+    plan = plan.with_settings(pours=1, prior_simulations=8)
     return replace(plan, scenes=(SCENE,), actions=ACTIONS)
 
 
@@ -78,7 +77,7 @@ def calibration(folder: Path, keys: str = "") -> CampaignPlan:
 def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, keys: str, paper: bool) -> None:
     plan = calibration(folder, keys).calibration
     assert plan is not None
-    plan = plans.changed(plan, simulations=8, initial=4)
+    plan = plan.with_settings(simulations=8, initial=4)
     plan = replace(plan, scene=SCENE, actions=CALIBRATION_ACTIONS, parameters=PARAMETERS)
     results: dict[str, Any] = {}
     for stage in calibration_stages(plan)[:2]:
@@ -138,9 +137,9 @@ def study(folder: Path, **changes: Any) -> StudyPlan:
 def test_a_study_has_the_papers_methods_beside_ours(tmp_path: Path) -> None:
     plan = study(tmp_path, mismatch=read("quick")["mismatch"])
     ours, papers = plan.calibration("C4").plan, plan.calibration("C4-paper").plan
-    assert plans.changed(papers, averaging="context") == ours != papers
+    assert papers.with_settings(averaging="context") == ours != papers
     ours, papers = (plan.deployment(label).plan for label in ("D2", "D2-paper"))
-    assert plans.changed(papers, mean="constant") == ours != papers
+    assert papers.with_settings(mean="constant") == ours != papers
     own, papers_own = (plan.deployment(label).plan.settings for label in ("D3", "D3-paper"))
     assert isinstance(own, D3Settings)
     assert isinstance(papers_own, D3Settings)

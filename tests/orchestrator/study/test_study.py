@@ -36,6 +36,7 @@ from tests.orchestrator import toy_study
 from tests.orchestrator.study_files import ROOT, read, small, without, written
 from tests.orchestrator.toy import logical_record
 from tests.orchestrator.toy_study import PAUSE, ToyLaboratory, run_toy_study
+from tests.patience import PATIENCE
 
 
 def comparable(study: StudyPlan) -> dict[str, Any]:
@@ -78,7 +79,7 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
     for cell in cells:
         run_cell(undisturbed, cell, undisturbed.folder, ToyLaboratory)  # type: ignore[arg-type]
     process = toy_process(disturbed, 0.05)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + PATIENCE
     while sum(is_finished(disturbed.folder, cell.id) for cell in cells) < 2:
         assert process.poll() is None, process.stderr.read() if process.stderr else ""
         assert time.monotonic() < deadline

@@ -48,7 +48,7 @@ def streams(address: str) -> dict[str, Any]:
         q[5] += 0.001
         control.servoJ(q, 0.0, 0.0, 0.002, 0.05, 300)
         control.waitPeriod(cycle)
-    until(lambda: abs(receive.getActualQ()[5] - q[5]) < 1e-4, 2.0)
+    until(lambda: abs(receive.getActualQ()[5] - q[5]) < 1e-4)
     seen["servoJ target"], seen["servoJ reached"] = q, receive.getActualQ()
     control.servoStop()
     pose = receive.getActualTCPPose()
@@ -57,23 +57,23 @@ def streams(address: str) -> dict[str, Any]:
         pose[1] += 0.0003
         control.servoL(pose, 0.0, 0.0, 0.002, 0.05, 300)
         control.waitPeriod(cycle)
-    until(lambda: abs(receive.getActualTCPPose()[1] - pose[1]) < 1e-4, 2.0)
+    until(lambda: abs(receive.getActualTCPPose()[1] - pose[1]) < 1e-4)
     seen["servoL target"], seen["servoL reached"] = list(pose), receive.getActualTCPPose()
     control.servoStop()
     control.speedJ([0.0, 0.0, 0.0, 0.0, 0.0, -0.4], 2.0, 0.5)
-    until(lambda: abs(receive.getActualQd()[5] + 0.4) < 1e-3, 2.0)
+    until(lambda: abs(receive.getActualQd()[5] + 0.4) < 1e-3)
     seen["speedJ"] = receive.getActualQd()
     control.speedStop(4.0)
     time.sleep(0.05)  # the receiving connection may be a package behind
     seen["speedJ after"] = receive.getTargetQd()
     control.speedL([0.0, 0.0, 0.05, 0.0, 0.0, 0.0], 0.5, 0.5)
-    until(lambda: abs(receive.getActualTCPSpeed()[2] - 0.05) < 1e-4, 2.0)
+    until(lambda: abs(receive.getActualTCPSpeed()[2] - 0.05) < 1e-4)
     seen["speedL"] = receive.getActualTCPSpeed()
     control.speedStop(1.0)
     time.sleep(0.05)
     seen["speedL after"] = receive.getTargetTCPSpeed()
     control.jogStart([0.0, 0.02, 0.0, 0.0, 0.0, 0.0], control.FEATURE_TOOL)
-    seen["jog"] = until(lambda: max(map(abs, receive.getActualTCPSpeed()[:3])) > 0.015, 3.0)
+    seen["jog"] = until(lambda: max(map(abs, receive.getActualTCPSpeed()[:3])) > 0.015)
     control.jogStop()
     return seen
 
@@ -85,7 +85,7 @@ def circular(address: str) -> dict[str, Any]:
     pose = receive.getActualTCPPose()
     pose[2] += 0.05
     control.servoC(pose, 0.1, 1.0)
-    until(lambda: abs(receive.getActualTCPPose()[2] - pose[2]) < 1e-3, 5.0)
+    until(lambda: abs(receive.getActualTCPPose()[2] - pose[2]) < 1e-3)
     seen: dict[str, Any] = {"target": pose, "reached": receive.getActualTCPPose()}
     # The library doesn't wait for servoC to be done, its script says so nevertheless: the next command is lost.
     seen["stop"] = [control.servoStop(), control.servoStop()]
@@ -112,7 +112,7 @@ def paths(address: str) -> dict[str, Any]:
     path.addEntry(PathEntry(PathEntry.MoveL, PathEntry.PositionTcpPose, [*start, 0.25, 1.2, 0.0]))
     control.movePath(path, True)
     progress = set()
-    until(lambda: control.getAsyncOperationProgressEx().isAsyncOperationRunning(), 2.0)
+    until(lambda: control.getAsyncOperationProgressEx().isAsyncOperationRunning())
     while control.getAsyncOperationProgressEx().isAsyncOperationRunning():
         progress.add(control.getAsyncOperationProgressEx().progress())
         time.sleep(0.002)
@@ -128,20 +128,20 @@ def asynchronous(address: str) -> dict[str, Any]:
     control.moveJ(HOME, 2.0, 4.0)
     before = control.getAsyncOperationProgressEx().operationId()
     seen: dict[str, Any] = {"started": control.moveJ([2.0, *HOME[1:]], 1.0, 1.4, True)}
-    seen["new operation"] = until(lambda: control.getAsyncOperationProgressEx().operationId() != before, 2.0)
+    seen["new operation"] = until(lambda: control.getAsyncOperationProgressEx().operationId() != before)
     seen["running"] = control.getAsyncOperationProgressEx().isAsyncOperationRunning()
     until(lambda: receive.getActualQ()[0] > 0.5)
     seen["not steady"] = control.isSteady()
     control.stopJ(2.0)
-    seen["stands after stopJ"] = until(lambda: max(map(abs, receive.getTargetQd())) < 1e-9, 0.5)
+    seen["stands after stopJ"] = until(lambda: max(map(abs, receive.getTargetQd())) < 1e-9)
     seen["stopped at"] = receive.getActualQ()[0]
-    seen["finished"] = until(lambda: not control.getAsyncOperationProgressEx().isAsyncOperationRunning(), 2.0)
+    seen["finished"] = until(lambda: not control.getAsyncOperationProgressEx().isAsyncOperationRunning())
     pose = receive.getActualTCPPose()
     pose[2] += 0.2
     control.moveL(pose, 0.1, 0.5, True)
     until(lambda: receive.getActualTCPSpeed()[2] > 0.09)
     control.stopL(1.0, True)
-    seen["stopL stops"] = until(lambda: max(map(abs, receive.getTargetQd())) < 1e-6, 5.0)
+    seen["stopL stops"] = until(lambda: max(map(abs, receive.getTargetQd())) < 1e-6)
     seen["moveL again"] = control.moveL(pose, 0.25, 1.2)
     return seen
 
@@ -151,11 +151,11 @@ def unreachable(address: str) -> dict[str, Any]:
     seen: dict[str, Any] = {"moveL": control.moveL([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])}
     seen["program runs"] = control.isProgramRunning()
     control.reuploadScript()
-    until(control.isProgramRunning, 5.0)
+    until(control.isProgramRunning)
     seen["inverse"] = attempt(lambda: control.getInverseKinematics([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     control.reuploadScript()
-    until(control.isProgramRunning, 5.0)
+    until(control.isProgramRunning)
     seen["moves again"] = control.moveJ(HOME, 2.0, 4.0)
     seen["force mode"] = control.forceMode([0.0] * 6, [0, 0, 1, 0, 0, 0], [0.0] * 6, 2, [0.1] * 6)
-    seen["force mode ends program"] = until(lambda: not control.isProgramRunning(), 2.0)
+    seen["force mode ends program"] = until(lambda: not control.isProgramRunning())
     return seen

@@ -34,7 +34,7 @@ def questions(address: str) -> dict[str, Any]:
     seen["tcp"] = control.getTCPOffset()
     seen["pose with tcp"] = receive.getActualTCPPose()
     seen["set payload"] = control.setPayload(0.75, [0.0, 0.0, 0.06])
-    until(lambda: receive.getPayload() == 0.75, 1.0)
+    until(lambda: receive.getPayload() == 0.75)
     seen["payload"] = [receive.getPayload(), *receive.getPayloadCog()]
     control.getActualToolFlangePose()
     time.sleep(0.1)
@@ -69,7 +69,7 @@ def signals(address: str) -> dict[str, Any]:
         io.setInputIntRegister(19, 42),
         io.setInputDoubleRegister(20, 2.5),
     ]
-    until(lambda: receive.getTargetSpeedFraction() == 0.6, 2.0)
+    until(lambda: receive.getTargetSpeedFraction() == 0.6)
     seen["bits"] = receive.getActualDigitalOutputBits()
     seen["state"] = [receive.getDigitalOutState(n) for n in (0, 1, 10, 16)]
     seen["analog"] = [receive.getStandardAnalogOutput0(), receive.getStandardAnalogOutput1()]
@@ -79,11 +79,11 @@ def signals(address: str) -> dict[str, Any]:
         "write_output_integer_register(13, read_input_integer_register(19) + 1)\n"
         "write_output_float_register(14, read_input_float_register(20) * 2)",
     )
-    until(lambda: receive.getOutputIntRegister(13) == 43, 2.0)
+    until(lambda: receive.getOutputIntRegister(13) == 43)
     seen["echo"] = [receive.getOutputIntRegister(13), receive.getOutputDoubleRegister(14)]
     io.setStandardDigitalOut(1, False)
     io.setSpeedSlider(1.0)
-    seen["off"] = until(lambda: not receive.getDigitalOutState(1), 2.0)
+    seen["off"] = until(lambda: not receive.getDigitalOutState(1))
     seen["inputs"] = [receive.getDigitalInState(3), receive.getDigitalInState(4), receive.getStandardAnalogInput0()]
     return seen
 
@@ -137,9 +137,9 @@ def dashboards(address: str) -> dict[str, Any]:
     client.powerOff()
     seen["off"] = client.robotmode()
     client.powerOn()
-    seen["idle"] = until(lambda: client.robotmode() == "Robotmode: IDLE", 10.0)
+    seen["idle"] = until(lambda: client.robotmode() == "Robotmode: IDLE")
     client.brakeRelease()
-    seen["on"] = until(lambda: client.robotmode() == "Robotmode: RUNNING", 10.0)
+    seen["on"] = until(lambda: client.robotmode() == "Robotmode: RUNNING")
     client.quit()
     return seen
 

@@ -20,7 +20,7 @@ def keep(interface: Any) -> Any:
     return interface
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
+def until(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
     """Wait for something; whether it came."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:

@@ -20,21 +20,21 @@ def protective_stop(address: str) -> dict[str, Any]:
     print("ready", flush=True)
     sys.stdin.readline()
     seen: dict[str, Any] = {"moveJ": control.moveJ([2.0, *HOME[1:]], 0.5, 1.0)}
-    seen["protective"] = until(receive.isProtectiveStopped, 0.5)
-    until(lambda: max(map(abs, receive.getTargetQd())) < 1e-9, 2.0)
+    seen["protective"] = until(receive.isProtectiveStopped)
+    until(lambda: max(map(abs, receive.getTargetQd())) < 1e-9)
     seen["stopped at"] = receive.getActualQ()[0]
     seen["inverse"] = attempt(lambda: control.getInverseKinematics(receive.getActualTCPPose()))
     seen["within limits"] = attempt(lambda: control.isPoseWithinSafetyLimits(receive.getActualTCPPose()))
     seen["tcp"] = attempt(control.getTCPOffset)
     seen["safetymode"] = client.safetymode()
     seen["too early"] = attempt(client.unlockProtectiveStop)
-    seen["unlocked"] = until(lambda: attempt(client.unlockProtectiveStop) is None, 10.0)
+    seen["unlocked"] = until(lambda: attempt(client.unlockProtectiveStop) is None)
     time.sleep(0.3)
     seen["stayed at"] = receive.getActualQ()[0]
     client.stop()
     time.sleep(0.1)
     control.reuploadScript()
-    seen["program runs"] = until(control.isProgramRunning, 5.0)
+    seen["program runs"] = until(control.isProgramRunning)
     seen["moves again"] = control.moveJ([*HOME], 2.0, 4.0)
     return seen
 
@@ -46,18 +46,18 @@ def emergency_stop(address: str) -> dict[str, Any]:
     print("ready", flush=True)
     sys.stdin.readline()
     seen: dict[str, Any] = {"moveJ": control.moveJ([2.0, *HOME[1:]], 0.5, 1.0)}
-    seen["emergency"] = until(receive.isEmergencyStopped, 0.5)
-    seen["off"] = until(lambda: receive.getRobotMode() == 3, 3.0)
+    seen["emergency"] = until(receive.isEmergencyStopped)
+    seen["off"] = until(lambda: receive.getRobotMode() == 3)
     seen["stopped at"] = receive.getActualQ()[0]
     print("stopped", flush=True)
     sys.stdin.readline()
     client.closeSafetyPopup()
     client.powerOn()
-    until(lambda: client.robotmode() == "Robotmode: IDLE", 10.0)
+    until(lambda: client.robotmode() == "Robotmode: IDLE")
     client.brakeRelease()
-    seen["running"] = until(lambda: client.robotmode() == "Robotmode: RUNNING", 10.0)
+    seen["running"] = until(lambda: client.robotmode() == "Robotmode: RUNNING")
     control.reuploadScript()
-    seen["program runs"] = until(control.isProgramRunning, 5.0)
+    seen["program runs"] = until(control.isProgramRunning)
     seen["moves again"] = control.moveJ(HOME, 2.0, 4.0)
     return seen
 

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.optimizer.core.problem import Posterior
 from orchestrator.commands.campaigns import theta_file
 from orchestrator.config.load import load_parameters, load_posterior
 from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.report.posterior import draw_posterior
+from orchestrator.report.posterior import draw_posterior, posterior_lines
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.design import MeasuredPour
-from orchestrator.strategies.calibration.posterior import directions
+from orchestrator.strategies.calibration.posterior import central, left_open, region
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.action import DEG
@@ -73,7 +74,6 @@ def test_the_region_holds_the_truth_and_is_smaller_than_what_was_searched(determ
 
 @pytest.mark.slow
 def test_regions_of_nine_tenths_mostly_hold_the_truth() -> None:
-    """θ* itself often lies far along the ridge on which the toy's two parameters make up for each other."""
     held = []
     for seed in range(8):
         region = calibrated(calibration_spill, weighed, seed)["posterior"]["region"]
@@ -94,14 +94,62 @@ def test_parameters_that_make_up_for_each_other_are_named(tied: dict[str, Any]) 
 
 def test_open_directions_are_put_into_words() -> None:
     rng = np.random.default_rng(0)
+    names = ("friction", "cohesion")
     free = np.column_stack([rng.random(500), 0.5 + 0.01 * rng.standard_normal(500)])
-    assert directions(free, ("friction", "cohesion"))[0].startswith("the pours say next to nothing along friction (")
+    assert left_open(drawn(free), names) == ["the pours leave friction open"]
     u = rng.random(500)
-    ridge = np.column_stack([u, u + 0.02 * rng.standard_normal(500)])
+    ridge = drawn(np.column_stack([u, u + 0.02 * rng.standard_normal(500)]))
     assert "friction and cohesion make up for each other: more of one, more of the other" in " ".join(
-        directions(ridge, ("friction", "cohesion"))
+        left_open(ridge, names)
     )
-    assert directions(0.5 + 0.01 * rng.standard_normal((500, 2)), ("friction", "cohesion")) == []
+    assert left_open(drawn(0.5 + 0.01 * rng.standard_normal((500, 2))), names) == []
+
+
+def drawn(points: Any) -> Posterior:
+    return Posterior(tuple(map(tuple, points.tolist())), (0.01,) * len(points), float(len(points)))
+
+
+def test_a_region_reaches_the_bound_at_which_the_draws_heap_up() -> None:
+    points = np.abs(0.1 * np.random.default_rng(0).standard_normal((400, 1)))
+    low, high = region(points)
+    assert low[0] < np.quantile(points, 0.02)  # an interval between quantiles would begin at the twentieth part
+    assert 0.9 <= np.mean((points >= low) & (points <= high)) < 0.96
+
+
+def test_the_central_theta_is_a_draw_on_a_bent_ridge_and_not_the_mean_beside_it() -> None:
+    turn = np.linspace(0.0, np.pi / 2, 201)
+    points = np.column_stack([np.cos(turn), np.sin(turn)])
+    at = np.array(central(drawn(points)))
+    assert np.hypot(*at) == pytest.approx(1.0)
+    assert np.hypot(*points.mean(axis=0)) < 0.95
+    assert np.arctan2(at[1], at[0]) == pytest.approx(np.pi / 4, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_best_theta_is_one_that_the_pours_do_not_exclude(seed: int) -> None:
+    result = calibrated(calibration_spill, weighed, seed)
+    for name, (low, high) in result["posterior"]["region"].items():
+        assert low <= result["theta"][name] <= high, name
+
+
+def test_what_is_expected_and_the_map_are_those_of_the_theta_that_is_recommended(tied: dict[str, Any]) -> None:
+    grids, theta = tied["map"], tied["theta"]
+    assert grids["over"] == ["cohesion", "friction"] or not grids["held"]
+    x, y = (int(np.argmin(np.abs(np.array(grids["axes"][name]) - theta[name]))) for name in ("cohesion", "friction"))
+    assert grids["mean"][y][x] == pytest.approx(tied["predicted_discrepancy"], abs=0.01)
+
+
+def test_people_read_what_is_determined_and_what_is_not() -> None:
+    said = {
+        "level": 0.9,
+        "region": {"particles": [900.0, 1300.0], "cohesion": [0.001, 0.097]},
+        "open": ["cohesion"],
+        "directions": [],
+    }
+    assert posterior_lines(said, PARAMETERS) == [
+        "90 % of the θ that fit the pours have particles 900 … 1 300 (searched 500 … 4 000)",
+        "the pours don't determine cohesion (0 … 0.1 N/m): nearly all of what was searched fits them as well as θ*",
+    ]
 
 
 def test_theta_file_carries_the_posterior_and_can_still_be_planned_with(

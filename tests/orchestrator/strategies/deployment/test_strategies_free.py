@@ -21,7 +21,6 @@ from orchestrator.strategies.deployment.d3_free import MOST_SIMULATIONS, FreeHyb
 from orchestrator.strategies.deployment.prices import Prices, PricesSettings
 from orchestrator.strategies.deployment.thinning import thinned
 from orchestrator.strategies.deployment.trust import TrustSettings
-from tests.orchestrator import plans
 from tests.orchestrator.killed import die_at, finished_times
 from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan
 from tests.orchestrator.test_stages import campaign, laboratory
@@ -216,8 +215,8 @@ def test_told_the_same_in_the_same_order_it_asks_for_the_same(model: Any) -> Non
 def _plan(directory: Path, prices: PricesSettings | None = None) -> Any:
     plan = campaign(directory, calibration=None)
     assert plan.deployment is not None
-    deployment = plans.changed(
-        plan.deployment, per_pour="free", prices=prices or PricesSettings(), prior_simulations=8, model="scaled"
+    deployment = plan.deployment.with_settings(
+        per_pour="free", prices=prices or PricesSettings(), prior_simulations=8, model="scaled"
     )
     return replace(plan, deployment=replace(deployment, scenes=(TOY_SCENE,)))
 

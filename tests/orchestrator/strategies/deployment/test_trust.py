@@ -165,7 +165,7 @@ def test_on_a_wrong_simulator_d3_ends_no_worse_than_d2_and_on_a_right_one_it_is_
         assert wrong.mean() - real.mean() < 0.01 + 2 * np.hypot(real.std(), wrong.std()) / np.sqrt(len(seeds))
         first = [np.min(Play(narrow_cup)(hybrid(seed, pours=3, model=model)).real_spills) for seed in seeds]
         of_d2 = [
-            np.min(Play(narrow_cup)(RealOnly(plans.changed(plan, pours=3), PLAYED, THETA, seed)).real_spills)
+            np.min(Play(narrow_cup)(RealOnly(plan.with_settings(pours=3), PLAYED, THETA, seed)).real_spills)
             for seed in seeds
         ]
         assert np.mean(first) < 0.5 * np.mean(of_d2)

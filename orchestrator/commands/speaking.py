@@ -1,0 +1,67 @@
+"""How verbs speak to people and to other programs, and how they end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+"""Exit codes beside 0 (done) and 3 (a person has to answer; `RunError.exit_code`)."""
+
+
+class RefusalError(Exception):
+    """A command can't do what was asked; printed as it is, without a traceback."""
+
+    def __init__(self, message: str, code: int = FAILED) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def say(text: str) -> None:
+    """A line for people: stderr, so that stdout stays for results."""
+    with contextlib.suppress(OSError):  # a terminal that was closed is no reason to leave an arm where it is
+        print(text, file=sys.stderr, flush=True)
+
+
+def print_json(data: dict[str, Any]) -> None:
+    """One line of JSON on stdout. Numbers that JSON has no word for become null."""
+    print(json.dumps(_plain(data), ensure_ascii=False), flush=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+@contextlib.contextmanager
+def stdout_for_results() -> Iterator[None]:
+    """While libraries are at work, whatever they print goes to stderr: stdout is for the result alone.
+
+    Done to the file descriptor, since some of them print from C++ and from processes of their own.
+    """
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def fail(refusal: RefusalError) -> NoReturn:
+    """Print a refusal and leave with its code."""
+    say(f"decant: {refusal}" if refusal.code != BAD_INPUT else str(refusal))
+    raise SystemExit(refusal.code)
