@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from orchestrator.journal import JOURNAL_NAME
 from orchestrator.plan import CampaignPlan, OutputPlan, RecordedPour, RecordSet
 from orchestrator.stages import (
     CALIBRATION,
@@ -31,6 +32,7 @@ from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.study.cells import FINAL, GRID, Cell
 from orchestrator.study.plan import StudyPlan
+from orchestrator.study.record import cell_record
 from orchestrator.study.strategies import AnsweredByTable, FinalPour, SimulatedTable
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
@@ -48,6 +50,11 @@ def campaign_of(
         load: of the cells that it needs.
         directory: of its run.
     """
+    plan, stages = _planned(study, cell, load, directory)
+    return replace(plan, resolved=cell_record(study.base.resolved, plan)), stages
+
+
+def _planned(study: StudyPlan, cell: Cell, load: Load, directory: Path) -> tuple[CampaignPlan, list[StageDefinition]]:
     base = study.base
     bench = base.laboratory.bench if not cell.level else study.level(cell.level).bench
     plan = replace(
@@ -57,17 +64,20 @@ def campaign_of(
         laboratory=replace(base.laboratory, bench=bench),
         outputs=OutputPlan(directory, rrd=False, figures=False, record_rate=0.0, recorded_simulations=0),
         on_unknown="repeat",
-        resolved={},
     )
+    match cell.kind:
+        case "grid" | "pours" if plan.calibration is not None:
+            designed = replace(plan.calibration, pour_count=study.pour_count, holdout=study.holdout)
+            plan = replace(plan, calibration=designed)
     match cell.kind:
         case "grid":
             return plan, [StageDefinition(GRID, lambda results, seed: _table(study, seed))]
         case "pours":
             return plan, [StageDefinition(POURS, lambda results, seed: _pours(study, seed), pours=True)]
         case "calibration":
-            return _calibration(study, cell, plan, load)
+            return _calibration(study, cell, plan, load, directory)
         case "uncalibrated":
-            plan = _with_pours(study, cell, plan, load)
+            plan = _with_pours(study, cell, plan, load, directory)
             return plan, [StageDefinition(EVALUATION, lambda results, seed: _score_of_default(plan, seed))]
         case "deployment":
             return _deployment(study, cell, plan, cell.needs, load)
@@ -110,7 +120,7 @@ def _pours(study: StudyPlan, seed: int) -> Strategy:
     return DesignedPours(plan.scene, plan.actions, len(points), study.holdout, seed, points=points)
 
 
-def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load) -> CampaignPlan:
+def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
     """The plan with the repetition's weighed pours as records."""
     calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
     assert calibration is not None
@@ -127,14 +137,14 @@ def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load) ->
                     row["split"],
                 )
             )
-    records = RecordSet(calibration.scene, tuple(pours), Path(cell.needs[0]))
+    records = RecordSet(calibration.scene, tuple(pours), directory.parent / cell.needs[0] / JOURNAL_NAME)
     return replace(plan, calibration=replace(calibration, records=records))
 
 
 def _calibration(
-    study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load
+    study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, directory: Path
 ) -> tuple[CampaignPlan, list[StageDefinition]]:
-    plan = _with_pours(study, cell, plan, load)
+    plan = _with_pours(study, cell, plan, load, directory)
     assert plan.calibration is not None
     stages = calibration_stages(plan.calibration)
     if cell.arm != "C1":

@@ -14,6 +14,7 @@ from orchestrator.config.motion import Parameters, ParametersBase
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.study.resolve import bench_of, calibration_arms, deployment_arms, levels_of, written_levels
 from orchestrator.config.vessel import missing_file
+from orchestrator.config.yaml.dump import as_file
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.references import References
@@ -275,9 +276,9 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
 
 
 def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
-    laboratory = None
+    references, laboratory = References(report), None
     if file.laboratory is not None:
-        laboratory = References(report).laboratory(file.laboratory, root.at("laboratory"))
+        laboratory = references.laboratory(file.laboratory, root.at("laboratory"))
     if file.campaign is None:
         return None
     path = (root.directory / file.campaign).resolve()
@@ -289,7 +290,10 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
     except ConfigError as error:
         report.problems.extend(error.problems)
         return None
-    base = base if laboratory is None else replace(base, laboratory=laboratory)
+    if laboratory is not None:
+        found = references.section(file.laboratory, root.at("laboratory"), LaboratoryFile)
+        record = {} if found is None else as_file(*found, references)
+        base = replace(base, laboratory=laboratory, resolved={**base.resolved, "laboratory": record})
     return base if file.parameters is None else _with_parameters(base, file.parameters, root.at("parameters"), report)
 
 
