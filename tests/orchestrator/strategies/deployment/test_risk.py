@@ -148,7 +148,7 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
     assert plain.best_values["x_offset"] < strategy.best_values["x_offset"]
 
 
-@pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG)])
+@pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG, speed_factor=0.0)])
 def test_where_every_action_touches_nothing_is_recommended(errors: PoseError) -> None:
     strategy = risky(iterations=4, pours=1, window=plans.window(0.1), risk=plans.risk("expected", pose_error=errors))
     played = Play(touching_below(1.0))(strategy)

@@ -168,7 +168,12 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
 
 @pytest.mark.parametrize(
     ("name", "changes", "warns"),
-    [("D2", {}, True), ("D3", {}, True), ("D2", {"plain": True}, False), ("D2", {"on_failed_pour": "ignore"}, False)],
+    [
+        ("D2", {}, True),
+        ("D3", {"model": "scaled"}, True),
+        ("D3", {"model": "residual"}, False),
+        ("D2", {"on_failed_pour": "ignore"}, False),
+    ],
 )
 def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_paper(name, changes, warns):
     def second_touches_third_is_not_weighed(request):
@@ -176,7 +181,7 @@ def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_pape
         nothing = PourMeasurement(SCENE.liquid.mass, math.nan, 0.0)
         return {2: Failed("pour_failed", "cups touch after all"), 3: Poured(nothing)}.get(number)
 
-    strategy = make(name, pours=5, refusals="avoid", **changes)
+    strategy = make(name, pours=5, **changes)
     played = Play(narrow_cup, answer=second_touches_third_is_not_weighed)(strategy)
     assert [pour["status"] for pour in strategy.result()["pours"]].count("failed") == 2
     second = ACTIONS.encode(played.pours[1].action.values())
@@ -196,9 +201,9 @@ def test_touching_vessels_are_avoided_and_cost_no_pour():
     assert result["refused_pours"] > 0
     assert len(played.real_spills) == 8
     assert [r["number"] for r in result["pours"] if r["status"] == "weighed"] == list(range(1, 9))
-    hybrid = make("D3", 1, pours=4)
+    hybrid = make("D3", 1, pours=4, model="scaled")
     Play(touches_when_near)(hybrid)
-    assert hybrid.result()["refused_pours"] == 0  # simulation has told it already
+    assert hybrid.result()["refused_pours"] <= 1  # simulations have told most of it
     assert hybrid.best_values["x_offset"] >= 0.10
 
 
