@@ -40,7 +40,7 @@ from orchestrator.fingerprint import fingerprint
 from orchestrator.flights import Flight, free_slots, next_to_tell
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
-from orchestrator.stages import CALIBRATION, calibration_stages, measured_pours, scenes_of, stage_seed
+from orchestrator.stages import CALIBRATION, calibrated_theta, calibration_stages, measured_pours, scenes_of, stage_seed
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
@@ -164,16 +164,19 @@ def calibrate(plan: CampaignPlan, seed: int, label: str, splits: Sequence[str]) 
         (stage,) = (stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION)
         strategy = stage.build({}, stage_seed(seed, stage.name))
         play(strategy, answers, plan.parallel_simulations, label)
-        theta = SimulationParameters.model_validate(cast("Mapping[str, Any]", strategy.result())["theta"])
+        theta = calibrated_theta({CALIBRATION: strategy.result()}).theta
     pours = [scored for scored in recorded(calibration) if scored.pour.split in splits]
     judge = Evaluation({"theta": theta}, pours, stage_seed(seed, "evaluation"))
     play(judge, answers, plan.parallel_simulations, f"{label}, θ*")
     answers.close()
-    pairs = cast("Sequence[Mapping[str, Any]]", judge.result()["pairs"])
     return {
         "theta": theta.model_dump(),
         "discrepancy": {split: judge.discrepancy("theta", split) for split in splits},
-        "errors": [abs(p["measured"] - p["simulated"]) for p in pairs if p["simulated"] is not None],
+        "errors": [
+            abs(pair.measured - pair.simulated)
+            for pair in judge.result().pairs
+            if pair.measured is not None and pair.simulated is not None
+        ],
         "cpu_s": round(time.process_time() - begun, 1),
     }
 

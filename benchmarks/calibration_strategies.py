@@ -34,7 +34,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from calibration_power import CAMPAIGN, SPLITS, Answers, Kept, known_values, play, recorded, searching
 from machine import describe, run_self, say, show
@@ -44,7 +44,9 @@ from orchestrator.config.load import load_campaign
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
 from orchestrator.plan import CalibrationPlan, CampaignPlan
-from orchestrator.stages import CALIBRATION, calibration_stages, stage_seed
+from orchestrator.results import learnt_by
+from orchestrator.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
+from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.strategies.calibration.evaluation import Evaluation, random_parameters
 from orchestrator.strategies.calibration.settings import DesignSettings
 from orchestrator.strategies.doors import calibrations
@@ -108,7 +110,7 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
     calibration = plan.calibration
     assert calibration is not None
     answers, begun, label = Answers(plan), time.process_time(), f"{row.name}, seed {seed}"
-    found: Mapping[str, Any] = {}
+    found: Calibrated | None = None
     if row.name == DEFAULTS:
         thetas = {"theta": SimulationParameters()}
     elif row.name == UNCALIBRATED:
@@ -120,8 +122,8 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
         (stage,) = (stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION)
         strategy = stage.build({}, stage_seed(seed, stage.name))
         play(strategy, answers, plan.parallel_simulations, label)
-        found = strategy.result()
-        thetas = {"theta": SimulationParameters.model_validate(found["theta"])}
+        found = learnt_by({CALIBRATION: strategy.result()}, CALIBRATION, Calibrated)
+        thetas = {"theta": calibrated_theta({CALIBRATION: found}).theta}
     pours = recorded(calibration)
     unseen = [scored for scored in pours if scored.pour.split != TRAINED_ON]
     # the unseen come first, so that all θ meet the same initial positions there
@@ -130,9 +132,9 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
     play(judge, answers, plan.parallel_simulations, f"{label}, judged")
     answers.close()
     errors: dict[str, list[float | None]] = {split: [] for split in SPLITS}
-    for pair in cast("Sequence[Mapping[str, Any]]", judge.result()["pairs"]):
-        simulated = pair["simulated"]
-        errors[pair["split"]].append(None if simulated is None else abs(pair["measured"] - simulated))
+    for pair in judge.result().pairs:
+        known = pair.measured is not None and pair.simulated is not None
+        errors[pair.split].append(abs(pair.measured - pair.simulated) if known else None)  # type: ignore[operator]
     return {
         "theta": None if row.name == RANDOM else thetas["theta"].model_dump(),
         "discrepancy": {
@@ -140,9 +142,9 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
             for split in SPLITS
         },
         "errors": {} if row.name == RANDOM else errors,
-        "simulations": found.get("simulations", 0),
-        "lost": found.get("lost", 0),
-        "expected": found.get("predicted_discrepancy"),
+        "simulations": 0 if found is None else found.simulations,
+        "lost": 0 if found is None else found.lost,
+        "expected": None if found is None or found.found is None else found.found.predicted_discrepancy,
         "cpu_s": round(time.process_time() - begun, 1),
     }
 

@@ -44,6 +44,7 @@ from orchestrator.occupancy import RESTS, Occupancy
 from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.trust import TrustSettings
 from sim_engine.action import DEG
@@ -186,6 +187,8 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         result = run(run_campaign(plan, bench, Path(folder) / "run", watchers=[bench.watch]))
     bench.occupancy.finish()
     (stage,) = result.results.values()
+    assert isinstance(stage, Deployed)
+    assert stage.recommended is not None
     values: dict[str, Any] = {
         "before first": bench.before_first,
         "simulations": bench.simulations,
@@ -195,8 +198,8 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         "mean wait, ms": 1e3 * float(np.mean(bench.occupancy.waits)),
         "longest answer, ms": 1e3 * max(bench.answers),
         "CPU, s": time.thread_time() - begun,
-        "alarm": float(bool((stage.get("trust") or {}).get("alarm"))),
-        "reported": bench.true(stage["action_si"]),
+        "alarm": float(stage.trust.alarm),
+        "reported": bench.true(stage.recommended.action_si),
     }
     for pours in (n for n in AFTER if n <= asked.pours):
         values[f"least of {pours}"] = min(bench.poured[:pours])

@@ -33,7 +33,9 @@ from orchestrator.occupancy import Occupancy
 from orchestrator.plan import DeploymentPlan, OutputPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.study.plan import StudyPlan
 from sim_engine.errors import InvalidSceneError
 from sim_engine.liquid import SimulationParameters
@@ -146,6 +148,7 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
         result = run(run_campaign(plan, fluid, Path(folder) / "run", watchers=[fluid.watch]))
     fluid.occupancy.finish()
     (stage,) = result.results.values()
+    assert isinstance(stage, Deployed)
     simulated = bool(fluid.simulations)
     values: Row = {
         "before first": fluid.before_first,
@@ -156,7 +159,7 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
         "longest wait, ms": 1e3 * max(fluid.occupancy.waits, default=0.0),
         "mean wait, ms": 1e3 * float(np.mean(fluid.occupancy.waits)),
         "longest answer, ms": 1e3 * max(fluid.answers),
-        "alarm": float(bool((stage.get("trust") or {}).get("followed"))),
+        "alarm": float(isinstance(stage.trust, Compared) and stage.trust.followed is not None),
         "apart, s": fluid.apart,
     }
     for pours in (n for n in AFTER if n <= asked.pours):

@@ -30,6 +30,7 @@ from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated,
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.learnt import Recommended
 from orchestrator.strategies.deployment.risk import RiskSettings
 from sim_engine.action import DEG, described
 from sim_engine.liquid import SimulationParameters
@@ -76,14 +77,16 @@ class Bench:
             return Failed("simulation", outcome.invalid)
         return Simulated(outcome)
 
-    def plan(self, strategy: OneShotPlanning) -> dict[str, Any]:
-        """Play a strategy to its end; its result."""
+    def plan(self, strategy: OneShotPlanning) -> Recommended:
+        """Play a strategy to its end; what it recommends."""
         waiting: list[Request] = []
         while not strategy.finished:
             waiting += strategy.ask(Slots(1 - sum(isinstance(one, Simulate) for one in waiting), 0))
             request = waiting.pop(0)
             strategy.tell(request, self.answer(request))
-        return strategy.result()
+        recommended = strategy.result().recommended
+        assert recommended is not None, "nothing was learnt"
+        return recommended
 
 
 def fresh_errors(count: int, seed: int) -> list[tuple[int, PoseError]]:
@@ -168,10 +171,10 @@ def main() -> None:
         for seed in range(asked.plans):
             strategy = OneShotPlanning if risk is None else RobustPlanning
             result = bench.plan(strategy(plan, scene, theta, seed))
-            losses.append(evaluated(bench, costing, result["action_si"], fresh_errors(asked.evaluations, seed)))
-            said = f"promised {100 * result['predicted_loss']:.2f} %, came to {100 * losses[-1].mean():.2f} %"
-            actions.append({"way": way, "seed": seed, "action": result["action"], "promised": result["predicted_loss"]})
-            say(f"{way}, plan {seed + 1}: {described(result['action_si'])}; {said}")
+            losses.append(evaluated(bench, costing, result.action_si, fresh_errors(asked.evaluations, seed)))
+            said = f"promised {100 * result.predicted_loss:.2f} %, came to {100 * losses[-1].mean():.2f} %"
+            actions.append({"way": way, "seed": seed, "action": result.action, "promised": result.predicted_loss})
+            say(f"{way}, plan {seed + 1}: {described(result.action_si)}; {said}")
         rows.append(row_of(way, losses))
         every[way] = [list(map(float, one)) for one in losses]
     totals = {"simulations": bench.simulations, "touched": bench.touched, "cpu_s": round(bench.seconds)}

@@ -30,6 +30,7 @@ from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.learnt import Recommended
 from orchestrator.strategies.deployment.risk import RiskSettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
@@ -114,14 +115,16 @@ def answer(request: Request, toy: Callable[..., Floats]) -> Outcome:
     return Simulated(PourOutcome(1.0 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.0, 1.0, 1, 0.0, request.seed))
 
 
-def play(strategy: OneShotPlanning, toy: Callable[..., Floats]) -> dict[str, Any]:
-    """A campaign to its end; its result."""
+def play(strategy: OneShotPlanning, toy: Callable[..., Floats]) -> Recommended:
+    """A campaign to its end; what it recommends."""
     waiting: list[Request] = []
     while not strategy.finished:
         waiting += strategy.ask(Slots(1 - sum(isinstance(one, Simulate) for one in waiting), 0))
         request = waiting.pop(0)
         strategy.tell(request, answer(request, toy))
-    return strategy.result()
+    recommended = strategy.result().recommended
+    assert recommended is not None, "nothing was learnt"
+    return recommended
 
 
 def truth(toy: Callable[..., Floats], level: float, places: Floats) -> Floats:
@@ -153,7 +156,7 @@ def main() -> None:
                 settings = D1Settings(pours=0, iterations=iterations, simulations_per_iteration=each, risk=risk)
                 plan = DeploymentPlan(settings, (SCENE,), SPACE, Loss())
                 chosen = [
-                    SPACE.encode(play(strategy(plan, SCENE, SimulationParameters(), seed), TOYS[name])["action_si"])
+                    SPACE.encode(play(strategy(plan, SCENE, SimulationParameters(), seed), TOYS[name]).action_si)
                     for seed in range(asked.seeds)
                 ]
                 regrets = truth(TOYS[name], level, np.array(chosen)) - least

@@ -28,7 +28,7 @@ from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simu
 from orchestrator.strategies.deployment.base import Deployment
 from orchestrator.strategies.deployment.d2 import D2Settings, RealOnly
 from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
-from orchestrator.strategies.deployment.trust import TrustSettings
+from orchestrator.strategies.deployment.trust import Compared, TrustSettings
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
@@ -87,12 +87,12 @@ def campaign(arm: str, simulator: str, seed: int, asked: argparse.Namespace) -> 
     strategy, numbers = kind(plan, SCENE, SimulationParameters(), seed), Numbers(world, simulator)
     numbers.play(strategy)
     best = strategy.best_values
-    trust: Any = strategy.result().get("trust") or {}
+    trust = strategy.result().trust
     return {
         "best of 3": min(numbers.poured[:3]),
         "mean": float(np.mean(numbers.poured)),
         "reported": 1.0 if best is None else world.true(SPACE.encode(best)),
-        "alarm": float(bool(trust.get("followed"))),
+        "alarm": float(isinstance(trust, Compared) and trust.followed is not None),
     }
 
 

@@ -9,7 +9,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from actors.protocols import Laboratory, Notice, Telling
 from orchestrator.errors import RunError
@@ -28,10 +27,12 @@ from orchestrator.journal import JOURNAL_NAME, Header, Journal, JournalReader, K
 from orchestrator.lanes import Deadlines, LaneError, Lanes
 from orchestrator.plan import CampaignPlan
 from orchestrator.replay import StageHistory, read_history, replayed_events
+from orchestrator.results import Results, decode_results
 from orchestrator.runs import write_provenance
 from orchestrator.scheduler import StageScheduler
 from orchestrator.stages import StageDefinition, scenes_of, stage_seed, stages_of
 from orchestrator.states import RESTING, State, check_transition
+from orchestrator.strategies.learnt import Learnt
 from orchestrator.unknown import AskOperator, OperatorNeededError, settle_open_questions, settle_unknown_pours
 
 
@@ -50,7 +51,7 @@ class CampaignResult:
     name: str
     directory: Path
     state: State
-    results: dict[str, dict[str, Any]] = field(default_factory=dict)
+    results: Results = field(default_factory=dict)
     simulations: int = 0
     pours: int = 0
     cpu_s: float = 0.0
@@ -189,7 +190,7 @@ class _Run:
             self._watchers.emit(opened)
             self._tell_of_idle(laboratory.simulators.size)
             self._enter(State.RUNNING)
-            results: dict[str, Mapping[str, Any]] = {}
+            results: dict[str, Learnt] = {}
             for index, stage in enumerate(self._stages, start=1):
                 results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, lanes)
             self._enter(State.FINISHED)
@@ -199,9 +200,9 @@ class _Run:
         stage: StageDefinition,
         index: int,
         history: StageHistory,
-        results: Mapping[str, Mapping[str, Any]],
+        results: Results,
         lanes: Lanes,
-    ) -> dict[str, Any]:
+    ) -> Learnt:
         done = history.result is not None
         opened = StageOpened(
             stage=stage.name,
@@ -305,7 +306,9 @@ class _Run:
 
     def _come_to_rest(self, state: State, reason: str) -> None:
         self._enter(State.UNKNOWN if self._unknown_pours else state, reason)
-        self._watchers.emit(CampaignClosed(state=str(self._state), results=self._journal.stage_results()))
+        self._watchers.emit(
+            CampaignClosed(state=str(self._state), results=decode_results(self._journal.stage_results()))
+        )
 
     def _close(self) -> CampaignResult:
         result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)
@@ -333,7 +336,7 @@ def read_result(journal: JournalReader, directory: Path, *, seconds: float = 0.0
         journal.header.name,
         directory,
         journal.state(),
-        journal.stage_results(),
+        decode_results(journal.stage_results()),
         simulations,
         pours,
         cpu_s,

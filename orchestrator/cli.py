@@ -257,12 +257,12 @@ def validate(
 
 
 @app.command(
-    epilog=examples("decant schema > campaign.json", "decant schema vessel > vessel.json"),
+    epilog=examples("decant schema > campaign.json", "decant schema result > result.json"),
 )
 def schema(
-    which: Annotated[str, typer.Argument(help="campaign, study, vessel or laboratory.")] = "campaign",
+    which: Annotated[str, typer.Argument(help="campaign, study, vessel, laboratory, or result.")] = "campaign",
 ) -> None:
-    """Print the JSON schema of campaign files (editors complete YAML with it)."""
+    """Print the JSON schema of campaign files (editors complete YAML with it), or of a run's summary.json."""
     from orchestrator.commands import single
 
     call(single.schema, which)

@@ -11,10 +11,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from actors.protocols import Frames, PourProgress
 from orchestrator.requests import Decision, Outcome, Request
+from orchestrator.results import Results
+from orchestrator.strategies.learnt import Learnt
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +73,7 @@ class CampaignClosed(Event):
     """
 
     state: str
-    results: dict[str, dict[str, Any]]
+    results: Results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +87,9 @@ class StageOpened(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StageClosed(Event):
-    """A strategy is done; `result` is what it learnt, JSON-ready."""
+    """A strategy is done; `result` is what it learnt."""
 
-    result: dict[str, Any]
+    result: Learnt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +131,7 @@ class StrategyProgressed(Event):
 
     done: int
     total: int
-    result: dict[str, Any]
+    result: Learnt
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,8 @@ from orchestrator.fingerprint import scene_by_content
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import RecordedPour
 from orchestrator.requests import Pour, Poured
+from orchestrator.results import Results, decode_results
+from orchestrator.strategies.calibration.design import DesignPoured
 from orchestrator.strategies.sound import is_sound
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
 from sim_engine.outcome import PourMeasurement
@@ -63,7 +65,7 @@ def read_former_run(directory: Path) -> FormerRun:
                 outcome.measurement.fractions
             ):
                 weighed.append((*requests[entry.body["id"]], outcome.measurement))
-        splits = _splits(journal.stage_results())
+        splits = _splits(decode_results(journal.stage_results()))
         header = journal.header.fingerprint
     pours = tuple(
         (pour.scene, _recorded(pour.action, measured, splits.get((stage, pour.number), "train")))
@@ -77,13 +79,13 @@ def _recorded(action: Action, measured: PourMeasurement, split: str) -> Recorded
     return RecordedPour(action, measured.loaded - measured.retained, measured.spilled, measured.retained, split)
 
 
-def _splits(results: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, int], str]:
+def _splits(results: Results) -> dict[tuple[str, int], str]:
     """Stage and number of a designed pour → what it was kept for."""
     return {
-        (stage, row["number"]): row["split"]
+        (stage, pour.number): pour.split
         for stage, result in results.items()
-        for row in result.get("pours", ())
-        if "split" in row
+        if isinstance(result, DesignPoured)
+        for pour in result.pours
     }
 
 

@@ -173,7 +173,7 @@ class JournalReader:
         return last
 
     def stage_results(self) -> dict[str, dict[str, Any]]:
-        """Results of the closed stages by name, in the order in which they were closed."""
+        """Results of the closed stages by name, in the order in which they were closed; see `orchestrator.results`."""
         return {entry.stage: entry.body["result"] for entry in self.entries(kinds=[Kind.STAGE_CLOSED])}
 
     def last_id(self) -> int:

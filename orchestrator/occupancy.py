@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 from orchestrator.journal import Entry, Kind
 from orchestrator.requests import Pour, Simulate
@@ -120,15 +119,3 @@ def occupancies(entries: Iterable[Entry], slots: int) -> dict[str, Occupancy]:
                 stage.finish()
     both = {Simulate.__name__, Pour.__name__}
     return {name: one for name, one in stages.items() if both <= done.get(name, set()) and one.useful > 0.0}
-
-
-def as_summary(found: Occupancy) -> dict[str, Any]:
-    """JSON-ready: the busy share of the pool while it had useful work, the share of the time in which it had, and the
-    arm's longest wait and the mean of all [s]."""
-    waits = found.waits
-    return {
-        "pool_busy": found.fraction,
-        "pool_useful": found.useful / found.total if found.total > 0.0 else None,
-        "arm_longest_wait_s": max(waits, default=None),
-        "arm_mean_wait_s": sum(waits) / len(waits) if waits else None,
-    }

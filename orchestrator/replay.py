@@ -11,6 +11,8 @@ from orchestrator.errors import RunError
 from orchestrator.events import RequestFinished
 from orchestrator.journal import JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
+from orchestrator.results import decode_result
+from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.protocol import Strategy
 
 
@@ -57,7 +59,7 @@ class StageHistory:
     pour_attempts: dict[int, int] = field(default_factory=dict)
     withdrawn: set[int] = field(default_factory=set)
     decisions: int = 0
-    result: dict[str, Any] | None = None
+    result: Learnt | None = None
 
     @property
     def ask_is_due(self) -> bool:
@@ -79,7 +81,11 @@ class StageHistory:
 
 
 def read_history(journal: JournalReader, stage: str) -> StageHistory:
-    """Everything that the journal holds about a stage."""
+    """Everything that the journal holds about a stage.
+
+    Raises:
+        RunError: an outcome or a result can't be read.
+    """
     history = StageHistory()
     for entry in journal.entries(stage=stage):
         body = entry.body
@@ -105,7 +111,7 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
             case Kind.DECISION:
                 history.decisions += 1
             case Kind.STAGE_CLOSED:
-                history.result = body["result"]
+                history.result = decode_result(body["result"])
     return history
 
 

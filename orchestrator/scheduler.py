@@ -34,6 +34,8 @@ from orchestrator.journal import Draft, Journal, Kind
 from orchestrator.lanes import Lanes
 from orchestrator.replay import StageHistory, replay, replayed_events
 from orchestrator.requests import Ask, Decision, Outcome, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.results import encode_result
+from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.unknown import needs_answer
 
@@ -120,11 +122,11 @@ class StageScheduler:
         if history.steps:
             self._report_progress()
 
-    async def run(self) -> dict[str, Any]:
+    async def run(self) -> Learnt:
         """Ask, run and tell until the strategy is finished.
 
         Returns:
-            Its result, JSON-ready, as it is in the journal.
+            What it has learnt, as it is in the journal.
 
         Raises:
             StrategyError: it asks for more than it may, or for nothing while there is nothing to wait for.
@@ -148,8 +150,8 @@ class StageScheduler:
         except BaseException as error:
             await self._wind_down(error)
             raise
-        result = cast("dict[str, Any]", to_json(self._strategy.result()))
-        self._journal.append(Kind.STAGE_CLOSED, {"result": result}, stage=self._stage)
+        result = self._strategy.result()
+        self._journal.append(Kind.STAGE_CLOSED, {"result": encode_result(result)}, stage=self._stage)
         return result
 
     def _ask(self) -> None:
@@ -290,7 +292,7 @@ class StageScheduler:
             return
         self._reported = time.monotonic()
         done, total = self._strategy.progress()
-        result = cast("dict[str, Any]", to_json(self._strategy.result()))
+        result = self._strategy.result()
         self._watchers.emit(StrategyProgressed(stage=self._stage, done=done, total=total, result=result))
 
     def _append(self, kind: Kind, body: dict[str, Any]) -> None:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from orchestrator.errors import RunError
 from orchestrator.flights import Order
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
-from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour
+from orchestrator.results import Results, learnt_by
+from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings
+from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.risk import Disturbances
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
@@ -29,9 +31,6 @@ DEPLOYMENT, PREDICTION = "deployment:", "prediction:"
 
 POSTERIOR_DRAWS = 64
 """θ of a posterior that a deployment under risk draws from."""
-
-Results = Mapping[str, Mapping[str, Any]]
-"""Results of the stages before, by name, as they are in the journal."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
         return plan.settings.build(plan, pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
-        theta = SimulationParameters.model_validate(results[CALIBRATION]["theta"])
+        theta = calibrated_theta(results).theta
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
         return Scorecard(theta, rivals, pours, plan.actions, seed)
@@ -145,8 +144,8 @@ def prediction_stages(
 
     def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            values = results[DEPLOYMENT + name].get("action_si")
-            action = None if values is None else scene.action(dict(values))
+            recommended = learnt_by(results, DEPLOYMENT + name, Deployed).recommended
+            action = None if recommended is None else scene.action(dict(recommended.action_si))
             theta, known = _theta(plan, results), with_posterior(deployment, results)
             costing = Costing.of(deployment, scene, theta)
             risk = known.settings.risk if isinstance(known.settings, D1Settings) else None
@@ -171,12 +170,12 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     """
     if not deployment.settings.needs_posterior or deployment.thetas:
         return deployment
-    found = results.get(CALIBRATION, {})
-    rows = (found.get("posterior") or {}).get("thetas", ())
-    if not rows:
+    found = calibrated_theta(results) if CALIBRATION in results else None
+    if found is None or found.posterior is None or not found.posterior.thetas:
         raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
+    rows = found.posterior.thetas
     kept = rows[:: max(len(rows) // POSTERIOR_DRAWS, 1)]
-    thetas = tuple(SimulationParameters.model_validate({**found["theta"], **row}) for row in kept)
+    thetas = tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
     return replace(deployment, thetas=thetas)
 
 
@@ -188,18 +187,27 @@ def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
 
 def _theta(plan: CampaignPlan, results: Results) -> SimulationParameters:
     """The calibrated θ; the plan's where nothing was calibrated."""
-    if CALIBRATION in results:
-        return SimulationParameters.model_validate(results[CALIBRATION]["theta"])
-    return plan.parameters
+    return calibrated_theta(results).theta if CALIBRATION in results else plan.parameters
+
+
+def calibrated_theta(results: Results) -> CalibratedTheta:
+    """θ* of the calibration's stage.
+
+    Raises:
+        RunError: there is none.
+    """
+    found = learnt_by(results, CALIBRATION, Calibrated).found
+    if found is None:
+        raise RunError("the calibration has found no θ*")
+    return found
 
 
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
     """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
     made = []
-    for row in results[POURS]["pours"] if POURS in results else ():
-        if "action_si" in row:  # a pour that was given up has none
-            action = plan.scene.action(row["action_si"])
-            made.append(ScoredPour(plan.scene.name, MeasuredPour(action, row["spillage"], row["poured"], row["split"])))
+    for pour in learnt_by(results, POURS, DesignPoured).measured if POURS in results else ():
+        action = plan.scene.action(dict(pour.action_si))
+        made.append(ScoredPour(plan.scene.name, MeasuredPour(action, pour.spillage, pour.poured, pour.split)))
     return [*made, *_recorded(plan.records)]
 
 

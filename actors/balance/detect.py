@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from actors.balance.dialects import DIALECTS, KCP, KERN_SWT, MT_SICS, SBI, Dialect, LineSettings
+from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.errors import LineSettingsError, UnknownDialectError
 from actors.balance.reading import FrameError, Reading
 from actors.balance.wire import Wire
@@ -16,13 +16,9 @@ LISTENING = 0.3
 """How long unasked lines are waited for at each setting [s]."""
 
 ANSWERING = 0.35
-"""How long an answer may take beside the time of its characters [s]."""
+"""How long an answer may take in a quick search, beside the time of its characters [s]."""
 
 _LONGEST_ANSWER = 48
-_PROBES: tuple[Dialect, ...] = (SBI, KERN_SWT, KCP)
-"""In this order: a balance that knows only Sartorius' commands may take a letter without ESC for a command, and `S` is
-'restart' there; ESC P and `w` mean nothing to the others. `SI` asks KCP and MT-SICS alike."""
-
 _OTHER_KERN = re.compile(rb"\s*(?:ST|US|OL),")
 
 
@@ -35,12 +31,23 @@ class Attempt:
         heard: what came unasked.
         answers: question → what came.
         possible: whether the port can be set so.
+        began, ended: when it was tried [s of `time.monotonic`].
+        moments: when anything came [s of `time.monotonic`].
     """
 
     line: LineSettings
     heard: bytes = b""
     answers: dict[str, bytes] = field(default_factory=dict)
     possible: bool = True
+    began: float = 0.0
+    ended: float = 0.0
+    moments: list[float] = field(default_factory=list)
+
+    def may_be_late(self, attempts: Sequence[Attempt], patience: float) -> bool:
+        """Whether something came that may have been an answer to this attempt's questions."""
+        return self.possible and any(
+            self.began <= moment <= self.ended + patience for other in attempts for moment in other.moments
+        )
 
     def __str__(self) -> str:
         if not self.possible:
@@ -73,8 +80,14 @@ def detect(
     allowed: Sequence[Dialect],
     open_wire: Callable[[LineSettings], Wire],
     interrupted: Callable[[], bool] = lambda: False,
+    *,
+    answer_time: float = ANSWERING,
 ) -> tuple[Detected, Wire]:
     """Find out what is at the other end.
+
+    Settings are tried quickly. A slow balance answers when the next ones are being tried, and looks like one that talks
+    at another speed; so where anything came, those that it may have been an answer to are tried once more, with
+    patience.
 
     Args:
         port: for messages.
@@ -82,6 +95,7 @@ def detect(
         allowed: dialects that may be found.
         open_wire: opens the port with a setting.
         interrupted: asked between settings; ends the search.
+        answer_time: longest time that an answer takes [s of the clock].
 
     Returns:
         What was found, and the wire, open.
@@ -90,83 +104,109 @@ def detect(
         UnknownDialectError: nothing was recognised; says what was tried and what came back.
         NoConnectionError: the port can't be opened.
     """
-    attempts: list[Attempt] = []
+    patience = max(answer_time, ANSWERING)
+    quick: list[Attempt] = []
+    patient: dict[LineSettings, Attempt] = {}
     for line in candidates:
-        if interrupted():
-            break
-        attempt = Attempt(line)
-        attempts.append(attempt)
-        try:
-            wire = open_wire(line)
-        except LineSettingsError:
-            attempt.possible = False
-            continue
-        try:
-            found = _try(wire, attempt, allowed)
-        except BaseException:
-            wire.close()
-            raise
+        quick.append(Attempt(line))
+        last = line == candidates[-1]
+        found = _attempt(quick[-1], allowed, open_wire, interrupted, ANSWERING, late=patience if last else 0.0)
         if found is not None:
-            return found, wire
-        wire.close()
-    raise UnknownDialectError(_failure(port, attempts, allowed))
-
-
-def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect]) -> Detected | None:
-    lines = _lines(wire, LISTENING)
-    attempt.heard = b"\n".join(lines)
-    for dialect in allowed:
-        if sum(_is_weight(dialect, line) for line in lines) >= 2:
-            return _recognised(wire, dialect, allowed, unasked=True)
-    wait = ANSWERING + _LONGEST_ANSWER * attempt.line.character_time
-    for probe in _PROBES:
-        speakers = [probe] if probe is not KCP else [KCP, MT_SICS]
-        if not any(dialect in allowed for dialect in speakers):
+            return found
+        if patience == ANSWERING or not quick[-1].moments:
             continue
-        wire.flush()
-        # An empty line first ends what an earlier question may have left in the balance's ear.
-        wire.send(b"\r\n" + probe.query if probe is KCP and attempt.answers else probe.query)
-        lines = _lines(wire, wait, lambda line, probe=probe: _is_weight(probe, line))  # type: ignore[misc]
-        attempt.answers[probe.title if probe is not KCP else "Kern KCP, MT-SICS"] = b"\n".join(lines)
-        if any(_is_weight(probe, line) for line in lines):
-            return _recognised(wire, probe, allowed, unasked=False)
+        for earlier in quick:
+            if earlier.line in patient or not earlier.may_be_late(quick, patience):
+                continue
+            patient[earlier.line] = Attempt(earlier.line)
+            found = _attempt(patient[earlier.line], allowed, open_wire, interrupted, patience)
+            if found is not None:
+                return found
+    raise UnknownDialectError(_failure(port, [patient.get(attempt.line, attempt) for attempt in quick], allowed))
+
+
+def _attempt(
+    attempt: Attempt,
+    allowed: Sequence[Dialect],
+    open_wire: Callable[[LineSettings], Wire],
+    interrupted: Callable[[], bool],
+    patience: float,
+    late: float = 0.0,
+) -> tuple[Detected, Wire] | None:
+    """Try one setting, and listen for what is late afterwards."""
+    if interrupted():
+        return None
+    attempt.began = time.monotonic()
+    try:
+        wire = open_wire(attempt.line)
+    except LineSettingsError:
+        attempt.possible = False
+        return None
+    try:
+        found = _try(wire, attempt, allowed, patience)
+        attempt.ended = time.monotonic()
+        if found is None and late > patience:
+            _lines(wire, late, lambda line: True, attempt)
+    except BaseException:
+        wire.close()
+        raise
+    if found is not None:
+        return found, wire
+    wire.close()
     return None
 
 
-def _recognised(wire: Wire, dialect: Dialect, allowed: Sequence[Dialect], *, unasked: bool) -> Detected:
-    if dialect not in (KCP, MT_SICS):
+def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect], patience: float) -> Detected | None:
+    lines = _lines(wire, LISTENING, attempt=attempt)
+    attempt.heard = b"\n".join(lines)
+    for dialect in allowed:
+        if sum(_is_weight(dialect, line) for line in lines) >= 2:
+            return _recognised(wire, dialect, allowed, patience, unasked=True)
+    wait = patience + _LONGEST_ANSWER * attempt.line.character_time
+    for probe, speakers in _probes(allowed).items():
+        wire.flush()
+        # An empty line first ends what an earlier question may have left in the balance's ear.
+        wire.send(b"\r\n" + probe if probe.endswith(b"\r\n") and attempt.answers else probe)
+        lines = _lines(wire, wait, lambda line, speakers=speakers: _is_weight(speakers[0], line), attempt)  # type: ignore[misc]
+        attempt.answers[", ".join(dialect.title for dialect in speakers)] = b"\n".join(lines)
+        if any(_is_weight(speakers[0], line) for line in lines):
+            return _recognised(wire, speakers[0], allowed, patience, unasked=False)
+    return None
+
+
+def _probes(allowed: Sequence[Dialect]) -> dict[bytes, list[Dialect]]:
+    """Questions in the order of their turns, each with the dialects that ask it."""
+    probes: dict[bytes, list[Dialect]] = {}
+    for dialect in sorted(allowed, key=lambda dialect: dialect.turn):
+        probes.setdefault(dialect.query, []).append(dialect)
+    return probes
+
+
+def _recognised(
+    wire: Wire, dialect: Dialect, allowed: Sequence[Dialect], patience: float, *, unasked: bool
+) -> Detected:
+    if not dialect.identity:
         return Detected(dialect, wire.line, unasked=unasked)
     if unasked and dialect.cancel is not None:
         wire.send(dialect.cancel)
         _lines(wire, ANSWERING)
-    level, model = (_identity(wire, question) for question in ("I1", "I2"))
-    found = _kcp_or_sics(level, model)
-    return Detected(found if found in allowed else dialect, wire.line, model.replace('"', ""), unasked)
+    said = {question: _identity(wire, question, patience) for question in dialect.identity}
+    alike = [other for other in allowed if other.query == dialect.query]
+    found = max(alike, key=lambda other: other.likeness(said))
+    return Detected(found, wire.line, said[dialect.identity[-1]].replace('"', ""), unasked)
 
 
-def _identity(wire: Wire, question: str) -> str:
+def _identity(wire: Wire, question: str, patience: float) -> str:
     """What the balance answers to I1, I2 …, without the question's echo; '' for nothing."""
     wire.flush()
     wire.send(question.encode("ascii") + b"\r\n")
-    wait = ANSWERING + _LONGEST_ANSWER * wire.line.character_time
+    wait = patience + _LONGEST_ANSWER * wire.line.character_time
     start = f"{question} A "
     for line in _lines(wire, wait, lambda line: line.startswith(question.encode("ascii"))):
         text = line.decode("ascii", "replace")
         if text.startswith(start):
             return text.removeprefix(start).strip()
     return ""
-
-
-def _kcp_or_sics(level: str, model: str) -> Dialect:
-    """KCP borrowed its questions and answers from MT-SICS; all that the driver does is the same but for the pace.
-
-    MT-SICS says its levels and one version of two numbers for each ("0123" "2.30" "2.22" …). KCP's versions have three
-    numbers (1.1.2); how it prints them could not be found out, so all that does not look like MT-SICS counts as KCP,
-    whose pace suits both.
-    """
-    if "KERN" in f"{level} {model}".upper():
-        return KCP
-    return MT_SICS if re.fullmatch(r'"[0-9]{1,4}"( "[0-9]+\.[0-9]+[A-Z]?")+', level) else KCP
 
 
 def _is_weight(dialect: Dialect, line: bytes) -> bool:
@@ -176,15 +216,31 @@ def _is_weight(dialect: Dialect, line: bytes) -> bool:
         return False
 
 
-def _lines(wire: Wire, wait: float, enough: Callable[[bytes], bool] = lambda line: False) -> list[bytes]:
-    """Lines that come within a time, or until one is enough; what has no end counts as a line."""
+def _lines(
+    wire: Wire,
+    wait: float,
+    enough: Callable[[bytes], bool] = lambda line: False,
+    attempt: Attempt | None = None,
+) -> list[bytes]:
+    """Lines that come within a time, or until one is enough; once something has come, only what follows soon.
+
+    What has no end counts as a line.
+    """
     end = time.monotonic() + wait
     lines: list[bytes] = []
-    while (line := wire.line_until(end)) is not None:
+    while (line := wire.line_until(min(end, time.monotonic() + ANSWERING))) is not None or (
+        not lines and not wire.waiting and time.monotonic() < end
+    ):
+        if line is None:
+            continue
         lines.append(line)
+        if attempt is not None:
+            attempt.moments.append(time.monotonic())
         if enough(line) or len(lines) > 50:
             return lines
     rest = wire.take()
+    if rest and attempt is not None:
+        attempt.moments.append(time.monotonic())
     return [*lines, rest] if rest else lines
 
 
@@ -220,12 +276,3 @@ def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect])
     titles = ", ".join(dialect.title for dialect in allowed)
     tried = "\n  ".join(map(str, attempts))
     return f"{port}: no balance recognised (looked for {titles}). {advice} Tried:\n  {tried}"
-
-
-def dialects(name: str) -> list[Dialect]:
-    """The dialects that a setting allows.
-
-    Args:
-        name: of one, or 'auto'.
-    """
-    return list(DIALECTS.values()) if name == "auto" else [DIALECTS[name]]

@@ -9,8 +9,8 @@ import time
 from collections.abc import Iterator
 
 from actors.balance.complaints import REFUSED
-from actors.balance.detect import Detected, detect, dialects
-from actors.balance.dialects import Dialect, LineSettings
+from actors.balance.detect import Detected, detect
+from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.errors import CommandError, NoConnectionError
 from actors.balance.reading import Acknowledgement, FrameError, Reading, Reply, Status
 from actors.balance.spec import SerialBalanceSpec
@@ -67,7 +67,7 @@ class Link:
         """
         if self._wire is not None:
             return
-        allowed, candidates = dialects(self._spec.dialect), self._spec.candidates()
+        allowed, candidates = self._spec.allowed, self._spec.candidates()
         if self.found is not None:  # plugged in again: nothing has to be found out
             self._wire = self._open_wire(self.found.line)
         elif len(allowed) == 1 and len(candidates) == 1:
@@ -75,7 +75,12 @@ class Link:
             self.found = Detected(allowed[0], candidates[0])
         else:
             self.found, self._wire = detect(
-                self._spec.port, candidates, allowed, self._open_wire, self._interrupted.is_set
+                self._spec.port,
+                candidates,
+                allowed,
+                self._open_wire,
+                self._interrupted.is_set,
+                answer_time=self._spec.answer_time,
             )
 
     def reopen(self, deadline: float) -> None:

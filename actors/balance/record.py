@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from actors.balance.dialects import DIALECTS
+from actors.balance.doors import dialects
 from actors.balance.errors import BalanceError
 from actors.balance.recording import Recorder
 from actors.balance.serial_balance import SerialBalance
@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--to", required=True, type=Path, help="file to write; must not exist yet")
     parser.add_argument("--balance", default="", help="make and model, as on its plate")
     parser.add_argument("--remarks", default="", help="what was put on it, and when")
-    parser.add_argument("--dialect", default=AUTO, choices=[AUTO, *DIALECTS])
+    parser.add_argument("--dialect", default=AUTO, choices=[AUTO, *dialects()])
     parser.add_argument("--baud", type=int, help="unless given, found out")
     parser.add_argument("--format", type=_format, help="e.g. 8N1; unless given, found out")
     parser.add_argument("--handshake", default="none", choices=["none", "software", "hardware"])

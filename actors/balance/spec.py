@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from actors.balance.dialects import DIALECTS, LineSettings
+from actors.balance.dialects.dialect import Dialect, LineSettings
+from actors.balance.doors import dialects
 from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
 from actors.balance.virtual_serial.scale import ScaleSettings
@@ -23,7 +24,7 @@ class SerialBalanceSpec:
 
     Attributes:
         port: device; under `/dev/serial/by-id/` it keeps its name when it is plugged in again.
-        dialect: 'kcp', 'kern-swt', 'mt-sics', 'sbi', or 'auto'.
+        dialect: one of `doors.dialects`, or 'auto'.
         baud: bits per second; None: found out.
         format: bits, parity and stop bits, as '8N1'; None: found out.
         handshake: whether the balance may stop the line: by characters (Xon/Xoff), by wires (CTS), or not.
@@ -50,8 +51,8 @@ class SerialBalanceSpec:
     time_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.dialect != AUTO and self.dialect not in DIALECTS:
-            raise ValueError(f"dialect '{self.dialect}' is not known; there are {', '.join(DIALECTS)} and {AUTO}")
+        if self.dialect != AUTO and self.dialect not in dialects():
+            raise ValueError(f"dialect '{self.dialect}' is not known; there are {', '.join(dialects())} and {AUTO}")
         if self.time_scale <= 0.0:
             raise ValueError(f"time_scale must be above 0, got {self.time_scale}")
         if self.format is not None:
@@ -62,10 +63,14 @@ class SerialBalanceSpec:
         """No call lasts longer than this [s of the clock]; what holds the driver should wait a little longer."""
         return 4.0 * self.settling.deadline / self.time_scale + 4.0 * self.reconnect_time + 60.0
 
+    @property
+    def allowed(self) -> tuple[Dialect, ...]:
+        """Dialects that it may speak."""
+        return tuple(dialects().values()) if self.dialect == AUTO else (dialects()[self.dialect],)
+
     def candidates(self) -> tuple[LineSettings, ...]:
         """Line settings to try, the likeliest first."""
-        names = [self.dialect] if self.dialect != AUTO else list(DIALECTS)
-        usual = _interleaved([DIALECTS[name].lines for name in names])
+        usual = _interleaved([dialect.lines for dialect in self.allowed])
         if self.baud is None and self.format is None:
             return usual
         forms = [parse_format(self.format)] if self.format is not None else [(s.bits, s.parity, s.stop) for s in usual]

@@ -122,6 +122,11 @@ class Wire:
                 return None
             self._pull()
 
+    @property
+    def waiting(self) -> bool:
+        """Whether something has come that has no end of line yet."""
+        return bool(self._buffer)
+
     def take(self) -> bytes:
         """What is waiting and has no end of line yet, taken out."""
         rest = bytes(self._buffer)

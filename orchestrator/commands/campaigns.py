@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +20,6 @@ if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
     from sim_engine.liquid import SimulationParameters
-
-THETA_FILE = "theta.json"
-KEPT_THETAS = 50
-"""Draws of the posterior in that file."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,12 +41,14 @@ class RunOptions:
 
 def run(path: Path, options: RunOptions) -> None:
     """The whole campaign."""
+    from orchestrator.report.summary import summary_json
+
     plan = read_campaign(path, options.laboratory)
     check_campaign_can_run(plan)
     _check_posterior(plan)
     finished = _run(plan, "run", path, options)
     if options.as_json:
-        print_json({"run": finished.result.directory.name, **finished.summary})
+        print_json({"run": finished.result.directory.name, **summary_json(finished.published.summary)})
 
 
 def _check_posterior(plan: CampaignPlan) -> None:
@@ -101,13 +98,20 @@ def calibrate(path: Path, options: RunOptions) -> None:
 
 def calibration_json(finished: Finished) -> dict[str, Any]:
     """θ* and mean |r − c_s| by split: its own, the median of random θ, the mean predictor's, the regression's."""
+    from orchestrator.results import learnt_by
+    from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta
+    from orchestrator.strategies.calibration.base import Calibrated
+    from orchestrator.strategies.calibration.evaluation import Scores
+    from orchestrator.strategies.calibration.scorecard import CALIBRATED
+
     results = finished.result.results
-    evaluation, theta = results["evaluation"], results["calibration"]["theta"]
-    ours = evaluation["discrepancy"]["theta"]
+    theta, calibration = calibrated_theta(results).theta.model_dump(), learnt_by(results, CALIBRATION, Calibrated)
+    evaluation = learnt_by(results, EVALUATION, Scores)
+    ours = evaluation.discrepancy[CALIBRATED]
     rivals = {
-        "random_theta": evaluation["random_median"],
-        "mean_predictor": evaluation.get("mean_predictor", {}),
-        "regression": evaluation.get("regression", {}),
+        "random_theta": evaluation.random_median,
+        "mean_predictor": evaluation.mean_predictor,
+        "regression": evaluation.regression,
     }
     data: dict[str, Any] = {"theta": theta}
     for split in ("train", "test", "transfer"):
@@ -117,11 +121,11 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
     return {
         **data,
         "simulations": finished.result.simulations,
-        "calibration_simulations": results["calibration"].get("simulations"),
+        "calibration_simulations": calibration.simulations,
         "cpu_s": finished.result.cpu_s,
         "run": str(finished.result.directory),
-        "figures": finished.figures,
-        "recording": finished.recording,
+        "figures": finished.published.figures,
+        "recording": finished.published.recording,
     }
 
 
@@ -138,7 +142,10 @@ def plan_pour(
     as_json: bool,
 ) -> None:
     """D1 for one receiver: the action that the calibrated simulator would pour with, and what to expect of it."""
+    from orchestrator.results import learnt_by
     from orchestrator.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
+    from orchestrator.strategies.deployment.learnt import Deployed
+    from orchestrator.strategies.repeats import Foreseen
 
     plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
     check_campaign_can_run(plan, as_written=receiver is None)
@@ -161,26 +168,25 @@ def plan_pour(
     )
     answers = []
     for stage in planning:
-        result = finished.result.results[stage.name]
-        if "action" not in result:
+        result = learnt_by(finished.result.results, stage.name, Deployed)
+        recommended = result.recommended
+        if recommended is None:
             raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
-        repeated = finished.result.results[PREDICTION + receiver_name]["over_seeds"]
-        spillage = repeated.get("spillage", {})
+        repeated = learnt_by(finished.result.results, PREDICTION + receiver_name, Foreseen).over_seeds
+        spillage = repeated.get("spillage")
+        told = finished.published.summary.receivers[result.scene]
         answers.append(
             {
                 "receiver": receiver_name,
-                "action": result["action"],
-                "action_si": result["action_si"],
-                "predicted_loss": result["predicted_loss"],
-                "predicted_spillage": spillage.get("mean"),
-                "predicted_spillage_deviation": spillage.get("deviation"),
-                "predicted_deviation": result["predicted_deviation"],
-                "prediction": repeated,
+                "action": recommended.action,
+                "action_si": recommended.action_si,
+                "predicted_loss": recommended.predicted_loss,
+                "predicted_spillage": None if spillage is None else spillage.mean,
+                "predicted_spillage_deviation": None if spillage is None else spillage.deviation,
+                "predicted_deviation": recommended.predicted_deviation,
                 "loss": plan.deployment.loss_name,
-                "risk": result.get("risk"),
-                "window": result.get("window"),
-                "not_covered": finished.summary["receivers"][result["scene"]]["not_covered"],
+                **told.model_dump(mode="json", include={"prediction", "risk", "window", "not_covered"}),
             }
         )
     theta = plan.parameters.model_dump()
@@ -286,23 +292,9 @@ def _run(
         answer=options.answer,
         checksum=checksum,
     )
-    calibrated = finished.result.results.get("calibration")
-    if calibrated is not None:
-        content = json.dumps(theta_file(calibrated), indent=2) + "\n"
-        (directory / THETA_FILE).write_text(content, encoding="utf-8")
-        say(f"θ* is in {directory / THETA_FILE}; use it with --parameters")
+    if finished.published.theta is not None:
+        say(f"θ* is in {finished.published.theta}; use it with --parameters")
     return finished
-
-
-def theta_file(calibrated: Mapping[str, Any]) -> dict[str, Any]:
-    """What `theta.json` holds: θ*, and where it is known the posterior as weighted θ, each complete."""
-    theta = dict(calibrated["theta"])
-    posterior = calibrated.get("posterior")
-    if posterior is None:
-        return {"theta": theta}
-    every = max(len(posterior["thetas"]) // KEPT_THETAS, 1)
-    kept = posterior["thetas"][::every]
-    return {"theta": theta, "posterior": [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]}
 
 
 def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:

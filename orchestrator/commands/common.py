@@ -8,7 +8,7 @@ import signal
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, INTERRUPTED, RefusalError, say, stdout_for_results
 
@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from actors.protocols import Laboratory
     from orchestrator.campaign import CampaignResult
     from orchestrator.plan import CampaignPlan
+    from orchestrator.publish import Published
     from orchestrator.stages import StageDefinition
-
-W = TypeVar("W")
 
 
 def read_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
@@ -99,9 +98,7 @@ class Finished:
     """A campaign that ran to its end, and what was written about it."""
 
     result: CampaignResult
-    summary: dict[str, Any]
-    figures: dict[str, Path]
-    recording: Path | None
+    published: Published
 
 
 def run_in_front_of_people(
@@ -138,6 +135,8 @@ def run_in_front_of_people(
     from orchestrator.events import Watcher
     from orchestrator.monitor.monitor import RerunMonitor
     from orchestrator.progress import ProgressDisplay
+    from orchestrator.publish import publish
+    from orchestrator.report.table import print_summary
     from orchestrator.stages import stages_of
 
     chosen = tuple(stages_of(plan) if stages is None else stages)
@@ -185,7 +184,9 @@ def run_in_front_of_people(
     finally:
         if monitor is not None:
             monitor.close()
-    return _report(plan, result, monitor)
+    published = publish(plan, result, monitor)
+    print_summary(plan, published.summary)
+    return Finished(result, published)
 
 
 def _way_on(directory: Path, again: str, not_resumed: str) -> str:
@@ -198,68 +199,12 @@ def _way_on(directory: Path, again: str, not_resumed: str) -> str:
 
 def _warn_of_what_is_not_simulated(plan: CampaignPlan) -> None:
     """Once at the beginning, of all action spaces."""
+    from orchestrator.publish import worked_out
     from orchestrator.report import regimes
     from orchestrator.report.names import receiver_names
 
-    for line in regimes.lines(_worked_out(regimes.campaign_warnings, plan), receiver_names(plan)):
+    for line in regimes.lines(worked_out(lambda: regimes.campaign_warnings(plan), say), receiver_names(plan)):
         say(line)
-
-
-def _worked_out(work: Callable[..., dict[str, list[W]]], *args: Any) -> dict[str, list[W]]:
-    """Warnings, or none if they can't be worked out: that is no reason to stop anything."""
-    try:
-        return work(*args)
-    except (ValueError, OSError) as error:
-        say(f"note: whether something is not simulated could not be worked out: {error}")
-        return {}
-
-
-def _report(plan: CampaignPlan, result: CampaignResult, monitor: Any) -> Finished:
-    from orchestrator.report import regimes
-    from orchestrator.report.campaign import draw_figures
-    from orchestrator.report.summary import print_summary, summarise, write_summary
-
-    evaluation = result.results.get("evaluation", {})
-    baselines: dict[str, dict[str, float | None]] = {}
-    for name in ("mean_predictor", "regression"):
-        for split, value in evaluation.get(name, {}).items():
-            if value is not None:
-                baselines.setdefault(split, {})[name] = value
-    figures = {}
-    if plan.outputs.figures:
-        figures = draw_figures(result.directory / "figures", plan, result.results, baselines=baselines)
-    recording = monitor.path if monitor is not None else None
-    summary = summarise(
-        plan,
-        result.results,
-        figures=figures,
-        recording=recording,
-        dropped_events=monitor.dropped if monitor is not None else 0,
-        baselines=baselines,
-        not_covered=_worked_out(regimes.campaign_warnings, plan),
-        best_not_covered=_worked_out(regimes.best_action_warnings, plan, result.results),
-        totals={
-            "mode": plan.laboratory.mode,
-            "simulations": result.simulations,
-            "pours": result.pours,
-            "cpu_s": result.cpu_s,
-            "seconds": result.seconds,
-            "occupancy": _occupancy(plan, result.directory),
-        },
-    )
-    write_summary(result.directory, summary)
-    print_summary(plan, summary)
-    return Finished(result, summary, figures, recording)
-
-
-def _occupancy(plan: CampaignPlan, directory: Path) -> dict[str, dict[str, Any]]:
-    """How busy the pool was beside the arm, by stage."""
-    from orchestrator.journal import JOURNAL_NAME, JournalReader
-    from orchestrator.occupancy import as_summary, occupancies
-
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        found = occupancies(journal.entries(), plan.parallel_simulations)
-    return {stage: as_summary(one) for stage, one in found.items()}
 
 
 async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, resumable: bool) -> CampaignResult:

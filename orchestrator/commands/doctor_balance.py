@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 
 from actors.balance.errors import BalanceError
@@ -32,6 +33,8 @@ def look_at_balance(spec: BalanceSpec | None, *, tare: bool) -> list[Check]:
         )
         there = f"there are {', '.join(known)}" if known else "no serial port is there"
         return [Check("balance port", "fail", f"{port} isn't there", f"plug the cable in, switch it on; {there}")]
+    if (other := _other_than_a_port(port)) is not None:
+        return [Check("balance port", "fail", f"{port} is {other}", "name the serial port that the balance is on")]
     if not os.access(port, os.R_OK | os.W_OK):
         return [
             Check(
@@ -71,3 +74,19 @@ def _group(port: Path) -> str:
         return port.group()
     except (KeyError, OSError):
         return "dialout"
+
+
+def _other_than_a_port(port: Path) -> str | None:
+    """What stands there, if it is no serial port; None where it is one, or can't be opened to see."""
+    if port.is_dir():
+        return "a folder"
+    if not stat.S_ISCHR(port.stat().st_mode):
+        return "a file"
+    try:
+        opened = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError:
+        return None
+    try:
+        return None if os.isatty(opened) else "a device, and not a serial port"
+    finally:
+        os.close(opened)

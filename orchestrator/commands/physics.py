@@ -25,7 +25,7 @@ def physics(
     from rich.progress import Progress
 
     from orchestrator.report import physics as report
-    from orchestrator.report.summary import PLAIN_WIDTH
+    from orchestrator.report.table import PLAIN_WIDTH
     from sim_engine.pour import PourSimulator
     from sim_engine.validation import suite
 

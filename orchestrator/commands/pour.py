@@ -17,6 +17,7 @@ from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, prin
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
+    from orchestrator.strategies.one_pour import WeighedPour
     from sim_engine.action import Action
     from sim_engine.task import Scene
 
@@ -246,8 +247,9 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     from orchestrator.commands.campaigns import run_directory
     from orchestrator.commands.common import check_laboratory_answers, run_in_front_of_people
     from orchestrator.commands.people import check_somebody_is_there
+    from orchestrator.results import learnt_by
     from orchestrator.stages import StageDefinition
-    from orchestrator.strategies.one_pour import OnePour
+    from orchestrator.strategies.one_pour import OnePour, OnePoured
 
     plan = dataclasses.replace(
         _only(chosen),
@@ -274,13 +276,14 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         not_resumed="this pour is not resumed; what was weighed of it",
         checksum=checksum,
     )
-    result = finished.result.results[STAGE]
-    if "failed" in result:
-        raise RefusalError(str(result["failed"]), FAILED)
+    result = learnt_by(finished.result.results, STAGE, OnePoured)
+    if result.weighed is None:
+        raise RefusalError(result.failed or "nothing was poured", FAILED)
     if as_json:
-        print_json({"run": str(directory), "mode": plan.laboratory.mode, "action": chosen.action.values(), **result})
+        about = {"run": str(directory), "mode": plan.laboratory.mode, "action": chosen.action.values()}
+        print_json({**about, **result.weighed.model_dump()})
     else:
-        print(told(result))
+        print(told(result.weighed))
 
 
 def _only(chosen: Chosen) -> CampaignPlan:
@@ -292,13 +295,14 @@ def _only(chosen: Chosen) -> CampaignPlan:
     return dataclasses.replace(plan, deployment=None)
 
 
-def told(result: dict[str, Any]) -> str:
+def told(weighed: WeighedPour) -> str:
     """What was weighed, in a line."""
-    spillage = result["spillage"]
+    spillage = weighed.spillage
     r = (
         "too little was poured to speak of spillage"
         if spillage is None
         else f"spillage {100 * spillage:.2f} % of poured"
     )
-    masses = ", ".join(f"{name} {1e3 * result[name]:.1f} g" for name in ("loaded", "spilled", "retained"))
+    parts = {"loaded": weighed.loaded, "spilled": weighed.spilled, "retained": weighed.retained}
+    masses = ", ".join(f"{name} {1e3 * mass:.1f} g" for name, mass in parts.items())
     return f"{masses}; {r}"

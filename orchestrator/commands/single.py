@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -195,6 +194,7 @@ def validate(paths: list[Path]) -> None:
     from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
     from orchestrator.config.study.sections import load_study
     from orchestrator.config.yaml.errors import ConfigError
+    from orchestrator.config.yaml.files import resolved
     from orchestrator.config.yaml.kinds import kind_of
     from orchestrator.config.yaml.source import Document
     from orchestrator.study.cells import cells_of
@@ -205,7 +205,7 @@ def validate(paths: list[Path]) -> None:
     for path in paths:
         problems: list[str] = []
         try:
-            kind = kind_of(Document.read(path.resolve()).data)
+            kind = kind_of(Document.read(resolved(path)).data)
             if kind == "vessel":
                 vessel = build_vessel(load_vessel(path))
                 note = f"vessel, holds {1e6 * vessel.capacity:.4g} mL to the brim"
@@ -232,16 +232,9 @@ def validate(paths: list[Path]) -> None:
 
 
 def schema(which: str) -> None:
-    """The JSON schema that editors complete campaign files with."""
-    from orchestrator.config import schema as schemas
+    """The JSON schema of the files that people write, or of what a run writes."""
+    from orchestrator.config.schema import SCHEMAS, schema_text
 
-    known = {
-        "campaign": schemas.campaign_schema,
-        "vessel": schemas.vessel_schema,
-        "laboratory": schemas.laboratory_schema,
-        "study": schemas.study_schema,
-    }
-    if which not in known:
-        raise RefusalError(f"no schema '{which}'; there are {', '.join(known)}", BAD_INPUT)
-    json.dump(known[which](), sys.stdout, indent=2, ensure_ascii=False)
-    print()
+    if which not in SCHEMAS:
+        raise RefusalError(f"no schema '{which}'; there are {', '.join(SCHEMAS)}", BAD_INPUT)
+    sys.stdout.write(schema_text(SCHEMAS[which]()))

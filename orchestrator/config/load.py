@@ -17,6 +17,7 @@ from orchestrator.config.laboratory.sections import LaboratoryFile, resolve_labo
 from orchestrator.config.motion import parameter_quantity
 from orchestrator.config.vessel import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.errors import ConfigError, Problem
+from orchestrator.config.yaml.files import resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.references import References
@@ -39,12 +40,12 @@ def load_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
     report = Report()
-    place = Place(Document.read(path.resolve()))
+    place = Place(Document.read(resolved(path)))
     if (other := wrong_kind(place.document, "campaign")) is not None:
         raise ConfigError([other])
     section = validate(CampaignFile, place, report)
     if section is not None and laboratory is not None:
-        section = section.model_copy(update={"laboratory": str(laboratory.resolve())})
+        section = section.model_copy(update={"laboratory": str(resolved(laboratory))})
     plan = None if section is None else resolve_campaign(section, place, report)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"
@@ -60,8 +61,8 @@ def load_vessel(path: Path) -> VesselSpec:
     report = Report()
     if path.suffix.lower() in MESH_SUFFIXES:
         message = f"is a mesh; describe the vessel in a YAML file: {{name: {path.stem}, mesh: {path.name}, unit: mm}}"
-        raise ConfigError([Problem(path.resolve(), 0, 0, "", message)])
-    found = References(report).file(path.resolve(), VesselFile)
+        raise ConfigError([Problem(resolved(path), 0, 0, "", message)])
+    found = References(report).file(resolved(path), VesselFile)
     vessel = None if found is None else resolve_vessel(*found, report)
     report.raise_if_any()
     assert vessel is not None, "a vessel without problems has a spec"
@@ -75,7 +76,7 @@ def load_laboratory(path: Path) -> LaboratorySpec:
         ConfigError: anything is wrong with it.
     """
     report = Report()
-    found = References(report).file(path.resolve(), LaboratoryFile)
+    found = References(report).file(resolved(path), LaboratoryFile)
     laboratory = None if found is None else resolve_laboratory(*found, report)
     report.raise_if_any()
     assert laboratory is not None, "a laboratory without problems has a spec"
@@ -127,7 +128,7 @@ def load_posterior(
         ConfigError: it has no posterior, or anything is wrong with it.
     """
     report = Report()
-    document = Document.read(path.resolve())
+    document = Document.read(resolved(path))
     place = Place(document)
     rows = document.data.get(POSTERIOR_KEY) if isinstance(document.data, dict) else None
     weights: list[float] = []
@@ -166,7 +167,7 @@ def load_parameters(path: Path, base: SimulationParameters | None = None) -> Sim
         ConfigError: anything is wrong with it.
     """
     report = Report()
-    document = Document.read(path.resolve())
+    document = Document.read(resolved(path))
     place = Place(document)
     if isinstance(document.data, dict):
         place = next((place.at(key) for key in THETA_KEYS if key in document.data), place)

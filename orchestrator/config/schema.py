@@ -1,8 +1,9 @@
-"""JSON schemas of the files people write, for editors that complete and check while one types."""
+"""JSON schemas of the files people write, for editors that complete and check, and of `summary.json` for programs."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from orchestrator.config.laboratory.sections import LaboratoryFile
 from orchestrator.config.study.sections import StudyFile
 from orchestrator.config.vessel import VesselFile
 from orchestrator.config.yaml.sections import SchemaGenerator, Section
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def campaign_schema() -> dict[str, Any]:
@@ -33,17 +36,28 @@ def study_schema() -> dict[str, Any]:
     return _schema(StudyFile, "Study")
 
 
+def result_schema() -> dict[str, Any]:
+    """Schema of a run's `summary.json`, with every kind of result."""
+    from orchestrator.report.summary import summary_schema
+
+    return {"$schema": DIALECT, **summary_schema()}
+
+
+SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
+    "campaign": campaign_schema,
+    "vessel": vessel_schema,
+    "laboratory": laboratory_schema,
+    "study": study_schema,
+    "result": result_schema,
+}
+"""By the names of their files."""
+
+
 def write_schemas(directory: Path) -> list[Path]:
-    """Write campaign.json, vessel.json, laboratory.json and study.json into a directory; the paths written."""
+    """Write all schemas into a directory, each as NAME.json; the paths written."""
     directory.mkdir(parents=True, exist_ok=True)
     paths = []
-    tables = (
-        ("campaign", campaign_schema),
-        ("vessel", vessel_schema),
-        ("laboratory", laboratory_schema),
-        ("study", study_schema),
-    )
-    for name, schema in tables:
+    for name, schema in SCHEMAS.items():
         path = directory / f"{name}.json"
         path.write_text(schema_text(schema()), encoding="utf-8")
         paths.append(path)
@@ -57,4 +71,4 @@ def schema_text(schema: dict[str, Any]) -> str:
 
 def _schema(model: type[Section], title: str) -> dict[str, Any]:
     schema = model.model_json_schema(by_alias=True, schema_generator=SchemaGenerator)
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": title}
+    return {"$schema": DIALECT, **schema, "title": title}

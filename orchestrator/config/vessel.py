@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from orchestrator.config.yaml.errors import did_you_mean
+from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.quantities import Quantity, parse_quantity
 from orchestrator.config.yaml.sections import FilePath, Name, Number, Section, Text
 from orchestrator.config.yaml.source import Place, Report
@@ -73,7 +72,7 @@ class LiquidFile(Section):
     name: Text = "water"
     """For people."""
 
-    mass: Annotated[float, Quantity("kg", "200 g", positive=True, upper=20.0)] | None = None
+    mass: Annotated[float, Quantity("kg", "200 g", lower=1e-4, upper=20.0)] | None = None
     """Mass that is loaded into the pourer."""
 
     density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] = 998.0
@@ -143,24 +142,14 @@ def _profile(section: ProfileSection, place: Place, report: Report) -> ProfileSh
 
 
 def _mesh(section: VesselFile, place: Place, report: Report) -> MeshShape | None:
-    path = (place.directory / str(section.mesh)).resolve()
+    path = resolved(place.directory / str(section.mesh))
     if path.suffix.lower() not in MESH_SUFFIXES:
         report.add(place.at("mesh"), f"{path.suffix or 'a file without suffix'} is no mesh; use STL, OBJ, PLY or GLB")
         return None
-    if not path.is_file():
-        report.add(place.at("mesh"), missing_file(path))
+    if (missing := missing_file(path)) is not None:
+        report.add(place.at("mesh"), missing)
         return None
     return MeshShape(path=path, unit=section.unit, up=section.up or "z")
-
-
-def missing_file(path: Path) -> str:
-    """What to say about a file that is not there."""
-    if path.is_dir():
-        return f"{path} is a directory; name a file in it"
-    neighbours = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-    guess = did_you_mean(path.name, neighbours)
-    hint = f"did you mean '{guess}'?" if guess else "paths are relative to the directory of the file they stand in"
-    return f"no such file: {path}; {hint}"
 
 
 def resolve_liquid(section: LiquidFile) -> Liquid | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 from orchestrator.plan import CampaignPlan
@@ -12,7 +12,6 @@ from orchestrator.report.maps import draw_surrogate, draw_trials
 from orchestrator.report.names import receiver_name
 from orchestrator.report.posterior import draw_posterior
 from orchestrator.report.results import (
-    Results,
     calibration_of,
     calibration_picture,
     deployment_picture,
@@ -20,11 +19,14 @@ from orchestrator.report.results import (
     discrepancy_groups,
     evaluation_of,
     pour_series,
+    theta_of,
 )
 from orchestrator.report.style import safe_name
 from orchestrator.report.trust import draw_trust
 from orchestrator.report.units import deployment_unit
 from orchestrator.report.window import draw_window
+from orchestrator.results import Results
+from orchestrator.strategies.deployment.trust import Compared
 
 _log = logging.getLogger(__name__)
 
@@ -33,8 +35,6 @@ def draw_figures(
     directory: Path,
     plan: CampaignPlan,
     results: Results,
-    *,
-    baselines: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> dict[str, Path]:
     """Draw what the results allow: discrepancy map and trials, test discrepancy, spillage against pours, loss maps,
     and the first pours against what was simulated.
@@ -47,22 +47,21 @@ def draw_figures(
     Args:
         directory: where the PNGs go.
         plan: of the campaign.
-        results: stage name → the strategy's result.
-        baselines: 'mean_predictor' and 'regression' by split ('train', 'test'), where they were computed.
+        results: what the stages learnt.
 
     Returns:
         Name of each figure → its file.
     """
     jobs: dict[str, Callable[[], Path]] = {}
-    calibration, evaluation = calibration_of(results), evaluation_of(results)
+    calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
     if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
         jobs["discrepancy map"] = lambda p=picture: draw_surrogate(directory / "discrepancy-map.png", p)  # type: ignore[misc]
         if picture.held and picture.points:
             jobs["discrepancy trials"] = lambda p=picture: draw_trials(directory / "discrepancy-trials.png", p)  # type: ignore[misc]
-    if calibration is not None and plan.calibration is not None and (posterior := calibration.get("posterior")):
-        space, theta = plan.calibration.parameters, calibration["theta"]
-        jobs["posterior"] = lambda: draw_posterior(directory / "posterior.png", posterior, space, theta)
-    if evaluation is not None and (groups := discrepancy_groups(evaluation, baselines)):
+    if theta is not None and plan.calibration is not None and (posterior := theta.posterior) is not None:
+        space, best = plan.calibration.parameters, theta.theta.model_dump()
+        jobs["posterior"] = lambda: draw_posterior(directory / "posterior.png", posterior, space, best)
+    if evaluation is not None and (groups := discrepancy_groups(evaluation)):
         jobs["test discrepancy"] = lambda: draw_discrepancy(
             directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the balance: {plan.name}"
         )
@@ -78,12 +77,12 @@ def draw_figures(
                 jobs[f"loss map {name}"] = lambda p=picture, n=name: draw_surrogate(  # type: ignore[misc]
                     directory / f"loss-map-{safe_name(n)}.png", p
                 )
-            if result.get("window"):
+            if result.window is not None:
                 picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
                 jobs[f"safe window {name}"] = lambda r=result, p=picture, n=name: draw_window(  # type: ignore[misc]
                     directory / f"window-{safe_name(n)}.png", r, p, unit=unit, receiver=n
                 )
-            if (trust := result.get("trust") or {}).get("pours"):
+            if isinstance(trust := result.trust, Compared) and trust.pours:
                 name = receiver_name(plan, scene)
                 jobs[f"trust {name}"] = lambda t=trust, n=name: draw_trust(  # type: ignore[misc]
                     directory / f"trust-{safe_name(n)}.png", t, unit=unit, receiver=n

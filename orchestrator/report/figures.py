@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+TOP = 1.08
+"""Upper end of the axis, over the largest value in view."""
+
+
 @dataclass(frozen=True)
 class PourSeries:
     """Pours into one receiver, in the order they were made.
@@ -70,7 +74,7 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
         style.dress(panel, title=_pour_title(one), x="pour", y=cost if place % columns == 0 else "")
     for extra in range(len(series), rows * columns):
         axes[extra // columns, extra % columns].set_visible(False)
-    axes[0, 0].set_ylim(0.0, 1.08 * top or 1.0)
+    axes[0, 0].set_ylim(0.0, TOP * top or 1.0)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return style.save(figure, path)
@@ -111,7 +115,14 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
             zorder=2,
         )
         # A first, clueless prediction must not squeeze what was measured into the lowest tenth.
-        top = max(top, min(float(np.nanmax(mean + 2 * deviation)), 2.0 * top))
+        ends = mean + 2 * deviation
+        top = max(top, min(float(np.nanmax(ends)), 2.0 * top))
+        for number, end in zip(numbers, ends, strict=True):
+            if end > TOP * top:
+                axes.annotate(
+                    f"{end:.3g}", (float(number), TOP * top), xytext=(7, -2), textcoords="offset points",
+                    va="top", fontsize=8, color=style.GREY, arrowprops=None,
+                )  # fmt: skip
     axes.step(numbers, best, where="post", color=style.BEST, linewidth=2.0, label="best so far", zorder=3)
     axes.plot(
         numbers,
@@ -122,6 +133,7 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
         markeredgecolor="white",
         label="measured",
         zorder=4,
+        clip_on=False,
     )
     failed = numbers[np.isnan(measured)]
     if len(failed):
@@ -175,27 +187,18 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
     figure, axes = style.new_figure(size=(2.2 + 2.5 * len(groups), 4.4))
     width = 0.19
     named: set[str] = set()
-    top = 0.0
-    for place, group in enumerate(groups):
-        bars: list[tuple[str, float | None, str, tuple[float, float] | None]] = [
+    top, left, middles = 0.0, 0.0, []
+    for group in groups:
+        every: list[tuple[str, float | None, str, tuple[float, float] | None]] = [
             ("calibrated simulator θ*", group.calibrated, style.BEST, None),
             (*_random(group.random),),
             ("mean of training pours", group.mean_predictor, style.PALE, None),
             ("GP regression, no simulator", group.regression, style.FALLING, None),
         ]
+        bars = [(name, value, colour, spread) for name, value, colour, spread in every if value is not None]
+        middles.append(left + 0.5 * (len(bars) - 1) * width)
         for slot, (name, value, colour, quartiles) in enumerate(bars):
-            x = place + (slot - 1.5) * width
-            if value is None:
-                axes.annotate(
-                    "n/a",
-                    (x, 0.0),
-                    xytext=(0, 3),
-                    textcoords="offset points",
-                    ha="center",
-                    fontsize=8,
-                    color=style.GREY,
-                )
-                continue
+            x = left + slot * width
             error = None if quartiles is None else 100 * np.array([[value - quartiles[0]], [quartiles[1] - value]])
             axes.bar(
                 x,
@@ -221,12 +224,11 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
                 color=style.INK,
                 fontweight="bold" if slot == 0 else "normal",
             )
+        left += (len(bars) + 1.5) * width  # a set of pours takes the room of those who had something to say
     style.dress(axes, title=title, y="mean |measured − predicted| spillage [%]")
     axes.set_ylim(0.0, 1.12 * top or 1.0)
-    axes.set_xlim(-0.55, len(groups) - 0.45)  # room for every predictor, those with nothing to say too
-    axes.set_xticks(
-        range(len(groups)), [f"{g.name}\n{g.pours} pour{'s' * (g.pours != 1)}" for g in groups], fontsize=9.5
-    )
+    axes.set_xlim(-1.5 * width, left - width)
+    axes.set_xticks(middles, [f"{g.name}\n{g.pours} pour{'s' * (g.pours != 1)}" for g in groups], fontsize=9.5)
     axes.tick_params(axis="x", length=0)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     return style.save(figure, path)

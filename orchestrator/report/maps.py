@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,6 +39,8 @@ class SurrogatePicture:
         numbers: what to write on the points (pours); None: they are dots (simulations).
         over: names of the map's two axes; empty: the space has no others.
         held: values of the other axes at which the map cuts the surrogate, SI.
+        simulated: where simulations were made beside the observed pours, SI.
+        largest: what the cost can be at most; a surrogate that says more is shown as saying that.
     """
 
     title: str
@@ -52,6 +55,8 @@ class SurrogatePicture:
     numbers: Sequence[int] | None = None
     over: tuple[str, ...] = ()
     held: Values = field(default_factory=dict)
+    simulated: Sequence[Values] = ()
+    largest: float = math.inf
 
     @property
     def plane(self) -> Space:
@@ -106,21 +111,29 @@ def _maps(picture: SurrogatePicture) -> Figure:
     shown: list[tuple[str, NDArray[np.float64] | None]] = [panel for panel in panels if panel[1] is not None] or [
         ("observations", None)
     ]
-    figure, axes = style.new_figure(1, len(shown), size=(5.4 * len(shown), 4.3), squeeze=False)
+    figure, axes = style.new_figure(1, len(shown), size=(5.6 * len(shown), 4.8), squeeze=False)
     figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
     for place, (name, grid) in enumerate(shown):
         _map_panel(figure, axes[0, place], picture, name, grid)
-    if picture.held:
-        figure.supxlabel(_cut_note(picture), fontsize=8.5, color=style.INK, x=0.02, ha="left")
+    marked = {name: h for h, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
+    if marked:
+        figure.legend(marked.values(), marked.keys(), loc="outside upper right", ncols=3, fontsize=9, frameon=False)
+    if notes := _notes(picture):
+        figure.supxlabel("\n".join(notes), fontsize=8.5, color=style.INK, x=0.02, ha="left")
     return figure
 
 
-def _cut_note(picture: SurrogatePicture) -> str:
-    """Where the map lies in the box, for those who'd take it for the whole."""
-    note = f"others at {picture.best_name}: {style.display_values(dict(picture.held))}"
-    if picture.points:
-        note += f"; the {_things(picture)} were made at any values of them"
-    return note
+def _notes(picture: SurrogatePicture) -> list[str]:
+    """Where the map lies in the box, and whether the best lies at an end of what was searched."""
+    notes = []
+    if picture.held:
+        note = f"others at {picture.best_name}: {style.display_values(dict(picture.held))}"
+        if picture.points:
+            note += f"; the {_things(picture)} were made at any values of them"
+        notes.append(note)
+    if picture.best is not None and (ends := style.at_ends(dict(picture.best), picture.space.axes)):
+        notes.append(f"{picture.best_name} has {' and '.join(ends)}: a wider range may hold a better one")
+    return notes
 
 
 def _map_panel(
@@ -129,66 +142,88 @@ def _map_panel(
     x_axis, y_axis = picture.plane.axes
     # Deviations say how sure the mean is, not how good a place is: another colour map, so that nobody mixes them up.
     colours = "cividis" if name == "standard deviation" else "viridis"
-    xs, ys = _column(picture.points, x_axis), _column(picture.points, y_axis)
     costs = np.asarray(picture.costs, dtype=float)
+    low, high = _limits(np.minimum(costs if grid is None else np.asarray(grid, dtype=float), picture.largest))
     if grid is not None:
-        values = np.asarray(grid, dtype=float)
-        # The surrogate's own range: single observations, far noisier, would flatten it.
-        low, high = _limits(values)
-        places = np.linspace(0.0, 1.0, values.shape[0])
-        mesh: Any = axes.contourf(
-            _decode(x_axis, places),
-            _decode(y_axis, places),
-            np.clip(values, low, high),
-            levels=np.linspace(low, high, 25),
-            cmap=colours,
-        )
+        mesh = _coloured(axes, picture, np.asarray(grid, dtype=float), colours, low, high)
         if name == "mean":
-            axes.contour(
-                _decode(x_axis, places),
-                _decode(y_axis, places),
-                values,
-                levels=np.linspace(low, high, 9)[1:-1],
-                colors="white",
-                linewidths=0.5,
-                alpha=0.6,
-            )
+            _contours(axes, picture, np.asarray(grid, dtype=float), low, high)
     else:
-        low, high = _limits(costs)
         mesh = axes.scatter([], [], c=[], cmap=colours, vmin=low, vmax=high)
-    if len(xs):
-        # Observations are filled with their own cost on the same scale: where one stands out, the surrogate disagrees.
-        filled: dict[str, Any] = (
-            {"c": costs, "cmap": colours, "vmin": low, "vmax": high} if name != "standard deviation" else {"c": "white"}
+    if picture.simulated:
+        places = (_column(picture.simulated, x_axis), _column(picture.simulated, y_axis))
+        axes.scatter(
+            *places, marker="x", s=18, linewidths=1.0, color=style.GREY, clip_on=False, zorder=3, label="simulation"
         )
-        size = 26 if picture.numbers is None else 130
-        axes.scatter(xs, ys, s=size, edgecolors="white", linewidths=1.0, zorder=3, clip_on=False, **filled)
-        if picture.numbers is not None:
-            for number, x, y, cost in zip(picture.numbers, xs, ys, costs, strict=True):
-                dark = name != "standard deviation" and cost < 0.6 * low + 0.4 * high
-                axes.annotate(
-                    str(number),
-                    (x, y),
-                    ha="center",
-                    va="center",
-                    fontsize=6.5,
-                    fontweight="bold",
-                    color="white" if dark else style.INK,
-                    zorder=4,
-                )
+    # Observations are filled with their own cost on the same scale: where one stands out, the surrogate disagrees.
+    filled: dict[str, Any] = {"c": "white"}
+    if name != "standard deviation":
+        filled = {"c": np.minimum(costs, picture.largest), "cmap": colours, "vmin": low, "vmax": high}
+    _observed(
+        axes, picture, filled, np.full(len(costs), name != "standard deviation") & (costs < 0.6 * low + 0.4 * high)
+    )
     if picture.best is not None:
         _mark_best(axes, picture, x_axis, y_axis)
     style.dress(
         axes, title=_panel_title(name, picture), x=style.label(x_axis.name), y=style.label(y_axis.name), grid=None
     )
-    _scale(axes, x_axis, "x")
-    _scale(axes, y_axis, "y")
-    bar = figure.colorbar(mesh, ax=axes, fraction=0.05, pad=0.02)
-    bar.set_label(picture.cost if name != "standard deviation" else f"± {picture.cost}", fontsize=9)
-    bar.ax.tick_params(labelsize=8)
-    bar.outline.set_visible(False)
+    style.frame(axes, x_axis, "x")
+    style.frame(axes, y_axis, "y")
+    _bar(figure, axes, mesh, picture.cost if name != "standard deviation" else f"± {picture.cost}")
+
+
+def _coloured(
+    axes: Axes, picture: SurrogatePicture, values: NDArray[np.float64], colours: str, low: float, high: float
+) -> Any:
+    """The grid in its own range: single observations, far noisier, would flatten it."""
+    x_axis, y_axis = picture.plane.axes
+    places = np.linspace(0.0, 1.0, values.shape[0])
+    beyond: Any = "max" if values.max() > high + 1e-9 * (high - low) else "neither"
+    return axes.contourf(
+        _decode(x_axis, places),
+        _decode(y_axis, places),
+        np.maximum(values, low),
+        levels=np.linspace(low, high, 25),
+        cmap=colours,
+        extend=beyond,
+    )
+
+
+def _contours(axes: Axes, picture: SurrogatePicture, values: NDArray[np.float64], low: float, high: float) -> None:
+    x_axis, y_axis = picture.plane.axes
+    places = np.linspace(0.0, 1.0, values.shape[0])
+    axes.contour(
+        _decode(x_axis, places),
+        _decode(y_axis, places),
+        values,
+        levels=np.linspace(low, high, 9)[1:-1],
+        colors="white",
+        linewidths=0.5,
+        alpha=0.6,
+    )
+
+
+def _observed(axes: Axes, picture: SurrogatePicture, filled: Mapping[str, Any], dark: NDArray[np.bool_]) -> None:
+    """Dots, or numbered discs; whole ones, also at the edge."""
+    if not len(picture.points):
+        return
+    xs, ys = (_column(picture.points, axis) for axis in picture.plane.axes)
+    size = 26 if picture.numbers is None else 130
+    edge = style.INK if isinstance(filled["c"], str) else "white"
+    name = "simulation" if picture.numbers is None else "pour"
+    axes.scatter(xs, ys, s=size, edgecolors=edge, linewidths=1.0, zorder=5, clip_on=False, label=name, **filled)
+    for number, x, y, inked in zip(picture.numbers or (), xs, ys, ~dark, strict=False):
+        colour = style.INK if inked else "white"
+        axes.text(x, y, str(number), ha="center", va="center", fontsize=6.5, fontweight="bold", color=colour, zorder=6)
+
+
+def _bar(figure: Figure, axes: Axes, mesh: Any, label: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
+    bar = figure.colorbar(mesh, ax=axes, fraction=0.05, pad=0.03)
+    bar.set_label(label, fontsize=9)
+    bar.ax.tick_params(labelsize=8)
+    bar.outline.set_visible(False)
     bar.locator = MaxNLocator(6)
     bar.update_ticks()
 
@@ -210,54 +245,39 @@ def _things(picture: SurrogatePicture) -> str:
 def _mark_best(axes: Axes, picture: SurrogatePicture, x_axis: Axis, y_axis: Axis) -> None:
     assert picture.best is not None
     x, y = _column([picture.best], x_axis)[0], _column([picture.best], y_axis)[0]
-    axes.scatter([x], [y], marker="*", s=330, color=style.BEST, edgecolors="white", linewidths=1.3, zorder=5)
-    # The label goes towards the middle of the picture, where there is room for it.
-    u, v = (axis.encode(float(picture.best[axis.name] or 0.0)) for axis in (x_axis, y_axis))
-    axes.annotate(
-        picture.best_name,
-        (x, y),
-        xytext=(11 if u < 0.6 else -11, 11 if v < 0.75 else -11),
-        textcoords="offset points",
-        ha="left" if u < 0.6 else "right",
-        va="bottom" if v < 0.75 else "top",
-        fontsize=10,
-        fontweight="bold",
-        color=style.INK,
-        bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
-        zorder=6,
-    )
+    # Above the map and below the numbers: where the best action was poured, its pour can still be read.
+    axes.scatter(
+        [x], [y], marker="*", s=560, color=style.BEST, edgecolors="white", linewidths=1.3, zorder=4, clip_on=False,
+        label=picture.best_name,
+    )  # fmt: skip
 
 
 def _slices(picture: SurrogatePicture) -> Figure:
     """One or more than two axes: the cost against each of them, the other axes wherever they were."""
     count = picture.space.dimension
-    figure, axes = style.new_figure(1, count, size=(max(5.4, 3.4 * count), 3.9), squeeze=False, sharey=True)
+    figure, axes = style.new_figure(1, count, size=(max(5.4, 3.4 * count), 4.1), squeeze=False, sharey=True)
     figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
     for place, axis in enumerate(picture.space.axes):
         panel = axes[0, place]
         panel.scatter(
             _column(picture.points, axis),
             picture.costs,
-            s=22,
+            s=26,
             color=style.MEASURED,
             alpha=0.75,
             edgecolors="white",
             linewidths=0.5,
+            clip_on=False,
+            zorder=3,
+            label="pour" if picture.numbers is not None else "simulation, the other parameters at any values",
         )
         if picture.best is not None:
             x = _column([picture.best], axis)[0]
-            panel.axvline(x, color=style.BEST, linewidth=1.6)
-            panel.annotate(
-                f" {picture.best_name}",
-                (x, 1.0),
-                xycoords=("data", "axes fraction"),
-                va="top",
-                color=style.BEST,
-                fontweight="bold",
-                fontsize=9.5,
-            )
+            panel.axvline(x, color=style.BEST, linewidth=1.8, label=picture.best_name)
         style.dress(panel, x=style.label(axis.name), y=picture.cost if place == 0 else "")
-        _scale(panel, axis, "x")
+        style.frame(panel, axis, "x")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     return figure
 
 
@@ -276,17 +296,3 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
     """Colour range of the values, never empty."""
     low, high = float(np.min(values)), float(np.max(values))
     return (low, high) if high - low > 1e-12 else (low - 0.5, low + 0.5)
-
-
-def _scale(axes: Axes, axis: Axis, which: str) -> None:
-    factor = style.display_factor(axis.name)
-    setter, limits = (axes.set_xscale, axes.set_xlim) if which == "x" else (axes.set_yscale, axes.set_ylim)
-    handle = axes.xaxis if which == "x" else axes.yaxis
-    if axis.scale == "log":
-        from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-        setter("log")
-        handle.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        handle.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        handle.set_minor_formatter(NullFormatter())
-    limits(axis.lower / factor, axis.upper / factor)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from rich.table import Table
 
-    from sim_engine.validation.result import CaseResult, Figure, Series
+    from sim_engine.validation.result import CaseResult, Figure
     from sim_engine.validation.suite import Case
 
 PAGE_NAME, DATA_NAME, IMAGES = "validation.md", "validation.json", "images"
@@ -23,6 +26,12 @@ SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
 
 PANELS_ABREAST = 3
 """More panels than these go into further rows."""
+
+FEW = 20
+"""Points of a reference from which it is a line."""
+
+MOST_PLACES = 5
+"""Points of a logarithmic axis that each get their number; of more, round numbers do."""
 
 AGAIN = "decant physics --full --write docs"
 
@@ -103,48 +112,104 @@ def draw(figure: Figure, path: Path) -> Path:
     panels = len(figure.titles)
     columns = min(panels, PANELS_ABREAST)
     rows = -(-panels // columns)
-    size = (1.2 + 5.2 * columns, 3.8 * rows)
-    canvas, axes = style.new_figure(rows, columns, size=size, squeeze=False)
+    wide, high = (6.2, 3.9) if panels == 1 else (3.4, 2.7)
+    canvas, axes = style.new_figure(rows, columns, size=(wide * columns, 0.5 + high * rows), squeeze=False)
+    looks = _looks(figure)
     for number, place in enumerate(axes.flat):
         if number < panels:
-            _panel(place, figure, number)
+            _panel(place, figure, number, looks)
         else:
             place.set_visible(False)
+    # Below the panels: inside it would lie on curves, wherever it stood.
+    handles = {n: h for place in axes.flat for h, n in zip(*place.get_legend_handles_labels(), strict=True)}
+    names = [name for name in looks if name in handles]
+    canvas.legend(
+        [handles[name] for name in names], names, loc="outside lower center", ncols=3, fontsize=8.5, frameon=False
+    )
     return style.save(canvas, path)
 
 
-def _panel(axes: Axes, figure: Figure, number: int) -> None:
-    here = [s for s in figure.series if s.panel == number]
-    measured = [s for s in here if s.kind == "measured"]
-    colours = dict(zip(map(id, measured), COLOURS * 4, strict=False))
-    of_subject = {_subject(s): colours[id(s)] for s in reversed(measured)}
-    looks = iter(REFERENCES * 4)
-    for series in here:
-        if series.kind == "reference":
-            line, marker = next(looks)
-            few = len(series.x) < 20 and len(series.x) > 2
-            axes.plot(
-                series.x, series.y, color=of_subject.get(_subject(series), style.INK), lw=1.2, ls="" if few else line,
-                marker=marker if few else None, ms=4, mfc="white", label=series.name, zorder=3,
-            )  # fmt: skip
-        else:
-            colour = colours[id(series)]
-            axes.plot(series.x, series.y, color=colour, lw=1.4, label=series.name)
-            if series.spread:
-                low, high = ([y + side * s for y, s in zip(series.y, series.spread, strict=True)] for side in (-1, 1))
-                axes.fill_between(series.x, low, high, color=colour, alpha=0.18, lw=0)
+@dataclass(frozen=True)
+class Look:
+    """How the curves of one name are drawn, in all panels alike.
+
+    Attributes:
+        colour, line, marker: of them; '' for none. No two names of a figure share all three.
+    """
+
+    colour: str
+    line: Any = "-"
+    marker: str = ""
+
+
+def _looks(figure: Figure) -> dict[str, Look]:
+    """Measured curves differ in colour, references have the colour of their subject and differ in line or marker."""
+    measured = list(dict.fromkeys(s.name for s in figure.series if s.kind == "measured"))
+    looks = {name: Look(colour) for name, colour in zip(measured, COLOURS * 4, strict=False)}
+    of_subject = {_subject(name): looks[name].colour for name in reversed(measured)}
+    styles = iter(REFERENCES * 4)
+    for series in figure.series:
+        if series.name not in looks:
+            line, marker = next(styles)
+            few = 2 < len(series.x) < FEW
+            colour = of_subject.get(_subject(series.name), style.INK)
+            looks[series.name] = Look(colour, "", marker) if few else Look(colour, line)
+    return looks
+
+
+def _panel(axes: Axes, figure: Figure, number: int, looks: Mapping[str, Look]) -> None:
+    for series in (s for s in figure.series if s.panel == number):
+        look = looks[series.name]
+        above = 3 if series.kind == "reference" else 2
+        axes.plot(
+            series.x, series.y, color=look.colour, ls=look.line or "none", marker=look.marker or None, ms=5,
+            mfc="white", lw=1.2 if series.kind == "reference" else 1.6, label=series.name, zorder=above,
+        )  # fmt: skip
+        if series.spread:
+            low, high = ([y + side * s for y, s in zip(series.y, series.spread, strict=True)] for side in (-1, 1))
+            axes.fill_between(series.x, low, high, color=look.colour, alpha=0.18, lw=0)
+    style.dress(axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both")
     if figure.log_x if isinstance(figure.log_x, bool) else figure.log_x[number]:
         axes.set_xscale("log")
         places = sorted({x for s in figure.series if s.panel == number and s.kind == "measured" for x in s.x})
-        axes.set_xticks(places, [f"{x:,g}".replace(",", " ") for x in places])
+        if len(places) > MOST_PLACES:
+            places = style.log_ticks(places[0], places[-1])
+        axes.set_xticks(places, [style.number(x) for x in places])
         axes.minorticks_off()
-    style.dress(axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both")
-    axes.legend(fontsize=8, framealpha=0.85, edgecolor="none")
 
 
-def _subject(series: Series) -> str:
+def _subject(name: str) -> str:
     """What a curve and its reference have in common: 'cone' of 'cone, 2,000 particles' and of 'cone, at rest'."""
-    return series.name.split(", ", maxsplit=1)[0]
+    return name.split(", ", maxsplit=1)[0]
+
+
+def figure_of(record: Mapping[str, Any]) -> Figure | None:
+    """The figure whose curves a record keeps, so that it can be drawn again without measuring."""
+    from sim_engine.validation.result import Figure, Series
+
+    kept = record.get("figure")
+    if kept is None:
+        return None
+    series = [
+        Series(s["name"], tuple(s["x"]), tuple(s["y"]), s["kind"], s["panel"], tuple(s["spread"]))
+        for s in kept["series"]
+    ]
+    titles, x_labels, y_labels = (tuple(kept[name]) for name in ("titles", "x_labels", "y_labels"))
+    log_x = kept["log_x"] if isinstance(kept["log_x"], bool) else tuple(kept["log_x"])
+    return Figure(titles, x_labels, y_labels, tuple(series), log_x)
+
+
+def _curves(figure: Figure) -> dict[str, Any]:
+    """JSON-ready, with five digits."""
+
+    def short(value: Any) -> Any:
+        if isinstance(value, float):
+            return float(f"{value:.5g}")
+        return [short(one) for one in value] if isinstance(value, list | tuple) else value
+
+    kept = dataclasses.asdict(figure)
+    kept["series"] = [{name: short(value) for name, value in one.items()} for one in kept["series"]]
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in kept.items()}
 
 
 def case_record(case: Case, result: CaseResult, image: Path | None, fingerprint: str) -> dict[str, Any]:
@@ -155,6 +220,7 @@ def case_record(case: Case, result: CaseResult, image: Path | None, fingerprint:
         "about": case.about,
         "cpu_s": round(result.cpu_s, 1),
         "image": None if image is None else image.name,
+        "figure": None if result.figure is None else _curves(result.figure),
         "measurements": [m.as_json() for m in result.measurements],
     }
 
@@ -182,7 +248,10 @@ def write_page(
     """
     sorted_records = {name: records[name] for name in order if name in records}
     data = {"solver": fingerprint, "theta": theta, "cases": sorted_records}
-    (folder / DATA_NAME).write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = json.dumps(data, indent=1, ensure_ascii=False)
+    # Curves in a line each: a number a line would be tens of thousands.
+    text = re.sub(r"\[\s+([-+\d.eE,\s]+?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    (folder / DATA_NAME).write_text(text + "\n", encoding="utf-8")
     page = folder / PAGE_NAME
     page.write_text(page_text(sorted_records, theta, fingerprint), encoding="utf-8")
     return page

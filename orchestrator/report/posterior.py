@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from orchestrator.report import style
+from orchestrator.strategies.calibration.posterior import PosteriorFound, PosteriorSummary
 from sim_engine.space import Axis, Space
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 BINS = 18
 
 
-def posterior_lines(posterior: Mapping[str, Any], space: Space) -> list[str]:
+def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
     """What the pours determine of θ and what they don't, one sentence a line.
 
     Args:
@@ -27,18 +28,18 @@ def posterior_lines(posterior: Mapping[str, Any], space: Space) -> list[str]:
     known, unknown = [], []
     for axis in space.axes:
         words, searched = axis.name.replace("_", " "), _interval(axis.name, axis.lower, axis.upper)
-        if axis.name in posterior["open"]:
+        if axis.name in posterior.open:
             unknown.append(f"{words} ({searched})")
         else:
-            known.append(f"{words} {_interval(axis.name, *posterior['region'][axis.name])} (searched {searched})")
+            known.append(f"{words} {_interval(axis.name, *posterior.region[axis.name])} (searched {searched})")
     lines = []
     if known:
-        lines.append(f"{100 * posterior['level']:.0f} % of the θ that fit the pours have {', '.join(known)}")
+        lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
     if unknown:
         lines.append(
             f"the pours don't determine {', '.join(unknown)}: nearly all of what was searched fits them as well as θ*"
         )
-    return [*lines, *posterior["directions"]]
+    return [*lines, *posterior.directions]
 
 
 def _interval(name: str, low: float, high: float) -> str:
@@ -47,7 +48,7 @@ def _interval(name: str, low: float, high: float) -> str:
     return f"{first} … {style.display_value(name, high)}"
 
 
-def draw_posterior(path: Path, posterior: Mapping[str, Any], space: Space, theta: Mapping[str, float]) -> Path:
+def draw_posterior(path: Path, posterior: PosteriorFound, space: Space, theta: Mapping[str, float]) -> Path:
     """One histogram per searched parameter with its region, one cloud per pair, θ* marked; logarithmic axes as such.
 
     Args:
@@ -62,7 +63,7 @@ def draw_posterior(path: Path, posterior: Mapping[str, Any], space: Space, theta
     Raises:
         ValueError: there are no draws.
     """
-    draws = posterior["thetas"]
+    draws = posterior.thetas
     if not draws:
         raise ValueError("posterior figure: no draws of θ")
     axes, d = space.axes, space.dimension
@@ -94,16 +95,18 @@ def draw_posterior(path: Path, posterior: Mapping[str, Any], space: Space, theta
     return style.save(figure, path)
 
 
-def _histogram(panel: Axes, axis: Axis, posterior: Mapping[str, Any], theta: Mapping[str, float]) -> None:
+def _histogram(panel: Axes, axis: Axis, posterior: PosteriorFound, theta: Mapping[str, float]) -> None:
     steps = np.geomspace if axis.scale == "log" else np.linspace
-    values = [draw[axis.name] for draw in posterior["thetas"]]
+    values = [draw[axis.name] for draw in posterior.thetas]
     panel.hist(values, bins=steps(axis.lower, axis.upper, BINS + 1).tolist(), color=style.GREY)
-    name = f"{100 * posterior['level']:.0f} % of the draws"
-    panel.axvspan(*posterior["region"][axis.name], color=style.MEASURED, alpha=0.18, linewidth=0.0, label=name)
+    name = f"{100 * posterior.level:.0f} % of the draws"
+    panel.axvspan(*posterior.region[axis.name], color=style.MEASURED, alpha=0.18, linewidth=0.0, label=name)
     panel.axvline(theta[axis.name], color=style.BEST, linewidth=1.8, label="θ*")
 
 
-def _cloud(panel: Axes, across: Axis, up: Axis, draws: list[Mapping[str, float]], theta: Mapping[str, float]) -> None:
+def _cloud(
+    panel: Axes, across: Axis, up: Axis, draws: Sequence[Mapping[str, float]], theta: Mapping[str, float]
+) -> None:
     places = [[draw[axis.name] for draw in draws] for axis in (across, up)]
     panel.plot(*places, ".", color=style.MEASURED, markersize=4, alpha=0.45, label="a draw")
     panel.plot(

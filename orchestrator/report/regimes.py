@@ -10,7 +10,8 @@ from typing import Any
 
 from orchestrator.plan import CalibrationPlan, CampaignPlan
 from orchestrator.report import style
-from orchestrator.report.results import Results, calibration_of, deployments_of
+from orchestrator.report.results import deployments_of, theta_of
+from orchestrator.results import Results
 from sim_engine.action import Action
 from sim_engine.fill import spacing
 from sim_engine.regimes import NotCovered, Regimes, regimes
@@ -107,13 +108,13 @@ def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list
     Raises:
         ValueError, OSError: as `regimes_of`.
     """
-    calibration = calibration_of(results)
-    particles = plan.parameters.particles if calibration is None else calibration["theta"]["particles"]
+    calibration = theta_of(results)
+    particles = (plan.parameters if calibration is None else calibration.theta).particles
     scenes = {} if plan.deployment is None else {scene.name: scene for scene in plan.deployment.scenes}
     found = {}
     for name, result in deployments_of(results).items():
-        if name in scenes and result.get("action_si") is not None:
-            action = scenes[name].action(dict(result["action_si"]))
+        if name in scenes and result.recommended is not None:
+            action = scenes[name].action(dict(result.recommended.action_si))
             found[name] = list(regimes_of(scenes[name], action, particles).not_covered)
     return found
 

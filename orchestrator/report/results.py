@@ -1,12 +1,11 @@
-"""Reads the stages' results (as strategies give them and the journal keeps them) into what figures and tables need.
+"""From what the stages learnt to what figures and tables need.
 
-A stage is known by what its result holds, not by its name, so that a run of any composition can be reported.
+A stage is known by the kind of its result, not by its name, so that a run of any composition can be reported.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,133 +13,121 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries
 from orchestrator.report.maps import SurrogatePicture
 from orchestrator.report.names import receiver_name
-from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
+from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
+from orchestrator.results import Results
+from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.evaluation import Scores
+from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.display import DisplayedMap
+from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.repeats import Foreseen
 
-Result = Mapping[str, Any]
-Results = Mapping[str, Result]
-"""Stage name → what its strategy's `result()` gave."""
+L = TypeVar("L", bound=Learnt)
 
 SPLITS = {"train": "training pours", "test": "test pours", "transfer": "another receiver"}
 """Names of the sets of weighed pours, in the order of reports."""
 
 
-def calibration_of(results: Results) -> Result | None:
-    """The result of the calibration stage, if it found a θ*."""
-    return next((r for r in results.values() if r.get("theta") is not None and "trials" in r), None)
+def all_of(results: Results, kind: type[L]) -> list[L]:
+    """The results of one kind, in the stages' order."""
+    return [result for result in results.values() if isinstance(result, kind)]
 
 
-def evaluation_of(results: Results) -> Result | None:
-    """The scores of θ* and its rivals on weighed pours: all evaluation stages taken together."""
-    found = [r for r in results.values() if "discrepancy" in r and "random_median" in r]
-    if not found:
-        return None
-    scores: dict[str, dict[str, float | None]] = {}
-    medians: dict[str, float | None] = {}
-    for one in found:
-        for label, by_split in one["discrepancy"].items():
-            scores.setdefault(label, {}).update(by_split)
-        medians.update(one["random_median"])
-    return {
-        "discrepancy": scores,
-        "random_median": medians,
-        "pairs": [pair for one in found for pair in one.get("pairs", ())],
-        "simulations": sum(int(one.get("simulations", 0)) for one in found),
-    }
+def calibration_of(results: Results) -> Calibrated | None:
+    """What the calibration learnt, if it found a θ*."""
+    return next((found for found in all_of(results, Calibrated) if found.found is not None), None)
 
 
-def deployments_of(results: Results) -> dict[str, Result]:
-    """Results of the deployment stages by scene."""
-    return {str(r["scene"]): r for r in results.values() if "strategy" in r and "scene" in r}
+def theta_of(results: Results) -> CalibratedTheta | None:
+    """θ*, if one was found."""
+    calibration = calibration_of(results)
+    return None if calibration is None else calibration.found
 
 
-def predictions_of(results: Results) -> dict[str, Mapping[str, Any]]:
-    """What fresh seeds of the recommended actions came to, by scene: quantity → mean, deviation, count."""
-    return {str(r["prediction_of"]): r["over_seeds"] for r in results.values() if "prediction_of" in r}
+def evaluation_of(results: Results) -> Scores | None:
+    """The scores of θ* and its rivals on weighed pours."""
+    return next(iter(all_of(results, Scores)), None)
 
 
-def calibrated_label(evaluation: Result) -> str | None:
+def deployments_of(results: Results) -> dict[str, Deployed]:
+    """What the deployments learnt, by scene."""
+    return {result.scene: result for result in all_of(results, Deployed)}
+
+
+def predictions_of(results: Results) -> dict[str, Foreseen]:
+    """What fresh seeds of the recommended actions came to, by scene."""
+    return {result.scene: result for result in all_of(results, Foreseen)}
+
+
+def calibrated_label(evaluation: Scores) -> str | None:
     """Under which label an evaluation scored θ*: the one that isn't random."""
-    return next((label for label in evaluation["discrepancy"] if not label.startswith("random ")), None)
+    return next((label for label in evaluation.discrepancy if not label.startswith("random ")), None)
 
 
-def discrepancy_groups(
-    evaluation: Result, baselines: Mapping[str, Mapping[str, float | None]] | None = None
-) -> list[DiscrepancyGroup]:
-    """Scores by set of pours, for `draw_discrepancy`.
-
-    Args:
-        evaluation: as `evaluation_of` gives it.
-        baselines: 'mean_predictor' and 'regression' by split, where they were computed.
-    """
+def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
+    """Scores by set of pours, for `draw_discrepancy`."""
     label = calibrated_label(evaluation)
     if label is None:
         return []
     groups = []
     for split, name in SPLITS.items():
-        own = evaluation["discrepancy"][label].get(split)
+        own = evaluation.discrepancy[label].get(split)
         if own is None:
             continue
-        rivals = [
-            scores[split]
-            for other, scores in evaluation["discrepancy"].items()
-            if other.startswith("random ") and scores.get(split) is not None
-        ]
-        rival = (baselines or {}).get(split, {})
+        rivals = [scores.get(split) for other, scores in evaluation.discrepancy.items() if other.startswith("random ")]
         groups.append(
             DiscrepancyGroup(
                 name,
-                sum(pair["split"] == split and pair["theta"] == label for pair in evaluation["pairs"]),
-                float(own),
-                [float(value) for value in rivals if value is not None],
-                rival.get("mean_predictor"),
-                rival.get("regression"),
+                sum(pair.split == split and pair.theta == label for pair in evaluation.pairs),
+                own,
+                [value for value in rivals if value is not None],
+                evaluation.mean_predictor.get(split),
+                evaluation.regression.get(split),
             )
         )
     return groups
 
 
-def calibration_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture | None:
+def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePicture | None:
     """The discrepancy over θ; None where the plan calibrates nothing or no trial told anything."""
     if plan.calibration is None:
         return None
-    trials = [t for t in result["trials"] if t["discrepancy"] is not None]
-    mean, deviation = _grids(result, DISCREPANCY)
-    if not trials and mean is None:
+    known = [(trial.theta, trial.discrepancy) for trial in result.trials if trial.discrepancy is not None]
+    shown = None if result.found is None else result.found.map
+    if not known and shown is None:
         return None
     return SurrogatePicture(
         title=f"Discrepancy over θ: {plan.calibration.scene.receiver.name}",
         cost=DISCREPANCY.label,
         space=plan.calibration.parameters,
-        points=[t["theta"] for t in trials],
-        costs=[DISCREPANCY.factor * t["discrepancy"] for t in trials],
-        best=result.get("theta"),
-        mean=mean,
-        deviation=deviation,
-        **_cut(result),
+        points=[theta for theta, _ in known],
+        costs=[DISCREPANCY.factor * discrepancy for _, discrepancy in known],
+        best=None if result.found is None else result.found.theta.model_dump(),
+        largest=DISCREPANCY.factor,
+        **_surrogate(shown, DISCREPANCY),
     )
 
 
-def deployment_picture(plan: CampaignPlan, result: Result) -> SurrogatePicture | None:
+def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture | None:
     """The loss over actions with the pours numbered; None before anything was learnt."""
     if plan.deployment is None:
         return None
     unit = deployment_unit(plan.deployment)
-    pours = weighed(result)
-    mean, deviation = _grids(result, unit)
-    if not pours and mean is None:
+    known = [(pour, pour.loss) for pour in result.weighed if pour.loss is not None]
+    if not known and result.map is None:
         return None
     return SurrogatePicture(
-        title=f"Loss over actions: {receiver_name(plan, result['scene'])} ({result['strategy']})",
+        title=f"Loss over actions: {receiver_name(plan, result.scene)} ({result.strategy})",
         cost=unit.label,
         space=plan.deployment.actions,
-        points=[p["action_si"] for p in pours],
-        costs=[unit.factor * p["loss"] for p in pours],
-        best=result.get("action_si"),
+        points=[pour.action_si for pour, _ in known],
+        costs=[unit.factor * loss for _, loss in known],
+        best=None if result.recommended is None else result.recommended.action_si,
         best_name="best action",
-        mean=mean,
-        deviation=deviation,
-        numbers=[int(p["number"]) for p in pours],
-        **_cut(result),
+        numbers=[pour.number for pour, _ in known],
+        simulated=[one.action_si for one in result.simulated],
+        largest=unit.factor * largest_loss(plan.deployment),
+        **_surrogate(result.map, unit),
     )
 
 
@@ -148,46 +135,29 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
     """Pours by receiver, for `draw_spillage`; refused ones (nothing was poured) are left out."""
     series = []
     for scene, result in deployments_of(results).items():
-        pours = [p for p in result["pours"] if p["status"] in ("weighed", "failed")]
+        pours = [pour for pour in result.pours if pour.status in ("weighed", "failed")]
         if not pours:
             continue
-        series.append(
-            PourSeries(
-                f"{receiver_name(plan, scene)} ({result['strategy']})",
-                [
-                    unit.factor * p["loss"] if p["status"] == "weighed" and p["loss"] is not None else None
-                    for p in pours
-                ],
-                [
-                    None
-                    if p["predicted"] is None
-                    else (
-                        unit.factor * at_least_nothing(p["predicted"]),
-                        unit.factor * (p["predicted_deviation"] or 0.0),
-                    )
-                    for p in pours
-                ],
-            )
-        )
+        losses = [
+            unit.factor * pour.loss if pour.status == "weighed" and pour.loss is not None else None for pour in pours
+        ]
+        predictions = [
+            None
+            if pour.predicted is None
+            else (unit.factor * at_least_nothing(pour.predicted), unit.factor * (pour.predicted_deviation or 0.0))
+            for pour in pours
+        ]
+        series.append(PourSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))
     return series
 
 
-def weighed(result: Result) -> Sequence[Result]:
-    """The pours of a deployment that gave a loss."""
-    return [p for p in result["pours"] if p["status"] == "weighed" and p["loss"] is not None]
-
-
-def _grids(result: Result, unit: LossUnit) -> tuple[Any, Any]:
-    grids = result.get("map")
-    if grids is None:
-        return None, None
-    mean = np.maximum(np.asarray(grids["mean"], float), 0.0)  # see `at_least_nothing`
-    return unit.factor * mean, unit.factor * np.asarray(grids["deviation"], float)
-
-
-def _cut(result: Result) -> dict[str, Any]:
-    """Which axes a result's map is over, and where the others were held."""
-    grids = result.get("map")
-    if grids is None or "over" not in grids:  # a map of all axes, as the first versions wrote it
+def _surrogate(shown: DisplayedMap | None, unit: LossUnit) -> dict[str, Any]:
+    """The map of a picture: which axes it is over, and where the others were held."""
+    if shown is None:
         return {}
-    return {"over": tuple(grids["over"]), "held": dict(grids["held"])}
+    return {
+        "mean": unit.factor * np.maximum(np.asarray(shown.mean, float), 0.0),  # see `at_least_nothing`
+        "deviation": unit.factor * np.asarray(shown.deviation, float),
+        "over": shown.over,
+        "held": shown.held,
+    }

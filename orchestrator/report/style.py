@@ -152,7 +152,11 @@ def frame(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
         handle.set_minor_locator(NullLocator())
     else:
         slack = 1e-9 * (high - low)
-        places = [t for t in MaxNLocator(6).tick_values(low, high) if low - slack <= t <= high + slack]
+        places = [
+            t
+            for t in MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+            if low - slack <= t <= high + slack
+        ]
         limits(low - MARGIN * (high - low), high + MARGIN * (high - low))
     handle.set_major_locator(FixedLocator(places))
     handle.set_major_formatter(FuncFormatter(lambda value, _: number(value)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from orchestrator.plan import CampaignPlan, DeploymentPlan
@@ -74,6 +75,13 @@ def deployment_unit(plan: DeploymentPlan) -> LossUnit:
         return loss_unit(plan.loss)
     weights = [(part.weight, part.name.replace("_", " ")) for part in plan.objectives.parts]
     return LossUnit(f"{' + '.join(n if w == 1.0 else f'{w:g} × {n}' for w, n in weights)} [%]", "%", 100.0)
+
+
+def largest_loss(plan: DeploymentPlan) -> float:
+    """What a deployment's loss can be at most, in its own unit; infinite where that depends on the load."""
+    if plan.objectives is not None or plan.loss.name in ("grams", "particles"):
+        return math.inf
+    return max(plan.loss.retained_weight, 1.0) if plan.loss.name == "spilled_and_retained" else 1.0
 
 
 DISCREPANCY = LossUnit("|measured − simulated| spillage [%]", "%", 100.0)

@@ -1,12 +1,33 @@
-"""Actions and surrogate maps as results show them: units in the keys, JSON-ready."""
+"""Actions and surrogate maps as results show them: units in the keys."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 from actors.optimizer.core.problem import SurrogateMap
+from orchestrator.strategies.learnt import Part
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.space import Space
+
+
+class DisplayedMap(Part):
+    """A surrogate over two axes: row i of `mean` and `deviation` is the second axis' i-th value."""
+
+    over: tuple[str, ...]
+    """Names of the two axes."""
+
+    held: dict[str, float]
+    """Values [SI] of the others, at which the surrogate was cut."""
+
+    axes: dict[str, tuple[float, ...]]
+    """Values [SI] along each of the two."""
+
+    mean: tuple[tuple[float, ...], ...]
+    """Posterior mean, in the cost's own unit."""
+
+    deviation: tuple[tuple[float, ...], ...]
+    """Posterior standard deviation, in the cost's own unit."""
+
 
 _SUFFIX = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}
 
@@ -20,20 +41,17 @@ def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | No
     return shown
 
 
-def displayed_map(surrogate: SurrogateMap | None, space: Space) -> dict[str, object] | None:
-    """A surrogate over two axes, with their values [SI]: row i of mean and deviation is the second axis' i-th value.
-
-    'over' names the two axes in their order; 'held' has the values [SI] of the others, at which the surrogate was cut.
-    """
+def displayed_map(surrogate: SurrogateMap | None, space: Space) -> DisplayedMap | None:
+    """A surrogate as results show it; None without one."""
     if surrogate is None:
         return None
     size = len(surrogate.mean)
     places = [i / (size - 1) if size > 1 else 0.5 for i in range(size)]
     plane = surrogate.plane(space)
-    return {
-        "over": list(plane.names),
-        "held": surrogate.held(space),
-        "axes": {axis.name: [axis.decode(u) for u in places] for axis in plane.axes},
-        "mean": [list(row) for row in surrogate.mean],
-        "deviation": [list(row) for row in surrogate.deviation],
-    }
+    return DisplayedMap(
+        over=plane.names,
+        held=surrogate.held(space),
+        axes={axis.name: tuple(axis.decode(u) for u in places) for axis in plane.axes},
+        mean=surrogate.mean,
+        deviation=surrogate.deviation,
+    )

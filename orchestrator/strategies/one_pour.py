@@ -2,12 +2,46 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
 from sim_engine.task import Scene
+
+
+class WeighedPour(Part):
+    """What the balance said of a pour."""
+
+    loaded: float
+    """Mass in the pourer before [kg]."""
+
+    spilled: float
+    """Mass beside the receiver [kg]."""
+
+    retained: float
+    """Mass left in the pourer [kg]."""
+
+    poured_fraction: float
+    """Share of the load that left the pourer."""
+
+    spillage: float | None
+    """r = spilled / poured; None below 5 % poured, where it is undefined."""
+
+
+class OnePoured(Learnt):
+    """A single pour that a person has chosen."""
+
+    kind: Literal["pour"] = "pour"
+
+    weighed: WeighedPour | None = None
+    """None before it was weighed, or where it failed."""
+
+    failed: str | None = None
+    """Why nothing was weighed."""
 
 
 class OnePour:
@@ -57,18 +91,19 @@ class OnePour:
         """Pours done, pours in all."""
         return int(self.finished), 1
 
-    def result(self) -> dict[str, object]:
-        """Masses [kg], fractions, and r = spilled / poured; or why there are none."""
+    def result(self) -> OnePoured:
+        """What was weighed, or why there is nothing."""
         match self._outcome:
             case PourMeasurement() as measured:
                 fractions = measured.fractions
-                return {
-                    "loaded": measured.loaded,
-                    "spilled": measured.spilled,
-                    "retained": measured.retained,
-                    "poured_fraction": fractions.poured,
-                    "spillage": normalised_spillage(fractions),
-                }
+                weighed = WeighedPour(
+                    loaded=measured.loaded,
+                    spilled=measured.spilled,
+                    retained=measured.retained,
+                    poured_fraction=fractions.poured,
+                    spillage=normalised_spillage(fractions),
+                )
+                return OnePoured(weighed=weighed)
             case Failed(kind, reason):
-                return {"failed": f"{kind}: {reason}"}
-        return {}
+                return OnePoured(failed=f"{kind}: {reason}")
+        return OnePoured()

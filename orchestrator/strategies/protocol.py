@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol, runtime_checkable
 
 from orchestrator.requests import Outcome, Request, Slots
+from orchestrator.strategies.learnt import Learnt
 
 
 @runtime_checkable
@@ -36,6 +37,6 @@ class Strategy(Protocol):
         """Steps done and steps in all, for a progress bar."""
         ...
 
-    def result(self) -> dict[str, object]:
-        """What was learnt so far, JSON-ready: shown live, kept in the journal and in the summary."""
+    def result(self) -> Learnt:
+        """What was learnt so far: shown live; at the end kept in the journal, and reported."""
         ...

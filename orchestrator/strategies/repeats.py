@@ -4,15 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourOutcome
 from sim_engine.spread import Spread, spreads
 from sim_engine.task import PoseError
+
+
+class Foreseen(Learnt):
+    """What fresh seeds of one action came to.
+
+    The loss counts cups that touched because of an error; the fractions, of which nothing is known then, do not.
+    """
+
+    kind: Literal["prediction"] = "prediction"
+
+    scene: str
+    """Name of the scene."""
+
+    simulations: int
+    """Those that were answered."""
+
+    simulations_lost: int
+    """Those of them that could not be used."""
+
+    thetas: int
+    """Different θ of a posterior that the seeds took turns with; 0 where θ is one."""
+
+    touching: int
+    """Simulations whose cups touched because of an error."""
+
+    over_seeds: dict[str, Spread]
+    """Mean and standard deviation of every fraction, of 'spillage' r = spilled / poured, and of the 'loss'."""
 
 
 class RepeatedSimulation:
@@ -99,20 +128,17 @@ class RepeatedSimulation:
         answered = len(self._losses) + self._lost
         return answered, answered + len(self._open) + len(self._unissued)
 
-    def result(self) -> dict[str, object]:
-        """Mean and standard deviation over the seeds: of every fraction, of r = spilled / poured, and of the loss.
-
-        The loss counts cups that touched because of an error; the fractions, of which nothing is known then, do not.
-        """
+    def result(self) -> Foreseen:
+        """Mean and standard deviation over the seeds answered so far."""
         over_seeds = spreads(self._outcomes)
         loss = Spread.of(self._losses)
         if loss is not None:
             over_seeds["loss"] = loss
-        return {
-            "prediction_of": self._costing.scene.name,
-            "simulations": self.progress()[0],
-            "simulations_lost": self._lost,
-            "thetas": self._thetas,
-            "touching": self._touching,
-            "over_seeds": {name: spread.as_json() for name, spread in over_seeds.items()},
-        }
+        return Foreseen(
+            scene=self._costing.scene.name,
+            simulations=self.progress()[0],
+            simulations_lost=self._lost,
+            thetas=self._thetas,
+            touching=self._touching,
+            over_seeds=over_seeds,
+        )

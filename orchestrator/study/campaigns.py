@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from orchestrator.journal import JOURNAL_NAME
 from orchestrator.plan import CampaignPlan, OutputPlan, RecordedPour, RecordSet
+from orchestrator.results import Results, learnt_by
 from orchestrator.stages import (
     CALIBRATION,
     EVALUATION,
     POURS,
-    Results,
     StageDefinition,
+    calibrated_theta,
     calibration_stages,
     deployment_stages,
     measured_pours,
@@ -25,20 +25,21 @@ from orchestrator.stages import (
     with_posterior,
 )
 from orchestrator.strategies.calibration.c1 import C1Settings
-from orchestrator.strategies.calibration.design import DesignedPours, draw_allowed, stratified
+from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, draw_allowed, stratified
 from orchestrator.strategies.calibration.prior import region_of
 from orchestrator.strategies.calibration.scorecard import Scorecard
 from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.study.cells import FINAL, GRID, Cell
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.record import cell_record
-from orchestrator.study.strategies import AnsweredByTable, FinalPour, SimulatedTable
+from orchestrator.study.strategies import AnsweredByTable, FinalPour, SimulatedTable, Tabled
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 
-Load = Callable[[str], Mapping[str, Any]]
-"""Stage results of a finished cell, by its id."""
+Load = Callable[[str], Results]
+"""What the stages of a finished cell learnt, by its id."""
 
 
 def campaign_of(
@@ -125,18 +126,10 @@ def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, di
     calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
     assert calibration is not None
     mass, pours = calibration.scene.liquid.mass, []
-    for row in load(cell.needs[0])[POURS]["pours"]:
-        if "action_si" in row:  # a pour that was given up has none
-            poured = row["poured"] * mass
-            pours.append(
-                RecordedPour(
-                    calibration.scene.action(row["action_si"]),
-                    poured,
-                    (row["spillage"] or 0.0) * poured,
-                    mass - poured,
-                    row["split"],
-                )
-            )
+    for pour in learnt_by(load(cell.needs[0]), POURS, DesignPoured).measured:
+        poured = pour.poured * mass
+        action, spilled = calibration.scene.action(dict(pour.action_si)), (pour.spillage or 0.0) * poured
+        pours.append(RecordedPour(action, poured, spilled, mass - poured, pour.split))
     records = RecordSet(calibration.scene, tuple(pours), directory.parent / cell.needs[0] / JOURNAL_NAME)
     return replace(plan, calibration=replace(calibration, records=records))
 
@@ -149,7 +142,7 @@ def _calibration(
     stages = calibration_stages(plan.calibration)
     if cell.arm != "C1":
         return plan, stages
-    rows = load(GRID)[GRID]["rows"]
+    rows = learnt_by(load(GRID), GRID, Tabled).rows
 
     def answered(stage: StageDefinition) -> StageDefinition:
         def build(results: Results, seed: int) -> Strategy:
@@ -174,7 +167,7 @@ def _deployment(
     for calibration in calibrations:
         found = load(calibration)
         deployment = with_posterior(deployment, found)
-        plan = replace(plan, parameters=SimulationParameters.model_validate(found[CALIBRATION]["theta"]))
+        plan = replace(plan, parameters=calibrated_theta(found).theta)
     plan = replace(plan, calibration=None, deployment=deployment)
     return plan, deployment_stages(plan, deployment)
 
@@ -184,8 +177,8 @@ def _final(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load) -> tupl
     learnt, *calibrations = cell.needs
     plan, stages = _deployment(study, cell, plan, calibrations, load)
     assert plan.deployment is not None
-    values = load(learnt)[stages[0].name].get("action_si")
+    recommended = learnt_by(load(learnt), stages[0].name, Deployed).recommended
     scene = plan.deployment.scenes[0]
-    action = None if values is None else scene.action(values)
+    action = None if recommended is None else scene.action(dict(recommended.action_si))
     costing = Costing.of(plan.deployment, scene, plan.parameters)
     return plan, [StageDefinition(FINAL, lambda results, seed: FinalPour(costing, action, seed), pours=True)]

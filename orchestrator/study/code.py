@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from actors.cluster.versions import sources, versions
 
-CODE = "code"
-"""Key of a cell's result; results from before versions were noted have none."""
+if TYPE_CHECKING:
+    from orchestrator.study.folder import CellResult
 
 _ROOT = Path(__file__).parents[2]
 
@@ -30,48 +31,35 @@ def code_now() -> dict[str, str]:
     }
 
 
-def made_by(results: Mapping[str, Mapping[str, Any]]) -> dict[tuple[tuple[str, str], ...], int]:
-    """How many cells each code has made; the empty code stands for cells from before versions were noted."""
-    count: dict[tuple[tuple[str, str], ...], int] = {}
-    for result in results.values():
-        code = tuple(result.get(CODE, {}).items())
-        count[code] = count.get(code, 0) + 1
-    return count
+def made_by(results: Mapping[str, CellResult]) -> Counter[tuple[tuple[str, str], ...]]:
+    """How many cells each code has made."""
+    return Counter(tuple(result.code.items()) for result in results.values())
 
 
-def warning(results: Mapping[str, Mapping[str, Any]]) -> str | None:
+def warning(results: Mapping[str, CellResult]) -> str | None:
     """What to say where a study goes on with other code than its finished cells were made with; None: nothing.
 
     Args:
         results: of the finished cells.
     """
-    now, other, unknown, parts = code_now(), 0, 0, dict[str, None]()
+    now, other, parts = code_now(), 0, dict[str, None]()
     for code, count in made_by(results).items():
-        if not code:
-            unknown += count
-        elif (was := dict(code)) != now:
+        if (was := dict(code)) != now:
             other += count
             parts |= dict.fromkeys(name for name in now if was.get(name) != now[name])
-    said = []
-    if other:
-        said.append(f"{other} finished by other code ({', '.join(parts)}: changed since)")
-    if unknown:
-        said.append(f"{unknown} finished before versions were noted")
-    if not said:
+    if not other:
         return None
     return (
-        f"warning: of this study's cells {', '.join(said)}; those that follow may not compare with them. To have "
-        "all of one code, give the study another name"
+        f"warning: of this study's cells {other} finished by other code ({', '.join(parts)}: changed since); those "
+        "that follow may not compare with them. To have all of one code, give the study another name"
     )
 
 
-def told(results: Mapping[str, Mapping[str, Any]]) -> str:
+def told(results: Mapping[str, CellResult]) -> str:
     """For the page: how many codes the cells have, and which."""
     count = made_by(results)
     if not count:
         return "Code: no cell is finished."
-    texts = []
-    for code, cells in sorted(count.items(), key=lambda item: -item[1]):
-        what = ", ".join(f"{name} {value}" for name, value in code) if code else "before versions were noted"
-        texts.append(f"{cells} of {what}")
-    return f"Code: {len(count)} different for {sum(count.values())} cells: {'; '.join(texts)}."
+    listed = [(cells, ", ".join(f"{name} {value}" for name, value in code)) for code, cells in count.most_common()]
+    texts = [f"{cells} of {parts}" for cells, parts in listed]
+    return f"Code: {len(count)} different for {count.total()} cells: {'; '.join(texts)}."

@@ -10,8 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from orchestrator.codec import digest, first_difference
+from pydantic import SerializeAsAny, field_validator
+
+from orchestrator.codec import digest, first_difference, from_json, to_json
 from orchestrator.errors import RunError
+from orchestrator.results import decode_result
+from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.study.cells import Cell
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 
@@ -32,24 +36,53 @@ def is_finished(folder: Path, cell: str) -> bool:
     return (run_folder(folder, cell) / RESULT).is_file()
 
 
-def read_result(folder: Path, cell: str) -> dict[str, Any]:
-    """What came of a finished cell: `results` by stage, `simulations`, `pours`, `cpu_s`, `seconds`, `expected`,
-    `code`.
+class CellResult(Part):
+    """What came of a finished cell."""
+
+    results: dict[str, SerializeAsAny[Learnt]]
+    """What each stage learnt, in order."""
+
+    simulations: int
+    """Finished ones, failed ones included."""
+
+    pours: int
+    """Finished ones, failed ones included."""
+
+    cpu_s: float
+    """CPU seconds of all simulations and suggestions."""
+
+    seconds: float
+    """Wall time."""
+
+    expected: tuple[tuple[int, float], ...]
+    """C4: simulations asked for until a θ was chosen, and the mean |Δ| expected of it."""
+
+    code: dict[str, str]
+    """Digests of what decides its numbers."""
+
+    @field_validator("results", mode="before")
+    @classmethod
+    def _by_kind(cls, value: Any) -> Any:
+        return {name: one if isinstance(one, Learnt) else decode_result(one) for name, one in value.items()}
+
+
+def read_result(folder: Path, cell: str) -> CellResult:
+    """What came of a finished cell.
 
     Raises:
         StudyError: it isn't finished, or its file is damaged.
     """
     path = run_folder(folder, cell) / RESULT
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
+        return CellResult.model_validate(from_json(json.loads(path.read_text(encoding="utf-8"))))
+    except (OSError, ValueError, RunError) as error:
         raise StudyError(f"{path}: can't be read ({error}); delete it, and the study makes it again") from None
 
 
-def write_result(folder: Path, cell: str, data: dict[str, Any]) -> None:
+def write_result(folder: Path, cell: str, result: CellResult) -> None:
     """Keep what came of a cell: all of it or nothing, whenever the process dies."""
     path = run_folder(folder, cell) / RESULT
-    write_whole(path, json.dumps(data, ensure_ascii=False))
+    write_whole(path, json.dumps(to_json(result.model_dump()), ensure_ascii=False))
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -62,7 +95,7 @@ def write_whole(path: Path, text: str) -> None:
     part.replace(path)
 
 
-def finished_results(folder: Path, cells: tuple[Cell, ...]) -> dict[str, dict[str, Any]]:
+def finished_results(folder: Path, cells: tuple[Cell, ...]) -> dict[str, CellResult]:
     """What came of all cells that are finished."""
     return {cell.id: read_result(folder, cell.id) for cell in cells if is_finished(folder, cell.id)}
 

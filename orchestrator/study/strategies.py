@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Literal
 
 from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.one_pour import OnePour
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.seeds import SeedStream
@@ -20,6 +21,54 @@ from sim_engine.outcome import PourOutcome
 Key = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, float | None], ...]]
 
 
+class TableRow(Part):
+    """One simulation of a table."""
+
+    theta: SimulationParameters
+    action: dict[str, float | None]
+    """All dimensions [SI]."""
+
+    fractions: tuple[float, float, float, float] | None = None
+    """Received, spilled, retained, in flight; None where it was lost."""
+
+    particles: int = 0
+    lost: str = ""
+    """Why there are no fractions."""
+
+
+class Tabled(Learnt):
+    """Simulations that the repetitions of a study share."""
+
+    kind: Literal["table"] = "table"
+
+    simulations: int
+    """Those that were answered."""
+
+    rows: tuple[TableRow, ...]
+    """All of them, at the end."""
+
+
+class FinalPoured(Learnt):
+    """A pour of what a deployment recommends, with a seed that took no part in the choice."""
+
+    kind: Literal["final"] = "final"
+
+    action_si: dict[str, float | None] | None
+    """All dimensions [SI]; None where nothing was recommended."""
+
+    loss: float
+    """In its own unit; the worst where nothing was weighed."""
+
+    spillage: float
+    """r = spilled / poured; 1 where nothing was weighed."""
+
+    made: bool
+    """Whether it was poured and weighed."""
+
+    reason: str
+    """Why it was not, or hardly poured anything."""
+
+
 class SimulatedTable:
     """Simulate every θ at every action once. An action has the same seed under every θ, as in C1."""
 
@@ -28,7 +77,7 @@ class SimulatedTable:
     ) -> None:
         seeds = SeedStream(seed, "table")
         each = [(action, seeds.next()) for action in actions]
-        self._rows: list[dict[str, object]] = []
+        self._rows: list[TableRow] = []
         self._total = len(actions) * len(thetas)
         self._unissued = deque(Simulate(scene, action, theta, s, "table") for theta in thetas for action, s in each)
         self._open: list[Simulate] = []
@@ -50,28 +99,28 @@ class SimulatedTable:
         if not isinstance(request, Simulate) or request not in self._open:
             raise ValueError(f"this simulation was not asked for: {request}")
         self._open.remove(request)
-        row: dict[str, object] = {"theta": request.parameters.model_dump(), "action": request.action.values()}
+        theta, action = request.parameters, request.action.values()
         match outcome:
             case Simulated(result) if result.invalid is None and is_sound(result.fractions):
-                row["fractions"] = [result.received, result.spilled, result.retained, result.in_flight]
-                row["particles"] = result.particles
+                fractions = (result.received, result.spilled, result.retained, result.in_flight)
+                self._rows.append(TableRow(theta=theta, action=action, fractions=fractions, particles=result.particles))
             case _:
-                row["lost"] = getattr(outcome, "reason", "") or "invalid outcome"
-        self._rows.append(row)
+                lost = getattr(outcome, "reason", "") or "invalid outcome"
+                self._rows.append(TableRow(theta=theta, action=action, lost=lost))
 
     def progress(self) -> tuple[int, int]:
         """Simulations answered, simulations in all."""
         return len(self._rows), self._total
 
-    def result(self) -> dict[str, object]:
+    def result(self) -> Tabled:
         """One row for each simulation, once all are there: watchers are told how many until then."""
-        return {"simulations": len(self._rows), "rows": list(self._rows) if self.finished else []}
+        return Tabled(simulations=len(self._rows), rows=tuple(self._rows) if self.finished else ())
 
 
 class AnsweredByTable:
     """A strategy whose simulations were made beforehand: only its other requests reach the laboratory."""
 
-    def __init__(self, inner: Strategy, rows: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, inner: Strategy, rows: Sequence[TableRow]) -> None:
         """Take over.
 
         Args:
@@ -79,7 +128,7 @@ class AnsweredByTable:
             rows: of a `SimulatedTable`.
         """
         self._inner = inner
-        self._known = {_key(row["theta"], row["action"]): row for row in rows}
+        self._known = {_key(row.theta, row.action): row for row in rows}
 
     @property
     def finished(self) -> bool:
@@ -112,17 +161,17 @@ class AnsweredByTable:
         """The strategy's."""
         return self._inner.progress()
 
-    def result(self) -> dict[str, object]:
+    def result(self) -> Learnt:
         """The strategy's."""
         return self._inner.result()
 
     def _answer(self, request: Simulate) -> Outcome:
-        row = self._known.get(_key(request.parameters.model_dump(), request.action.values()))
+        row = self._known.get(_key(request.parameters, request.action.values()))
         if row is None:
             raise ValueError(f"the table has no simulation of {request.parameters} at {request.action}")
-        if "fractions" not in row:
-            return Failed("simulation", str(row["lost"]))
-        received, spilled, retained, in_flight = row["fractions"]
+        if row.fractions is None:
+            return Failed("simulation", row.lost)
+        received, spilled, retained, in_flight = row.fractions
         return Simulated(
             PourOutcome(
                 received=received,
@@ -130,7 +179,7 @@ class AnsweredByTable:
                 retained=retained,
                 in_flight=in_flight,
                 escaped=0.0,
-                particles=row["particles"],
+                particles=row.particles,
                 spacing=0.0,
                 density_error=0.0,
                 simulated_time=0.0,
@@ -161,13 +210,13 @@ class FinalPour:
         self._costing = costing
         self._action = action
         self._pour = None if action is None else OnePour(costing.scene, action, seed)
-        self._row: dict[str, object] | None = None if action is not None else self._lost("nothing was recommended")
+        self._made: FinalPoured | None = None if action is not None else self._lost("nothing was recommended")
         self.decisions: list[Decision] = [] if self._pour is None else self._pour.decisions
 
     @property
     def finished(self) -> bool:
         """It was poured, or came to nothing."""
-        return self._row is not None
+        return self._made is not None
 
     def ask(self, slots: Slots) -> list[Request]:
         """The pour, once."""
@@ -182,28 +231,30 @@ class FinalPour:
             case Poured(measurement) if is_sound(measurement.fractions):
                 loss = self._costing.total(self._costing.poured(measurement, self._action))
                 spillage = normalised_spillage(measurement.fractions)
-                self._row = {
-                    "loss": loss,
-                    "spillage": 1.0 if spillage is None else spillage,
-                    "reason": "" if spillage is not None else "hardly anything was poured",
-                }
+                self._made = FinalPoured(
+                    action_si=self._action.values(),
+                    loss=loss,
+                    spillage=1.0 if spillage is None else spillage,
+                    made=True,
+                    reason="" if spillage is not None else "hardly anything was poured",
+                )
             case Poured():
-                self._row = self._lost("weighing: the balance gave no numbers")
+                self._made = self._lost("weighing: the balance gave no numbers")
             case Failed(kind, reason):
-                self._row = self._lost(f"{kind}: {reason}")
+                self._made = self._lost(f"{kind}: {reason}")
 
     def progress(self) -> tuple[int, int]:
         """Pours done, pours in all."""
         return int(self.finished), 1
 
-    def result(self) -> dict[str, object]:
-        """`loss`, `spillage` (r), `made` (whether anything was weighed) and why not; the action in SI."""
+    def result(self) -> FinalPoured:
+        """What came of it; as lost, until something has."""
+        return self._lost("it has not been poured yet") if self._made is None else self._made
+
+    def _lost(self, reason: str) -> FinalPoured:
         action = None if self._action is None else self._action.values()
-        return {"action_si": action, **({"made": True} | self._row if self._row is not None else {})}
-
-    def _lost(self, reason: str) -> dict[str, object]:
-        return {"loss": self._costing.worst, "spillage": 1.0, "made": False, "reason": reason}
+        return FinalPoured(action_si=action, loss=self._costing.worst, spillage=1.0, made=False, reason=reason)
 
 
-def _key(theta: Mapping[str, float], action: Mapping[str, float | None]) -> Key:
-    return tuple(sorted(theta.items())), tuple(sorted(action.items()))
+def _key(theta: SimulationParameters, action: Mapping[str, float | None]) -> Key:
+    return tuple(sorted(theta.model_dump().items())), tuple(sorted(action.items()))

@@ -16,7 +16,6 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from actors.protocols import Laboratory, LaboratoryError
 from actors.simulation.in_process import InProcessSimulatorPool
@@ -27,8 +26,8 @@ from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.stages import CALIBRATION
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import Cell, cells_of
-from orchestrator.study.code import CODE, code_now
-from orchestrator.study.folder import read_result, run_folder, write_result
+from orchestrator.study.code import code_now
+from orchestrator.study.folder import CellResult, read_result, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
 
 Make = Callable[[LaboratorySpec, bool], Laboratory]
@@ -49,7 +48,7 @@ def in_this_process(simulators: InProcessSimulatorPool) -> Make:
     return make
 
 
-def run_cell(study: StudyPlan, cell: Cell, folder: Path, make: Make) -> dict[str, Any]:
+def run_cell(study: StudyPlan, cell: Cell, folder: Path, make: Make) -> CellResult:
     """Run a cell, or go on with it, and keep what came of it.
 
     Raises:
@@ -57,33 +56,33 @@ def run_cell(study: StudyPlan, cell: Cell, folder: Path, make: Make) -> dict[str
         LaboratoryError: its laboratory can't be opened.
     """
     directory = run_folder(folder, cell.id)
-    plan, stages = campaign_of(study, cell, lambda other: read_result(folder, other)["results"], directory)
+    plan, stages = campaign_of(study, cell, lambda other: read_result(folder, other).results, directory)
     directory.mkdir(parents=True, exist_ok=True)
     laboratory = make(plan.laboratory, any(stage.pours for stage in stages))
     begun = (directory / JOURNAL_NAME).is_file()
     result = asyncio.run(run_campaign(plan, laboratory, directory, resume=begun, stages=stages))
-    data = {
-        "results": result.results,
-        "simulations": result.simulations,
-        "pours": result.pours,
-        "cpu_s": result.cpu_s,
-        "seconds": result.seconds,
-        "expected": _expected(directory) if cell.arm.startswith("C4") else [],
-        CODE: code_now(),
-    }
-    write_result(folder, cell.id, data)
-    return data
+    kept = CellResult(
+        results=dict(result.results),
+        simulations=result.simulations,
+        pours=result.pours,
+        cpu_s=result.cpu_s,
+        seconds=result.seconds,
+        expected=tuple(_expected(directory)) if cell.arm.startswith("C4") else (),
+        code=code_now(),
+    )
+    write_result(folder, cell.id, kept)
+    return kept
 
 
-def _expected(directory: Path) -> list[list[float]]:
-    """What C4's surrogate expected of each θ when it was chosen: [simulations asked for until then, mean |Δ|]."""
-    asked, found = 0, []
+def _expected(directory: Path) -> list[tuple[int, float]]:
+    """What C4's surrogate expected of each θ when it was chosen: simulations asked for until then, and mean |Δ|."""
+    asked, found = 0, list[tuple[int, float]]()
     with JournalReader(directory / JOURNAL_NAME) as journal:
         for entry in journal.entries(stage=CALIBRATION, kinds=[Kind.REQUESTED, Kind.DECISION]):
             if entry.kind == Kind.REQUESTED:
                 asked += entry.body["request"]["type"] == "Simulate"
             elif "mean" in (entry.body.get("values") or {}):
-                found.append([asked, entry.body["values"]["mean"]])
+                found.append((asked, entry.body["values"]["mean"]))
     return found
 
 

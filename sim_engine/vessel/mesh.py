@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sim_engine import cache
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.flood import Flood, brim_height, flood, floor_height
-from sim_engine.vessel.mesh_distance import cast_rays, crossings, layout_around, signed_distance
+from sim_engine.vessel.mesh_distance import GridLayout, cast_rays, crossings, layout_around, signed_distance
 from sim_engine.vessel.mesh_file import read_mesh
 from sim_engine.vessel.rim import measure_opening, trace_meridians
 from sim_engine.vessel.sdf import SignedDistanceGrid, choose_spacing
@@ -19,7 +19,7 @@ from sim_engine.vessel.vessel import QUADRATURE_POINTS, Vessel, lattice
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Raised whenever the same mesh would give other arrays."""
 
 SMALLEST_SHARE = 0.03
@@ -80,6 +80,7 @@ def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
     wall = wall_thickness(vertices, faces)
     layout = layout_around(vertices, choose_spacing(np.ptp(vertices, axis=0), wall))
     hits, inside = crossings(vertices, faces, layout)
+    _check_one_body(vertices, faces, inside, layout, shape)
     found = flood(~inside)
     _check_cavity(found, shape, layout.spacing, vertices, layout.origin[2])
     rim = brim_height(found, ~inside, layout, hits)
@@ -134,6 +135,32 @@ def wall_thickness(vertices: Floats, faces: Integers) -> float:
     if not parallel.any():
         return float(np.ptp(vertices, axis=0).min())
     return float(np.percentile(length[parallel], 2.0))
+
+
+def _check_one_body(
+    vertices: Floats, faces: Integers, inside: NDArray[np.bool_], layout: GridLayout, shape: MeshShape
+) -> None:
+    """Refuse several things in one file. Bodies that overlap or touch, such as a handle of its own, are one."""
+    from scipy import ndimage
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
+    joined = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(len(vertices),) * 2)
+    if connected_components(joined, directed=False)[0] == 1:
+        return
+    everywhere = np.ones((3, 3, 3), dtype=bool)
+    labels, count = ndimage.label(ndimage.binary_dilation(inside, everywhere), everywhere)
+    if count < 2:
+        return
+    shown = []
+    for part in ndimage.find_objects(labels):
+        size = " × ".join(f"{1e3 * layout.spacing * max(s.stop - s.start - 2, 1):.0f}" for s in part)
+        shown.append(f"{size} mm")
+    raise VesselError(
+        f"{shape.path.name}: {count} bodies that don't touch ({', '.join(shown[:4])}{', …' if count > 4 else ''}); a "
+        "vessel is one: save it alone"
+    )
 
 
 def _check_cavity(found: Flood, shape: MeshShape, spacing: float, vertices: Floats, bottom: float) -> None:

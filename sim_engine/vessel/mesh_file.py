@@ -19,6 +19,8 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 SMALLEST, LARGEST = 0.020, 0.500
 """Largest extent of a plausible vessel [m]."""
 MOST_FACES = 1_000_000
+LARGEST_FILE = 300_000_000
+"""As much as so many triangles take where they are written as text [bytes]."""
 
 
 def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
@@ -36,6 +38,11 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
     kind = shape.path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise VesselError(f"{shape.path.name}: '{kind}' is no mesh format known here; use {', '.join(FORMATS)}")
+    size = shape.path.stat().st_size
+    if size > LARGEST_FILE:
+        raise VesselError(
+            f"{shape.path.name}: {size / 1e6:.0f} MB; simplify it to at most {MOST_FACES:,} triangles, some 50 MB"
+        )
     content = shape.path.read_bytes()
     try:
         loaded = trimesh.load(io.BytesIO(content), file_type=kind, process=True)

@@ -18,7 +18,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="session")
-def results() -> dict[str, dict[str, Any]]:
+def results() -> dict[str, Any]:
     """Results of the real strategies, in a world whose spillage is a formula."""
     from tests.orchestrator.reported import played_results
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Outcome, Pour, Request, Simulate, Slots
 from orchestrator.stages import StageDefinition
 from orchestrator.states import State, check_transition
+from orchestrator.strategies.learnt import Learnt
 from tests.orchestrator.toy import SCENE, SPACE, THETA, ToyLaboratory, run_toy
 
 
@@ -27,6 +28,13 @@ def states(directory: Path) -> list[str]:
 
 def one_stage(strategy: Any, order: Any = "logical") -> tuple[StageDefinition, ...]:
     return (StageDefinition("only", lambda results, seed: strategy, order=order, pours=True),)
+
+
+class Scripted(Learnt):
+    """What a script was told."""
+
+    kind: Literal["scripted"] = "scripted"
+    told: tuple[str, ...] = ()
 
 
 class Script:
@@ -57,8 +65,8 @@ class Script:
     def progress(self) -> tuple[int, int]:
         return len(self.told), self.count
 
-    def result(self) -> dict[str, object]:
-        return {"told": [type(outcome).__name__ for _, outcome in self.told]}
+    def result(self) -> Scripted:
+        return Scripted(told=tuple(type(outcome).__name__ for _, outcome in self.told))
 
 
 def simulate(seed: int) -> Simulate:

@@ -12,7 +12,8 @@ import pytest
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
-from orchestrator.report.summary import summarise, summary_table
+from orchestrator.report.summary import summarise
+from orchestrator.report.table import summary_table
 from orchestrator.report.units import loss_unit
 from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
 from orchestrator.stages import deployment_stages, prediction_stages
@@ -25,7 +26,7 @@ from orchestrator.tally import Tally
 from sim_engine.losses import Loss
 from tests.orchestrator import watched
 from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan
-from tests.orchestrator.reported import shown
+from tests.orchestrator.reported import changed, shown
 from tests.orchestrator.toy import ToyLaboratory, run_toy, toy_plan
 from tests.orchestrator.toys import narrow_cup
 
@@ -54,11 +55,11 @@ def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> Non
     assert {(r.action, r.purpose) for r in played.simulations} == {(ACTION, "predict")}
     assert len({r.seed for r in played.simulations}) == 5
     spilled = [o.outcome.fractions.spilled for _, o in played.told]  # type: ignore[union-attr]
-    found: Any = strategy.result()["over_seeds"]
-    assert found["spilled"] == pytest.approx(
-        {"mean": statistics.mean(spilled), "deviation": statistics.stdev(spilled), "count": 5}
-    )
-    assert found["loss"]["mean"] == pytest.approx(200.0 * statistics.mean(spilled))
+    found: Any = strategy.result().over_seeds
+    assert found["spilled"].mean == pytest.approx(statistics.mean(spilled))
+    assert found["spilled"].deviation == pytest.approx(statistics.stdev(spilled))
+    assert found["spilled"].count == 5
+    assert found["loss"].mean == pytest.approx(200.0 * statistics.mean(spilled))
     assert strategy.progress() == (5, 5)
     assert Play(narrow_cup)(repeated()).simulations == Play(narrow_cup)(repeated()).simulations
     assert Play(narrow_cup)(repeated(seed=4)).simulations != played.simulations
@@ -73,14 +74,14 @@ def test_simulations_that_failed_are_counted_and_left_out_of_the_prediction() ->
     strategy = repeated()
     Play(narrow_cup, answer=answer)(strategy)
     result: Any = strategy.result()
-    assert (result["simulations"], result["simulations_lost"]) == (5, 2)
-    assert result["over_seeds"]["loss"]["count"] == 3
+    assert (result.simulations, result.simulations_lost) == (5, 2)
+    assert result.over_seeds["loss"].count == 3
 
 
 def test_without_a_planned_action_nothing_is_simulated() -> None:
     strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), None, 5, 1)
     assert strategy.finished
-    assert strategy.result()["over_seeds"] == {}
+    assert strategy.result().over_seeds == {}
 
 
 def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path) -> None:
@@ -92,13 +93,13 @@ def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path
     result = asyncio.run(run_toy(tmp_path / "run", learning_laboratory(), plan=plan, stages=stages))
     assert list(result.results) == ["deployment:cup", "prediction:cup"]
     assert result.simulations == 4 * 2 + 3
-    found = result.results["prediction:cup"]["over_seeds"]
-    assert found["spillage"]["count"] == 3
-    assert found["spillage"]["deviation"] > 0.0
+    found = result.results["prediction:cup"].over_seeds
+    assert found["spillage"].count == 3
+    assert found["spillage"].deviation > 0.0
     summary = summarise(plan, result.results)
-    assert summary["receivers"]["cup"]["prediction"] == found
+    assert summary.receivers["cup"].prediction == found
     text = " ".join(shown(summary_table(plan, summary)).split())
-    mean, deviation = (100 * found["spillage"][name] for name in ("mean", "deviation"))
+    mean, deviation = (100 * getattr(found["spillage"], name) for name in ("mean", "deviation"))
     assert f"cup, best action: spilled / poured {mean:.2f} ± {deviation:.2f} %" in text
     assert "(mean ± standard deviation, 3 fresh seeds)" in text
 
@@ -120,9 +121,9 @@ def test_d1_tells_the_scatter_of_one_seed_though_it_averages_several() -> None:
     )
     Play(narrow_cup)(strategy)
     result: Any = strategy.result()
-    assert result["predicted_scatter"] == pytest.approx(2.0 * result["hyperparameters"]["noise"])
-    assert result["predicted_spillage_deviation"] > 0.0
-    assert result["pours"][0]["predicted_scatter"] == result["predicted_scatter"]
+    assert result.recommended.predicted_scatter == pytest.approx(2.0 * result.recommended.hyperparameters["noise"])
+    assert result.recommended.predicted_spillage_deviation > 0.0
+    assert result.pours[0].predicted_scatter == result.recommended.predicted_scatter
 
 
 def test_the_line_of_a_pour_says_both() -> None:
@@ -138,13 +139,15 @@ def test_the_line_of_a_pour_says_both() -> None:
     assert "predicted 0.80 ± 0.90 %, a pour ± 0.50 %" in (tally.pour_line() or "")
 
 
-def test_the_summary_s_best_expected_loss_has_both(results: dict[str, dict[str, Any]]) -> None:
+def test_the_summary_s_best_expected_loss_has_both(results: dict[str, Any]) -> None:
     plan = watched.campaign()
-    deployed = {**results["narrow cup"], "predicted_loss": 0.02, "predicted_deviation": 0.01, "predicted_scatter": 0.03}
+    learnt = results["narrow cup"]
+    known = changed(learnt.recommended, predicted_loss=0.02, predicted_deviation=0.01, predicted_scatter=0.03)
+    deployed = changed(learnt, recommended=known)
     text = shown(summary_table(plan, summarise(plan, {"narrow cup": deployed})))
     assert "2.00 ± 1.00 %, a pour ± 3.00 %" in text
-    older = {key: value for key, value in deployed.items() if key != "predicted_scatter"}
-    assert "a pour" not in shown(summary_table(plan, summarise(plan, {"narrow cup": older})))
+    unknown = changed(learnt, recommended=changed(known, predicted_scatter=None))
+    assert "a pour" not in shown(summary_table(plan, summarise(plan, {"narrow cup": unknown})))
 
 
 def test_what_is_asked_for_is_simulations_of_the_slots_that_are_free() -> None:

@@ -60,7 +60,7 @@ def test_log_without_terminal_has_at_most_one_progress_line_in_two_seconds() -> 
     display(StageOpened(stage="calibration", index=1, count=1))
     for step in range(100):
         now = 0.1 * step
-        display(StrategyProgressed(stage="calibration", done=step, total=100, result={}))
+        display(StrategyProgressed(stage="calibration", done=step, total=100, result=watched.LEARNT))
     assert len([line for line in written(plain).splitlines() if "/100" in line]) == 5  # at 0, 2, 4, 6 and 8 s
 
 
@@ -80,7 +80,7 @@ def test_plain_lines_say_how_busy_the_pool_was_not_who_is_idle_at_the_moment_a_r
         display(replace(finished, time=end, id=key, frames=None))
     for time_now, done in ((10.0, 2), (14.0, 3)):
         now = time_now
-        display(StrategyProgressed(time=now, stage="calibration", done=done, total=8, result={}))
+        display(StrategyProgressed(time=now, stage="calibration", done=done, total=8, result=watched.LEARNT))
     lines = [line for line in written(plain).splitlines() if "/8" in line]
     assert "pool 70 % busy · 2 simulations" in lines[0]
     assert "pool 0 % busy · 2 simulations" in lines[1]
@@ -124,8 +124,8 @@ def test_text_that_looks_like_markup_is_shown_as_it_is() -> None:
 def test_time_left_is_estimated_from_this_runs_pace_not_from_replayed_steps() -> None:
     tally = Tally(watched.campaign())
     tally(StageOpened(time=0.0, stage="calibration", index=1, count=1))
-    tally(StrategyProgressed(time=5.0, stage="calibration", done=80, total=100, result={}, replayed=True))
-    tally(StrategyProgressed(time=10.0, stage="calibration", done=85, total=100, result={}))
+    tally(StrategyProgressed(time=5.0, stage="calibration", done=80, total=100, result=watched.LEARNT, replayed=True))
+    tally(StrategyProgressed(time=10.0, stage="calibration", done=85, total=100, result=watched.LEARNT))
     stage = tally.stages["calibration"]
     assert stage.remaining(10.0) == pytest.approx(15 * 10.0 / 5)
 

@@ -75,21 +75,21 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
     events: list[Event] = []
     result = run(tmp_path / "run", campaign(tmp_path), watchers=[events.append])
     assert list(result.results) == ["pours", "calibration", "evaluation", "deployment:cup", "deployment:narrow"]
-    theta = result.results["calibration"]["theta"]
-    assert (theta["particles"], theta["viscosity"]) == (700, 4.0)
+    theta = result.results["calibration"].found.theta
+    assert (theta.particles, theta.viscosity) == (700, 4.0)
     done = [e for e in events if isinstance(e, RequestFinished)]
     deployed = [e.request for e in done if e.stage.startswith("deployment") and isinstance(e.request, Simulate)]
     assert deployed
-    assert {canonical(request.parameters.model_dump()) for request in deployed} == {canonical(theta)}
+    assert {canonical(request.parameters.model_dump()) for request in deployed} == {canonical(theta.model_dump())}
     assert {r.request.scene for r in done if r.stage == "deployment:narrow" and isinstance(r.request, Pour)} == {
         "narrow"
     }
     evaluation = result.results["evaluation"]
-    assert set(evaluation["discrepancy"]) == {"theta", "random 1", "random 2", "random 3"}
-    assert evaluation["discrepancy"]["theta"].keys() == {"test", "train"}
-    assert evaluation["random_median"].keys() == {"test"}  # random θ are not simulated on training pours
-    assert evaluation["mean_predictor"]["test"] is not None
-    assert evaluation["regression"]["test"] is not None
+    assert set(evaluation.discrepancy) == {"theta", "random 1", "random 2", "random 3"}
+    assert evaluation.discrepancy["theta"].keys() == {"test", "train"}
+    assert evaluation.random_median.keys() == {"test"}  # random θ are not simulated on training pours
+    assert evaluation.mean_predictor["test"] is not None
+    assert evaluation.regression["test"] is not None
 
 
 def test_the_real_strategies_resume_as_if_nothing_had_happened(tmp_path: Path) -> None:
@@ -131,10 +131,10 @@ def test_records_take_the_place_of_pours(tmp_path: Path) -> None:
     assert list(result.results) == ["calibration", "evaluation"]
     assert result.pours == 0
     evaluation = result.results["evaluation"]
-    assert set(evaluation["discrepancy"]["theta"]) == {"train", "transfer"}
-    assert set(evaluation["random_median"]) == {"transfer"}
-    assert evaluation["regression"] == {}  # no answer for another vessel
-    assert {pair["scene"] for pair in evaluation["pairs"] if pair["split"] == "transfer"} == {"narrow"}
+    assert set(evaluation.discrepancy["theta"]) == {"train", "transfer"}
+    assert set(evaluation.random_median) == {"transfer"}
+    assert evaluation.regression == {}  # no answer for another vessel
+    assert {pair.scene for pair in evaluation.pairs if pair.split == "transfer"} == {"narrow"}
 
 
 def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> None:

@@ -9,10 +9,10 @@ import argparse
 import asyncio
 import hashlib
 import random
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,7 +35,9 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
+from orchestrator.results import Results, learnt_by
 from orchestrator.stages import StageDefinition
+from orchestrator.strategies.learnt import Learnt
 from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
@@ -195,6 +197,14 @@ def slow_laboratory(longest: float, rng: random.Random | None = None) -> ToyLabo
     )
 
 
+class Toyed(Learnt):
+    """What the toy strategy learnt."""
+
+    kind: Literal["toy"] = "toy"
+    spillages: tuple[float, ...]
+    simulations: int
+
+
 class ToyStrategy:
     """Some simulations, then pours with `beside` simulations beside each. All decisions depend on what was told."""
 
@@ -264,8 +274,8 @@ class ToyStrategy:
     def progress(self) -> tuple[int, int]:
         return self._told_pours, self._pours
 
-    def result(self) -> dict[str, object]:
-        return {"spillages": self.spillages, "simulations": self._asked_simulations}
+    def result(self) -> Toyed:
+        return Toyed(spillages=tuple(self.spillages), simulations=self._asked_simulations)
 
     def _seed(self) -> int:
         return int(self._rng.integers(2**31))
@@ -274,8 +284,8 @@ class ToyStrategy:
 def toy_stages(**numbers: int) -> tuple[StageDefinition, ...]:
     """Two stages; the second one's seed depends on the first one's result."""
 
-    def second(results: Mapping[str, Mapping[str, Any]], seed: int) -> ToyStrategy:
-        return ToyStrategy(seed + int(1e6 * results["first"]["spillages"][-1]), **numbers)
+    def second(results: Results, seed: int) -> ToyStrategy:
+        return ToyStrategy(seed + int(1e6 * learnt_by(results, "first", Toyed).spillages[-1]), **numbers)
 
     return (
         StageDefinition("first", lambda results, seed: ToyStrategy(seed, **numbers), pours=True),

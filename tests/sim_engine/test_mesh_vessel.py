@@ -110,6 +110,21 @@ def test_overlap_of_two_bodies_is_solid(mug: Vessel) -> None:
     assert mug.grid.sample(ends).max() < 0.0
 
 
+@pytest.mark.parametrize("distance", [120.0, 76.0])
+def test_two_vessels_in_one_file_are_refused(build: Make, distance: float) -> None:
+    other = cup().apply_translation([distance, 0.0, 0.0])
+    with pytest.raises(
+        VesselError, match=r"vessel\.stl: 2 bodies that don't touch \(\d+ × \d+ × 6\d mm, .* save it alone"
+    ):
+        build(trimesh.util.concatenate([cup(), other]))
+
+
+def test_a_handle_of_its_own_that_touches_the_wall_belongs_to_the_vessel(build: Make) -> None:
+    handle = trimesh.creation.box((20.0, 8.0, 30.0)).apply_translation([44.0, 0.0, 30.0])  # 0.1 mm off the facets
+    alone, both = build(cup()), build(trimesh.util.concatenate([cup(), handle]))
+    assert both.capacity == pytest.approx(alone.capacity, rel=0.01)
+
+
 def test_distance_of_a_mesh_is_the_distance_to_its_nearest_triangle(build: Make) -> None:
     vessel = build(cup())
     rng = np.random.default_rng(1)

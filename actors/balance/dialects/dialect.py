@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Protocol
 
 from actors.balance.reading import Reading, Reply
-
-END = b"\r\n"
-"""Ends every line of every dialect here."""
+from actors.balance.virtual_serial.voice import PlainVoice, Voice
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,10}(?:\.[0-9]{1,9})?")
 """A weight in digits; no exponents, no commas, and a digit on both sides of the point."""
@@ -46,54 +45,39 @@ class LineSettings:
         return (1 + self.bits + (self.parity != "N") + self.stop) / self.baud
 
 
-class Dialect(Protocol):
-    """One way of talking. Implementations are modules' constants without state."""
+@dataclass(frozen=True, kw_only=True)
+class Dialect(ABC):
+    """One way of talking: a class without state in a file of its own, whose one instance is registered at the door
+    `decant.balances` under its `name`.
 
-    @property
-    def name(self) -> str:
-        """In files: 'kcp'."""
-        ...
+    Attributes:
+        name: in files: 'kcp'.
+        title: for people: 'Kern KCP'.
+        lines: line settings that such balances come with, the likeliest first.
+        gap: shortest time from one question to the next [s].
+        query: asks for what the display shows now.
+        tare: counts what is on the balance as nothing.
+        zero: sets the empty balance's zero; None where only a key does.
+        cancel: ends repeated output and commands that wait; None where there is no such command.
+        acknowledged: whether tare and zero are answered by a line.
+        turn: when this is asked, as long as it isn't known who is there: a question that means nothing to other
+            balances comes first, one that they may take for a command last.
+        identity: questions that make it say who it is, without ends of lines.
+    """
 
-    @property
-    def title(self) -> str:
-        """For people: 'Kern KCP'."""
-        ...
+    name: str
+    title: str
+    query: bytes
+    tare: bytes
+    lines: tuple[LineSettings, ...] = tuple(LineSettings(baud) for baud in (9600, 19200, 4800, 2400, 1200))
+    gap: float = 0.1
+    zero: bytes | None = None
+    cancel: bytes | None = None
+    acknowledged: bool = False
+    turn: int = 5
+    identity: tuple[str, ...] = ()
 
-    @property
-    def lines(self) -> tuple[LineSettings, ...]:
-        """Line settings that such balances come with, the likeliest first."""
-        ...
-
-    @property
-    def gap(self) -> float:
-        """Shortest time from one question to the next [s]."""
-        ...
-
-    @property
-    def query(self) -> bytes:
-        """Asks for what the display shows now."""
-        ...
-
-    @property
-    def tare(self) -> bytes:
-        """Counts what is on the balance as nothing."""
-        ...
-
-    @property
-    def zero(self) -> bytes | None:
-        """Sets the empty balance's zero; None where only a key does."""
-        ...
-
-    @property
-    def cancel(self) -> bytes | None:
-        """Ends repeated output and commands that wait; None where there is no such command."""
-        ...
-
-    @property
-    def acknowledged(self) -> bool:
-        """Whether tare and zero are answered by a line."""
-        ...
-
+    @abstractmethod
     def decode(self, line: bytes) -> Reply:
         """Understand one line.
 
@@ -103,15 +87,27 @@ class Dialect(Protocol):
         Raises:
             FrameError: it is none of this dialect's.
         """
-        ...
 
+    @abstractmethod
     def encode(self, reading: Reading) -> bytes:
         """The line that a balance of this dialect would send for a reading, CR LF included.
 
         Raises:
             ValueError: the dialect can't say it.
         """
-        ...
+
+    def likeness(self, said: Mapping[str, str]) -> int:
+        """How much a balance that knew the query is one of this dialect; of those that ask alike the largest wins.
+
+        Args:
+            said: what it answered to the questions of `identity`, '' for nothing.
+        """
+        return 0
+
+    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+        """Its side at the far end of the line, for virtual balances: by the dialect's name, and by others for what else
+        such balances may be set to."""
+        return {self.name: lambda: PlainVoice(self, self.query, self.tare, self.zero)}
 
 
 def text_of(line: bytes) -> str | None:

@@ -7,15 +7,19 @@ Limitations: `TA` reads the tare in some manuals and `MM` in others, so neither 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects import status_lines
-from actors.balance.dialects.dialect import LineSettings
+from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.reading import Reading, Reply
+from actors.balance.virtual_serial.voice import Voice
 
 
-@dataclass(frozen=True)
-class _Kcp:
+@dataclass(frozen=True, kw_only=True)
+class Kcp(Dialect):
+    """See the module's text."""
+
     name: str = "kcp"
     title: str = "Kern KCP"
     lines: tuple[LineSettings, ...] = tuple(LineSettings(baud) for baud in (9600, 19200, 4800, 2400, 1200))
@@ -25,13 +29,25 @@ class _Kcp:
     zero: bytes | None = b"Z\r\n"
     cancel: bytes | None = b"@\r\n"
     acknowledged: bool = True
+    turn: int = 2
+    identity: tuple[str, ...] = status_lines.IDENTITY
 
     def decode(self, line: bytes) -> Reply:
+        """See `Dialect.decode`."""
         return status_lines.decode(line)
 
     def encode(self, reading: Reading) -> bytes:
+        """See `Dialect.encode`."""
         return status_lines.encode(reading)
 
+    def likeness(self, said: Mapping[str, str]) -> int:
+        """See `Dialect.likeness`."""
+        return 3 if status_lines.is_kern(said) else 1  # whose pace suits both, where nothing else is known
 
-KCP = _Kcp()
+    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+        """See `Dialect.voices`."""
+        return {self.name: lambda: status_lines.StatusLineVoice(self, '"01" "1.1.2" "1.1.2"', "KERN VIRTUAL 6200-2")}
+
+
+KCP = Kcp()
 """Kern KCP."""

@@ -16,10 +16,12 @@ Limitations: there is no command for zero, and taring is not answered.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from actors.balance.dialects.dialect import END, LineSettings, number_in, text_of
+from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
 from actors.balance.reading import FrameError, Reading, Reply, Status
+from actors.balance.virtual_serial.voice import END, Display, Said, Voice, Waiting, silently, weight_line
 
 STABLE_WIDTHS = (16, 17)
 """Characters of a stable line without CR LF."""
@@ -33,8 +35,8 @@ FAULT_WIDTHS = (12, 16)
 _LINE = re.compile(r"[ M]?(?P<sign>[ -]?) *(?P<value>[0-9.]+) (?P<unit>[A-Za-z%]{0,4}) *")
 
 
-@dataclass(frozen=True)
-class KernSwt:
+@dataclass(frozen=True, kw_only=True)
+class KernSwt(Dialect):
     """The dialect; both layouts are understood, whichever is set.
 
     Attributes:
@@ -45,12 +47,9 @@ class KernSwt:
     name: str = "kern-swt"
     title: str = "older Kern (s/w/t)"
     lines: tuple[LineSettings, ...] = tuple(LineSettings(baud) for baud in (9600, 4800, 2400, 1200, 19200))
-    gap: float = 0.1
     query: bytes = b"w"
     tare: bytes = b"t"
-    zero: bytes | None = None
-    cancel: bytes | None = None
-    acknowledged: bool = False
+    turn: int = 1
 
     def decode(self, line: bytes) -> Reply:
         """See `Dialect.decode`."""
@@ -84,6 +83,35 @@ class KernSwt:
         else:
             raise ValueError(f"no line of this dialect says '{reading.status}'")
         return text.encode("ascii") + END
+
+    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+        """See `Dialect.voices`."""
+        return {self.name: KernSwtVoice, f"{self.name}-short": lambda: KernSwtVoice(short=True)}
+
+
+class KernSwtVoice:
+    """Older Kern balances.
+
+    Args:
+        short: lines of 15 and 14 bytes where the other layout has 18.
+    """
+
+    def __init__(self, *, short: bool = False) -> None:
+        self.dialect = KernSwt(short=short)
+
+    def commands(self, heard: bytearray) -> list[bytes]:
+        """See `Voice.commands`."""
+        letters = [bytes([byte]) for byte in heard if byte in b"swt"]
+        heard.clear()
+        return letters
+
+    def answer(self, command: bytes, display: Display) -> Said:
+        """See `Voice.answer`."""
+        if command == b"w":
+            return weight_line(self.dialect, display.reading())
+        if command == b"s":
+            return Waiting(lambda: weight_line(self.dialect, display.reading()))
+        return Waiting(lambda: silently(display.tare)) if command == b"t" else b""
 
 
 KERN_SWT = KernSwt()

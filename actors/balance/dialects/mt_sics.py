@@ -7,15 +7,19 @@ Mettler-Toledo AL/AB operating instructions (commands, `S` replies); AT operatin
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects import status_lines
-from actors.balance.dialects.dialect import LineSettings
+from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.reading import Reading, Reply
+from actors.balance.virtual_serial.voice import Voice
 
 
-@dataclass(frozen=True)
-class _MtSics:
+@dataclass(frozen=True, kw_only=True)
+class MtSics(Dialect):
+    """See the module's text."""
+
     name: str = "mt-sics"
     title: str = "Mettler-Toledo MT-SICS"
     lines: tuple[LineSettings, ...] = tuple(LineSettings(baud) for baud in (9600, 19200, 4800, 2400, 1200))
@@ -25,13 +29,25 @@ class _MtSics:
     zero: bytes | None = b"Z\r\n"
     cancel: bytes | None = b"@\r\n"
     acknowledged: bool = True
+    turn: int = 2
+    identity: tuple[str, ...] = status_lines.IDENTITY
 
     def decode(self, line: bytes) -> Reply:
+        """See `Dialect.decode`."""
         return status_lines.decode(line)
 
     def encode(self, reading: Reading) -> bytes:
+        """See `Dialect.encode`."""
         return status_lines.encode(reading)
 
+    def likeness(self, said: Mapping[str, str]) -> int:
+        """See `Dialect.likeness`."""
+        return 2 if status_lines.levels_of_sics(said) else 0
 
-MT_SICS = _MtSics()
+    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+        """See `Dialect.voices`."""
+        return {self.name: lambda: status_lines.StatusLineVoice(self, '"01" "2.30" "2.22"', "VIRTUAL 6200.00 g")}
+
+
+MT_SICS = MtSics()
 """Mettler-Toledo MT-SICS."""

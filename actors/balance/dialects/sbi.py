@@ -17,10 +17,12 @@ stability, the question is answered only once the balance is at rest; with autom
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from actors.balance.dialects.dialect import END, LineSettings, number_in, text_of
+from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
 from actors.balance.reading import FrameError, Reading, Reply, Status
+from actors.balance.virtual_serial.voice import END, Display, Said, Voice, Waiting, line_of, silently, weight_line
 
 SHORT, LONG = 14, 20
 """Widths of the two layouts without CR LF."""
@@ -31,8 +33,8 @@ _FAULT = re.compile(r"(?:Err|ERR) *(?P<number>[0-9]{1,4})|(?P<word>(?:APP|DIS|PR
 _BRACKETS = re.compile(r"\[([0-9]+)\]")
 
 
-@dataclass(frozen=True)
-class Sbi:
+@dataclass(frozen=True, kw_only=True)
+class Sbi(Dialect):
     """The dialect; both layouts are understood, whichever is set.
 
     Attributes:
@@ -49,12 +51,10 @@ class Sbi:
         LineSettings(9600, bits=7, parity="O"),
         LineSettings(1200),
     )
-    gap: float = 0.1
     query: bytes = b"\x1bP\r\n"
     tare: bytes = b"\x1bU\r\n"
     zero: bytes | None = b"\x1bV\r\n"
-    cancel: bytes | None = None
-    acknowledged: bool = False
+    turn: int = 0
 
     def decode(self, line: bytes) -> Reply:
         """See `Dialect.decode`."""
@@ -87,6 +87,14 @@ class Sbi:
             raise ValueError(f"no line of this dialect says '{status}'")
         return ((f"{label:<6}" if self.identified else "") + text).encode("ascii") + END
 
+    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+        """See `Dialect.voices`."""
+        return {
+            self.name: SbiVoice,
+            f"{self.name}-identified": lambda: SbiVoice(identified=True),
+            f"{self.name}-at-stability": lambda: SbiVoice(at_stability=True),
+        }
+
 
 _SAID = {Status.OVER: "High", Status.UNDER: "Low", Status.BUSY: "--"}
 
@@ -105,6 +113,42 @@ def _weight(text: str) -> Reading:
     if sign == "-":
         number = -number
     return Reading(Status.STABLE if name else Status.UNSTABLE, number, name)
+
+
+class SbiVoice:
+    """Sartorius SBI.
+
+    Args:
+        identified: lines of 22 characters.
+        at_stability: answers ESC P only once it is at rest.
+    """
+
+    def __init__(self, *, identified: bool = False, at_stability: bool = False) -> None:
+        self.dialect = Sbi(identified=identified)
+        self._at_stability = at_stability
+
+    def commands(self, heard: bytearray) -> list[bytes]:
+        """See `Voice.commands`."""
+        found = re.findall(rb"\x1b([A-Z]|[a-z][A-Za-z0-9]*_)", bytes(heard))
+        tail = bytes(heard).rpartition(b"\x1b")
+        begun = tail[1] and re.fullmatch(rb"(?:[a-z][A-Za-z0-9]*)?", tail[2])
+        heard[:] = b"\x1b" + tail[2] if begun else b""
+        return found
+
+    def answer(self, command: bytes, display: Display) -> Said:
+        """See `Voice.answer`."""
+        if command == b"P" and not self._at_stability:
+            return weight_line(self.dialect, display.reading())
+        match command:
+            case b"P":
+                return Waiting(lambda: weight_line(self.dialect, display.reading()))
+            case b"T" | b"U":
+                return Waiting(lambda: silently(display.tare))
+            case b"V":
+                return Waiting(lambda: silently(display.zero))
+            case b"x1_":
+                return line_of("VIRTUAL-SBI")
+        return b""
 
 
 SBI = Sbi()

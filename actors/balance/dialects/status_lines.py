@@ -9,9 +9,11 @@ understood.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
-from actors.balance.dialects.dialect import END, number_in, text_of
+from actors.balance.dialects.dialect import number_in, text_of
 from actors.balance.reading import Acknowledgement, Answer, FrameError, Reading, Reply, Status
+from actors.balance.virtual_serial.voice import END, Display, Lines, Repeat, Said, Waiting, line_of, weight_line
 
 WEIGHTS = {"S": Status.STABLE, "D": Status.UNSTABLE}
 STATES = {"I": Status.BUSY, "+": Status.OVER, "-": Status.UNDER, "L": Status.ERROR}
@@ -80,3 +82,78 @@ def encode(reading: Reading) -> bytes:
     if reading.status is Status.ERROR:
         return f"S S Error {reading.detail.removeprefix('error ') or '1b'}".encode("ascii") + END
     raise ValueError(f"no line says '{reading.status}'")
+
+
+IDENTITY = ("I1", "I2")
+"""Ask for the levels of commands, and for the model."""
+
+_SIGNS = {Status.OVER: "+", Status.UNDER: "-"}
+
+
+class StatusLineVoice:
+    """KCP and MT-SICS.
+
+    Args:
+        dialect: one of the two.
+        levels: answer to I1.
+        model: answer to I2.
+    """
+
+    def __init__(self, dialect: Lines, levels: str, model: str) -> None:
+        self.dialect = dialect
+        self._identity = {"I1": levels, "I2": f'"{model}"', "I3": '"1.00"', "I4": '"0123456789"'}
+
+    def commands(self, heard: bytearray) -> list[bytes]:
+        """See `Voice.commands`."""
+        *whole, rest = re.split(rb"\r\n|\n", bytes(heard))
+        heard[:] = rest
+        return whole
+
+    def answer(self, command: bytes, display: Display) -> Said:
+        """See `Voice.answer`."""
+        word = command.decode("ascii", "replace")
+        match word:
+            case "":
+                return b""
+            case "SI":
+                return weight_line(self.dialect, display.reading())
+            case "S":
+                return Waiting(lambda: weight_line(self.dialect, display.reading()), line_of("S I"))
+            case "SIR":
+                return Repeat()
+            case "T" | "Z":
+                return Waiting(lambda: self._act(word, display), line_of(f"{word} I"))
+            case "TI" | "ZI":
+                return self._act(word, display)
+            case "TA":
+                return line_of(f"TA A {display.scale.tared!s:>10} {display.scale.settings.unit}")
+            case "TAC":
+                display.scale.clear_tare()
+                return line_of("TAC A")
+            case "@":
+                return line_of(f"I4 A {self._identity['I4']}")
+        return line_of(f"{word} A {self._identity[word]}") if word in self._identity else line_of("ES")
+
+    def _act(self, word: str, display: Display) -> bytes:
+        status = display.tare() if word.startswith("T") else display.zero()
+        if status in _SIGNS:
+            return line_of(f"{word} {_SIGNS[status]}")
+        letter = "S" if display.scale.stable else "D"
+        if word.startswith("Z"):
+            return line_of("Z A" if word == "Z" else f"ZI {letter}")
+        return line_of(f"{word} {letter} {display.scale.tared!s:>10} {display.scale.settings.unit}")
+
+
+def levels_of_sics(said: Mapping[str, str]) -> bool:
+    """Whether the answer to I1 looks like MT-SICS's: its levels, and one version of two numbers for each.
+
+    KCP borrowed its questions and answers from MT-SICS; all that the driver does is the same but for the pace. MT-SICS
+    says its levels and versions as "0123" "2.30" "2.22" …; KCP's versions have three numbers (1.1.2). How it prints
+    them could not be found out.
+    """
+    return re.fullmatch(r'"[0-9]{1,4}"( "[0-9]+\.[0-9]+[A-Z]?")+', said.get("I1", "")) is not None
+
+
+def is_kern(said: Mapping[str, str]) -> bool:
+    """Whether it calls itself one of Kern's."""
+    return any("KERN" in text.upper() for text in said.values())

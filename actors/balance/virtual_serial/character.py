@@ -7,10 +7,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from actors.balance.doors import voices
 from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.faults import FaultyDisplay, spoil
 from actors.balance.virtual_serial.scale import Scale, ScaleSettings
-from actors.balance.virtual_serial.voice import VOICES, Repeat, Waiting, weight_line
+from actors.balance.virtual_serial.voice import Repeat, Waiting, weight_line
 
 REPEAT_INTERVAL = 0.2
 """From one repeated reading to the next [s of bench time]."""
@@ -47,7 +48,7 @@ class Emulation:
     """A balance that speaks a dialect.
 
     Args:
-        dialect: one of `voice.VOICES`.
+        dialect: one of `doors.voices`.
         settings: of its scale.
         time_scale: bench seconds per second of the clock; 0: bench time passes by order only.
         latency: from question to answer [s of the clock].
@@ -57,7 +58,7 @@ class Emulation:
     def __init__(
         self, dialect: str, settings: ScaleSettings, time_scale: float, latency: float, seed: tuple[int, ...]
     ) -> None:
-        self._voice = VOICES[dialect]()
+        self._voice = voices()[dialect]()
         self._scale = Scale(settings, seed)
         self._display = FaultyDisplay(self._scale)
         self._time_scale, self._latency = time_scale, latency

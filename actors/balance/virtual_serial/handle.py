@@ -14,9 +14,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from actors.balance.doors import voices
 from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.scale import ScaleSettings
-from actors.balance.virtual_serial.voice import VOICES
 from actors.protocols import LaboratoryError
 from actors.ray_warden import MARK
 
@@ -137,7 +137,7 @@ class VirtualSerialBalance(FarProcess):
         """Start one, empty.
 
         Args:
-            dialect: one of `voice.VOICES`.
+            dialect: one of `doors.voices`.
             baud: speed of the line; 0: any, and characters take no time.
             scale: what a data sheet says.
             time_scale: bench seconds per second of the clock; 0: bench time passes by `advance` only.
@@ -147,8 +147,8 @@ class VirtualSerialBalance(FarProcess):
         Raises:
             LaboratoryError: it did not start.
         """
-        if dialect not in VOICES:
-            raise LaboratoryError(f"no virtual balance speaks '{dialect}'; there are {', '.join(VOICES)}")
+        if dialect not in voices():
+            raise LaboratoryError(f"no virtual balance speaks '{dialect}'; there are {', '.join(voices())}")
         settings = {
             "dialect": dialect,
             "scale": asdict(scale or ScaleSettings()),

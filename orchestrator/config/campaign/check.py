@@ -11,6 +11,7 @@ import numpy as np
 from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from orchestrator.config.yaml.errors import ConfigError, Problem
+from orchestrator.config.yaml.files import why_not_writable
 from orchestrator.config.yaml.source import Document, Loc
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.calibration.prior import actions_all_over
@@ -192,9 +193,9 @@ class _Checker:
 def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Problem]:
     """Build the vessels of a campaign and try its actions.
 
-    Checked for every scene: both vessels can be built and hold the liquid; some action of the space tilts far enough
-    for the liquid to leave, and one lets the vessels stay clear of each other and can be made by the laboratory's arm
-    (middle, corners and a few drawn at random are tried); recorded pours stay clear.
+    Runs must find a folder. Checked for every scene: both vessels can be built and hold the liquid; some action of the
+    space tilts far enough for the liquid to leave, and one lets the vessels stay clear of each other and can be made by
+    the laboratory's arm (middle, corners and a few drawn at random are tried); recorded pours stay clear.
 
     Args:
         plan: of the campaign.
@@ -209,6 +210,8 @@ def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Probl
         document = None  # a plan that was never a file
     checker = _Checker(plan.laboratory.arm, document)
     at: Loc
+    if (problem := why_not_writable(plan.outputs.directory)) is not None:
+        checker.add((("outputs", "directory"),), problem)
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)
         if calibration.records is None:

@@ -5,20 +5,37 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orchestrator.config.yaml.errors import Problem, did_you_mean
+from orchestrator.config.yaml.files import UnreadableError, read_text
 from orchestrator.plan import RecordedPour
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
+
+if TYPE_CHECKING:
+    import _csv
 
 MASS_COLUMNS = ("poured_g", "spilled_g", "retained_g")
 SPLITS = ("train", "test", "transfer")
 LIP_COLUMN = "lip_to_receiver_axis_mm"
 
+MOST_POURS = 2_000
+"""The surrogates take some hundreds."""
+
 MASS_TOLERANCE = 0.01
 """Largest relative difference between poured + retained and the load; spills and drips make a weighing no better."""
+
+NOISE, NOISE_OF_LOAD = 0.3, 1e-3
+"""How far below zero a weighed mass may come to lie: in grams, or as a part of the load where that is more."""
+
+MOST_ALIKE = 5
+"""Lines that are the same in all their numbers: pours that were made differ in the last digit."""
+
+_NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
 def column_name(dimension: Dimension) -> str:
@@ -100,44 +117,78 @@ def read_records(
     """
     table = Table()
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        table.problems.append(Problem(path, 0, 0, "", f"is not text in UTF-8 (byte {error.start}); save it as UTF-8"))
-        return table
-    except OSError as error:
-        table.problems.append(Problem(path, 0, 0, "", f"can't be read: {error.strerror}"))
+        text = read_text(path, encoding="utf-8-sig")
+    except UnreadableError as error:
+        table.problems.append(Problem(path, 0, 0, "", str(error)))
         return table
     if not text.strip():
         table.problems.append(Problem(path, 0, 0, "", "is empty; it needs a header and a line for each pour"))
         return table
-    lines = text.splitlines()
-    reader = csv.reader(io.StringIO(text))
-    header = [cell.strip() for cell in next(reader, [])]
-    names = {theirs: ours for ours, theirs in (columns or {}).items()}
-    header = [names.get(cell, cell) for cell in header]
-    _check_header(table, path, header, lines[0] if lines else "", lip_radius, needs_split=split is None)
-    if table.problems:
-        return table
-    table.dimensions = tuple(
-        name
-        for name, dimension in ACTION_DIMENSIONS.items()
-        if column_name(dimension) in header or (name == "x_offset" and LIP_COLUMN in header)
-    )
-    for cells in reader:
-        if any(cell.strip() for cell in cells):
-            row = _read_row(
-                table, path, header, cells, reader.line_num, lines[reader.line_num - 1], loaded, lip_radius, split
-            )
-            if row is not None:
-                table.rows.append(row)
+    lines = list(io.StringIO(text, newline=""))
+    reader = csv.reader(lines)
+    try:
+        _read_table(table, path, reader, lines, loaded, lip_radius, columns or {}, split)
+    except csv.Error as error:
+        message = f"is not CSV: {error}; is a quote still open?"
+        table.problems.append(Problem(path, reader.line_num, 1, "", message))
     if not table.rows and not table.problems:
         table.problems.append(Problem(path, 1, 1, "", "has no pours; add a line for each below the header"))
     return table
 
 
+def _read_table(
+    table: Table,
+    path: Path,
+    reader: _csv.Reader,
+    lines: list[str],
+    loaded: float,
+    lip_radius: float | None,
+    columns: Mapping[str, str],
+    split: str | None,
+) -> None:
+    header = [cell.strip() for cell in next(reader, [])]
+    names = {theirs: ours for ours, theirs in columns.items()}
+    header = [names.get(cell, cell) for cell in header]
+    _check_header(table, path, header, lines[0], lip_radius, needs_split=split is None)
+    if table.problems:
+        return
+    table.dimensions = tuple(
+        name
+        for name, dimension in ACTION_DIMENSIONS.items()
+        if column_name(dimension) in header or (name == "x_offset" and LIP_COLUMN in header)
+    )
+    alike: dict[tuple[str, ...], list[int]] = {}
+    for cells in reader:
+        if not any(cell.strip() for cell in cells):
+            continue
+        number = reader.line_num
+        if len(table.rows) == MOST_POURS:
+            message = f"has more than {MOST_POURS} pours, which no calibration can use; keep the best of them"
+            table.problems.append(Problem(path, number, 1, "", message))
+            return
+        alike.setdefault(tuple(cell.strip() for cell in cells), []).append(number)
+        row = _read_row(table, path, header, cells, number, lines[number - 1], loaded, lip_radius, split)
+        if row is not None:
+            table.rows.append(row)
+    for numbers in alike.values():
+        if len(numbers) > MOST_ALIKE:
+            message = (
+                f"the same pour stands in {len(numbers)} lines; pours that were really made differ in the last digit. "
+                "Keep the line once"
+            )
+            line = lines[numbers[1] - 1]
+            table.problems.append(Problem(path, numbers[1], 1, "", message, line))
+
+
 def _check_header(
     table: Table, path: Path, header: list[str], line: str, lip_radius: float | None, *, needs_split: bool
 ) -> None:
+    separator = next((s for s in ";\t" if s in line and "," not in line), None)
+    if separator is not None:
+        name = "semicolons" if separator == ";" else "tabs"
+        message = f"cells are separated by {name}; save it with commas, and numbers with a decimal point"
+        table.problems.append(Problem(path, 1, line.index(separator) + 1, "", message, line))
+        return
     known = (*DIMENSION_COLUMNS, LIP_COLUMN, *MASS_COLUMNS, "split")
 
     def add(name: str, message: str) -> None:
@@ -189,12 +240,13 @@ def _read_row(
     for name, cell in zip(header, cells, strict=True):
         if name == "split":
             continue
-        try:
-            values[name] = float(cell)
-            if not math.isfinite(values[name]):
-                raise ValueError
-        except ValueError:
-            add(name, f"{cell.strip()!r} is not a number" if cell.strip() else "is empty; every pour needs a value")
+        text = cell.strip()
+        if _NUMBER.fullmatch(text) and math.isfinite(float(text)):
+            values[name] = float(text)
+        elif not text:
+            add(name, "is empty; every pour needs a value")
+        else:
+            add(name, f"{text!r} is not a number; write it like 12.5")
     split = cells[header.index("split")].strip() if "split" in header else str(usual_split)
     if split not in SPLITS:
         add("split", f"{split!r} is not known; should be one of {', '.join(SPLITS)}")
@@ -221,9 +273,10 @@ def _read_row(
 def _check_masses(masses: list[float], loaded: float, add: Callable[[str, str], None]) -> None:
     poured, spilled, retained = masses
     slack = MASS_TOLERANCE * loaded
+    noise = max(NOISE, NOISE_OF_LOAD * loaded)
     for name, mass in zip(MASS_COLUMNS, masses, strict=True):
-        if mass < -slack:
-            add(name, f"{mass:g} g is less than nothing")
+        if mass < -noise:
+            add(name, f"{mass:g} g is less than nothing, by more than a balance's noise of {noise:g} g")
     if abs(poured + retained - loaded) > slack:
         add(
             "poured_g",

@@ -8,8 +8,8 @@ from orchestrator.config.campaign.records import LIP_COLUMN, Table, column_name,
 from orchestrator.config.campaign.scenes import SceneBuilder
 from orchestrator.config.campaign.sections import PoursSection
 from orchestrator.config.motion import MotionBase
-from orchestrator.config.vessel import missing_file
 from orchestrator.config.yaml.errors import dotted
+from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.source import Place
 from orchestrator.plan import RecordSet
 from sim_engine.action import ACTION_DIMENSIONS
@@ -85,8 +85,8 @@ def read_table(pours: PoursSection, source: str | None, place: Place, builder: S
     if source is None or builder.liquid is None:
         return None
     path = _path(source, place)
-    if not path.is_file():
-        builder.report.add(place, missing_file(path))
+    if (missing := missing_file(path)) is not None:
+        builder.report.add(place, missing)
         return None
     table = read_records(path, loaded=builder.liquid.mass, lip_radius=pours.lip_radius, columns=pours.columns)
     builder.report.problems.extend(table.problems)
@@ -94,7 +94,7 @@ def read_table(pours: PoursSection, source: str | None, place: Place, builder: S
 
 
 def _path(source: str, place: Place) -> Path:
-    return (place.directory / source).resolve()
+    return resolved(place.directory / source)
 
 
 def _record_set(

@@ -12,6 +12,7 @@ from orchestrator.config.campaign.resolve_deployment import resolve_deployment
 from orchestrator.config.campaign.scenes import SceneBuilder
 from orchestrator.config.campaign.sections import CampaignFile
 from orchestrator.config.motion import ParametersBase
+from orchestrator.config.yaml.files import resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.source import Place, Report
 from orchestrator.plan import CampaignPlan, OutputPlan
@@ -72,12 +73,12 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         parallel_simulations=file.parallel_simulations,
         on_unknown=file.on_unknown,
         resolved=campaign_record(file, root, references, directory),
-        laboratory_source=((root.directory / file.laboratory).resolve() if isinstance(file.laboratory, str) else None),
+        laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
     )
 
 
 def _directory(text: str | None, root: Place) -> Path:
-    return Path("runs").resolve() if text is None else (root.directory / text).resolve()
+    return resolved(Path("runs") if text is None else root.directory / text)
 
 
 def _is_virtual(laboratory: LaboratorySpec) -> bool:

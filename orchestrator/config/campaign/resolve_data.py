@@ -8,8 +8,8 @@ from actors.spec import LaboratorySpec
 from orchestrator.codec import CodecError
 from orchestrator.config.campaign.records import column_name, read_records
 from orchestrator.config.campaign.sections import DataSection
-from orchestrator.config.vessel import missing_file
 from orchestrator.config.yaml.errors import did_you_mean
+from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.source import Place, Report
 from orchestrator.former import FormerRun, fitting, pours_in, read_former_run
 from orchestrator.journal import JOURNAL_NAME, JournalError
@@ -66,7 +66,7 @@ def resolve_data(
 def _of_file(
     section: DataSection, place: Place, scenes: tuple[Scene, ...], actions: Space, report: Report
 ) -> tuple[Path, dict[str, tuple[RecordedPour, ...]] | None]:
-    path = (place.directory / str(section.source)).resolve()
+    path = resolved(place.directory / str(section.source))
     receivers = {scene.receiver.name: scene for scene in scenes}
     if section.receiver is None and len(scenes) > 1:
         report.add(place, f"says not into which receiver; add 'receiver:' and one of {', '.join(receivers)}", key=True)
@@ -76,8 +76,8 @@ def _of_file(
         hint = f"did you mean '{guess}'?" if guess else f"receivers are {', '.join(receivers)}"
         report.add(place.at("receiver"), f"deployment has no receiver '{section.receiver}'; {hint}")
         return path, None
-    if not path.is_file():
-        report.add(place.at("from"), missing_file(path))
+    if (why := missing_file(path)) is not None:
+        report.add(place.at("from"), why)
         return path, None
     scene = scenes[0] if section.receiver is None else receivers[section.receiver]
     table = read_records(
@@ -118,7 +118,7 @@ def _of_run(
 
 def former_run(run: str, place: Place, report: Report) -> FormerRun | None:
     """A former run by its folder; None where there is none that can be read."""
-    directory = (place.directory / run).resolve()
+    directory = resolved(place.directory / run)
     if not (directory / JOURNAL_NAME).is_file():
         what = (
             "has no journal; name the folder of a run" if directory.is_dir() else "no such folder; name that of a run"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from actors.balance.doors import dialects
 from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
 from actors.balance.spec import AUTO, BalanceSpec, SerialBalanceSpec, parse_format
@@ -19,7 +20,8 @@ _SHEET = ScaleSettings()
 _SERIAL = SerialBalanceSpec(port="")
 _BALANCE = BalanceSpec(Placement.TRAY, None)
 
-Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1)]
+Error = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
+"""Of a weighing: a balance that is 10 g out tells nothing about a spill."""
 PositiveMass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1, positive=True)]
 Duration = Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0)]
 PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=True)]
@@ -29,6 +31,9 @@ USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400,
 
 VIRTUAL_DIALECT = "kcp"
 """Spoken by a virtual balance unless another dialect is named."""
+
+
+DialectName: Any = Literal[(AUTO, *dialects())]  # what is installed, ours as everybody's
 
 
 class SettlingSection(Section):
@@ -56,7 +61,7 @@ class VirtualScaleSection(Section):
     capacity: Annotated[float, Quantity("kg", "6.2 kg", 0.0, 1000.0, positive=True)] = _SHEET.capacity
     """Heaviest load."""
 
-    noise: Mass = _SHEET.noise
+    noise: Error = _SHEET.noise
     """Standard deviation of weighing the same thing again."""
 
     drift: Annotated[float, Quantity("kg/s", "0.01 g/s", -0.01, 0.01)] = _SHEET.drift
@@ -78,7 +83,7 @@ class BalanceDeviceSection(Section):
     virtual: VirtualScaleSection | None = None
     """A balance that is not there, in place of a port."""
 
-    dialect: Literal["auto", "kcp", "kern-swt", "mt-sics", "sbi"] = AUTO  # type: ignore[assignment]
+    dialect: DialectName = AUTO
     """How it talks; 'auto' finds out."""
 
     baud: PositiveCount | None = None
@@ -93,7 +98,7 @@ class BalanceDeviceSection(Section):
     step: PositiveMass | None = None
     """Step of its display, where that is not one of the last digit."""
 
-    repeatability: Mass = _SERIAL.repeatability
+    repeatability: Error = _SERIAL.repeatability
     """Standard deviation of weighing the same thing again, from its data sheet."""
 
     settling: SettlingSection = SettlingSection()

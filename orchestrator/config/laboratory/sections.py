@@ -26,7 +26,7 @@ from sim_engine.task import PoseError
 _DEFAULT = VirtualBenchSpec(liquid=SimulationParameters())
 
 Duration = Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)]
-Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1)]
+Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
 
 
 class BalanceSection(Section):

@@ -13,9 +13,9 @@ from orchestrator.config.load import load_campaign
 from orchestrator.config.motion import Parameters, ParametersBase
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.study.resolve import bench_of, calibration_arms, deployment_arms, levels_of, written_levels
-from orchestrator.config.vessel import missing_file
 from orchestrator.config.yaml.dump import as_file
 from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Text
@@ -201,7 +201,7 @@ def load_study(path: Path) -> StudyPlan:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
     report = Report()
-    place = Place(Document.read(path.resolve()))
+    place = Place(Document.read(resolved(path)))
     if (other := wrong_kind(place.document, "study")) is not None:
         raise ConfigError([other])
     section = validate(StudyFile, place, report)
@@ -271,7 +271,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         holdout=holdout,
         compared=compared,
         confirm=file.confirm or 0,
-        directory=Path("runs").resolve() if file.directory is None else (root.directory / file.directory).resolve(),
+        directory=resolved(Path("runs") if file.directory is None else root.directory / file.directory),
     )
 
 
@@ -281,9 +281,9 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
         laboratory = references.laboratory(file.laboratory, root.at("laboratory"))
     if file.campaign is None:
         return None
-    path = (root.directory / file.campaign).resolve()
-    if not path.is_file():
-        report.add(root.at("campaign"), missing_file(path))
+    path = resolved(root.directory / file.campaign)
+    if (missing := missing_file(path)) is not None:
+        report.add(root.at("campaign"), missing)
         return None
     try:
         base = load_campaign(path)

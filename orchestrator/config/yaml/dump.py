@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from pydantic import Tag
 
+from orchestrator.config.yaml.files import resolved
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.sections import IN_FILE, Mark, Section
@@ -67,7 +68,7 @@ class _Writer:
 
     def _text(self, value: str, annotation: Any, metadata: tuple[Any, ...], place: Place) -> Any:
         if _find(Mark, annotation, metadata) == IN_FILE:
-            return str((place.directory / value).resolve())
+            return str(resolved(place.directory / value))
         model = _behind_a_path(annotation)
         found = None if model is None else self.references.section(value, place, model)
         return value if found is None else as_file(*found, self.references, whole=self.whole)

@@ -7,6 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+PROBLEMS_SHOWN = 20
+LINE_SHOWN, TEXT_SHOWN = 200, 1500
+"""Characters of a line of a file and of a message that are shown: a person mends one thing after the other."""
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -31,12 +35,16 @@ class Problem:
     def __str__(self) -> str:
         """`path:line:col: where: message` with the source line and a caret below."""
         place = shown_path(self.path) if self.line == 0 else f"{shown_path(self.path)}:{self.line}:{self.column}"
-        head = ": ".join(part for part in (place, self.where, self.message) if part)
+        head = ": ".join(part for part in (place, _cut(self.where), _cut(self.message)) if part)
         if not self.source_line.strip():
             return head
         # Tabs would move the caret: both lines are shown with each tab as one space.
         source = self.source_line.replace("\t", " ").rstrip()
-        return f"{head}\n{self.line:5d} | {source}\n      | {' ' * (self.column - 1)}^"
+        before = self.column - 1
+        if len(source) > LINE_SHOWN:  # only what stands around the place
+            begin = max(0, before - LINE_SHOWN // 2)
+            source, before = source[begin : begin + LINE_SHOWN], before - begin
+        return f"{head}\n{self.line:5d} | {source}\n      | {' ' * before}^"
 
 
 class ConfigError(Exception):
@@ -48,7 +56,14 @@ class ConfigError(Exception):
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems: tuple[Problem, ...] = tuple(problems)
-        super().__init__("\n".join(str(problem) for problem in self.problems))
+        lines = [str(problem) for problem in self.problems[:PROBLEMS_SHOWN]]
+        if len(self.problems) > PROBLEMS_SHOWN:
+            lines.append(f"… and {len(self.problems) - PROBLEMS_SHOWN} more problems; mend these first")
+        super().__init__("\n".join(lines))
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= TEXT_SHOWN else f"{text[: TEXT_SHOWN // 2]} … {text[-TEXT_SHOWN // 4 :]}"
 
 
 def shown_path(path: Path) -> str:

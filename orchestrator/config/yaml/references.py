@@ -11,11 +11,11 @@ from orchestrator.config.vessel import (
     MESH_SUFFIXES,
     LiquidFile,
     VesselFile,
-    missing_file,
     resolve_liquid,
     resolve_vessel,
 )
 from orchestrator.config.yaml.errors import ConfigError, shown_path
+from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Document, Place, Report
@@ -45,14 +45,14 @@ class References:
             return value, place
         if not isinstance(value, str):
             return None
-        path = (place.directory / value).resolve()
+        path = resolved(place.directory / value)
         if path.suffix.lower() in MESH_SUFFIXES and model is VesselFile:
             self.report.add(
                 place, f"is a mesh; write {{name: {path.stem}, mesh: {value}, unit: mm}} with the unit that it is in"
             )
             return None
-        if not path.is_file():
-            self.report.add(place, missing_file(path))
+        if (missing := missing_file(path)) is not None:
+            self.report.add(place, missing)
             return None
         if path.suffix.lower() not in YAML_SUFFIXES:
             self.report.add(place, f"{path.name} is no YAML file; its name should end in .yaml")

@@ -11,16 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer, MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from orchestrator.config.yaml.errors import ConfigError, Problem, dotted
+from orchestrator.config.yaml.files import UnreadableError, read_text
 
 Loc = tuple[str | int, ...]
 
 NODE_LIMIT = 20_000
 """Nodes of a file after aliases are followed: a campaign has a few hundred; a loop or bomb of aliases has more."""
+
+DEPTH_LIMIT = 30
+"""Mappings and lists in each other: a campaign has eight."""
 
 
 @dataclass(frozen=True)
@@ -59,18 +64,9 @@ class Document:
             ConfigError: it can't be read, is not YAML, or is empty.
         """
         try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            raise ConfigError([Problem(path, 0, 0, "", "no such file")]) from None
-        except IsADirectoryError:
-            raise ConfigError([Problem(path, 0, 0, "", "is a directory; name a YAML file in it")]) from None
-        except UnicodeDecodeError as error:
-            raise ConfigError(
-                [Problem(path, 0, 0, "", f"is not text in UTF-8 (byte {error.start}); save it as UTF-8")]
-            ) from None
-        except OSError as error:
-            raise ConfigError([Problem(path, 0, 0, "", f"can't be read: {error.strerror}")]) from error
-        return cls.parse(text, path)
+            return cls.parse(read_text(path), path)
+        except UnreadableError as error:
+            raise ConfigError([Problem(path, 0, 0, "", str(error))]) from None
 
     @classmethod
     def parse(cls, text: str, path: Path) -> Document:
@@ -81,7 +77,11 @@ class Document:
         """
         document = cls(path, text.splitlines())
         try:
-            root = YAML(typ="rt").compose(text)
+            root = _parser().compose(text)
+        except MaxDepthExceededError as error:
+            raise ConfigError([document._too_deep(_start_of(error.problem_mark))]) from None
+        except _TooManyNodesError as error:
+            raise ConfigError([document._too_many(_start_of(error.problem_mark), ())]) from None
         except MarkedYAMLError as error:
             raise ConfigError([document._syntax_problem(error)]) from None
         except ReaderError as error:
@@ -125,10 +125,15 @@ class Document:
 
     def _plain(self, node: Node, loc: Loc, active: frozenset[int] = frozenset()) -> Any:
         self._nodes += 1
-        if id(node) in active or self._nodes > NODE_LIMIT:
+        if len(loc) > DEPTH_LIMIT:  # by aliases within aliases
+            raise ConfigError([self._too_deep(_start(node))])
+        if self._nodes > NODE_LIMIT:
+            raise ConfigError([self._too_many(_start(node), loc)])
+        if id(node) in active:
             line, column = _start(node)
-            reason = "an anchor that contains itself" if id(node) in active else f"more than {NODE_LIMIT} values"
-            raise ConfigError([Problem(self.path, line, column, dotted(loc), reason, self.line(line))])
+            raise ConfigError(
+                [Problem(self.path, line, column, dotted(loc), "an anchor that contains itself", self.line(line))]
+            )
         inside = active | {id(node)}
         match node:
             case MappingNode():
@@ -185,6 +190,14 @@ class Document:
 
     def _add(self, line: int, column: int, loc: Loc, message: str) -> None:
         self.problems.append(Problem(self.path, line, column, dotted(loc), message, self.line(line)))
+
+    def _too_deep(self, start: tuple[int, int]) -> Problem:
+        message = f"is nested more than {DEPTH_LIMIT} deep; is a bracket not closed, or is this another kind of file?"
+        return Problem(self.path, *start, "", message, self.line(start[0]))
+
+    def _too_many(self, start: tuple[int, int], loc: Loc) -> Problem:
+        message = f"more than {NODE_LIMIT} values; a campaign has some hundreds. Is this the right file?"
+        return Problem(self.path, *start, dotted(loc), message, self.line(start[0]))
 
     def _syntax_problem(self, error: MarkedYAMLError) -> Problem:
         mark = error.problem_mark or error.context_mark
@@ -256,8 +269,35 @@ class Report:
         raise ConfigError(sorted(unique, key=lambda p: (order[p.path], p.line, p.column)))
 
 
+class _TooManyNodesError(MarkedYAMLError):
+    """Raised while reading, before everything has been read."""
+
+
+class _Composer(Composer):
+    nodes = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self.nodes += 1
+        if self.nodes > NODE_LIMIT:
+            raise _TooManyNodesError(problem_mark=self.parser.peek_event().start_mark)
+        return super().compose_node(parent, index)
+
+
+def _parser() -> YAML:
+    """Without the comments, whose keeping takes a round-trip parser a minute where there are a million of them."""
+    parser = YAML(typ="safe", pure=True)
+    parser.Composer = _Composer
+    parser.max_depth = DEPTH_LIMIT
+    parser.composer.warn_double_anchors = False
+    return parser
+
+
 def _start(node: Node) -> tuple[int, int]:
-    return node.start_mark.line + 1, node.start_mark.column + 1
+    return _start_of(node.start_mark)
+
+
+def _start_of(mark: Any) -> tuple[int, int]:
+    return mark.line + 1, mark.column + 1
 
 
 def _is_empty(node: Node) -> bool:

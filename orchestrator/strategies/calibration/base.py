@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Generic, TypeVar, cast
+from typing import Generic, Literal, TypeVar, cast
 
 from actors.optimizer.core.problem import Point, Suggestion
 from orchestrator.errors import LearningError
@@ -12,7 +12,9 @@ from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.calibration.design import MeasuredPour
-from orchestrator.strategies.display import displayed_map
+from orchestrator.strategies.calibration.posterior import PosteriorFound
+from orchestrator.strategies.display import DisplayedMap, displayed_map
+from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.settings import CalibrationSettings
 from orchestrator.strategies.sound import is_sound
@@ -24,6 +26,91 @@ MAP_RESOLUTION = 30
 
 S = TypeVar("S", bound=CalibrationSettings)
 """Settings of a calibration."""
+
+
+class CalibrationTrial(Part):
+    """A θ that was tried, and how far the simulator was from the pours with it."""
+
+    theta: dict[str, float]
+    """Searched parameters."""
+
+    discrepancy: float | None
+    """Mean |r − c_s|, or of a single action; None where nothing could be compared."""
+
+
+class TriedOnPours(CalibrationTrial):
+    """C1 to C3: a θ that was simulated on every training pour."""
+
+    defined: int
+    """Pours on which it could be compared."""
+
+    largest: float | None
+    """The largest |r − c_s| among them."""
+
+
+class TriedOnce(CalibrationTrial):
+    """C4: a θ that was simulated at one action."""
+
+    action_si: dict[str, float]
+    """Searched dimensions of the action."""
+
+    measured: float
+    """What the regression of the weighed pours expects there, c_r."""
+
+    difference: float | None
+    """c_r − c_s with its sign, where the surrogate sees the action; else None."""
+
+
+class CalibratedTheta(Part):
+    """θ*, and what is known of it."""
+
+    theta: SimulationParameters
+    """All parameters, those that were not searched too."""
+
+    searched: tuple[str, ...]
+    """Names of the searched ones."""
+
+    predicted_discrepancy: float
+    """Expected mean |r − c_s| of it."""
+
+    predicted_deviation: float
+    """Standard deviation of that expectation."""
+
+    hyperparameters: dict[str, float] | None
+    """Those of the surrogate; None where there is none."""
+
+    map: DisplayedMap | None
+    """The discrepancy over the two parameters that matter most."""
+
+    posterior: PosteriorFound | None = None
+    """Which other θ fit the pours; only C4 says."""
+
+
+class Calibrated(Learnt):
+    """What a calibration has learnt."""
+
+    kind: Literal["calibration"] = "calibration"
+
+    strategy: str
+    """'C1' to 'C4', or another one's name."""
+
+    simulations: int
+    """Those that were answered."""
+
+    lost: int
+    """Those of them that gave no discrepancy."""
+
+    undefined: int
+    """Those that poured too little for a spillage."""
+
+    training_pours: int
+    """Weighed pours that it learnt from."""
+
+    trials: tuple[TriedOnPours | TriedOnce, ...]
+    """Every θ that has been answered, in the order of asking."""
+
+    found: CalibratedTheta | None = None
+    """θ*; None until the end."""
 
 
 class Calibration(ABC, Generic[S]):
@@ -159,32 +246,37 @@ class Calibration(ABC, Generic[S]):
         return self._trials.answered, self._budget
 
     @abstractmethod
-    def _row(self, number: int, trial: Trial) -> Mapping[str, object]:
-        """What the result has of a trial beside its θ."""
+    def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:
+        """What the result has of a trial."""
 
-    def result(self) -> dict[str, object]:
+    def _posterior_found(self) -> PosteriorFound | None:
+        """Which other θ fit the pours."""
+        return None
+
+    def result(self) -> Calibrated:
         """θ* with its expected discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
-        trials = [(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed]
-        result: dict[str, object] = {
-            "strategy": self._plan.strategy,
-            "simulations": self._trials.answered,
-            "lost": self._trials.lost,
-            "undefined": self._undefined,
-            "training_pours": len(self._usable),
-            "trials": [{"theta": self._values(trial.point), **self._row(i, trial)} for i, trial in trials],
-        }
-        if self.finished:
-            mean, deviation = self._expected
-            final = self._final
-            result |= {
-                "theta": self.theta.model_dump(),
-                "searched": list(self._plan.parameters.names),
-                "predicted_discrepancy": mean,
-                "predicted_deviation": deviation,
-                "hyperparameters": None if final is None else final.hyperparameters,
-                "map": None if final is None else displayed_map(final.surrogate, self._plan.parameters),
-            }
-        return result
+        return Calibrated(
+            strategy=self._plan.strategy,
+            simulations=self._trials.answered,
+            lost=self._trials.lost,
+            undefined=self._undefined,
+            training_pours=len(self._usable),
+            trials=tuple(self._row(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed),
+            found=self._found() if self.finished else None,
+        )
+
+    def _found(self) -> CalibratedTheta:
+        mean, deviation = self._expected
+        final = self._final
+        return CalibratedTheta(
+            theta=self.theta,
+            searched=self._plan.parameters.names,
+            predicted_discrepancy=mean,
+            predicted_deviation=deviation,
+            hyperparameters=None if final is None else final.hyperparameters,
+            map=None if final is None else displayed_map(final.surrogate, self._plan.parameters),
+            posterior=self._posterior_found(),
+        )
 
 
 def described(values: Mapping[str, float]) -> str:

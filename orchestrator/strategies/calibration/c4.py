@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal, Self
 
@@ -11,9 +11,9 @@ from orchestrator.config.yaml.sections import PositiveCount
 from orchestrator.errors import LearningError
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
-from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, described
+from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, TriedOnce, described
 from orchestrator.strategies.calibration.design import MeasuredPour
-from orchestrator.strategies.calibration.posterior import central, left_open, posterior_result
+from orchestrator.strategies.calibration.posterior import PosteriorFound, central, left_open, posterior_found
 from orchestrator.strategies.calibration.prior import actions_of_prior
 from orchestrator.strategies.calibration.settings import Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
@@ -271,25 +271,22 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def result(self) -> dict[str, object]:
-        """As every calibration; with what the pours say about θ beside θ*."""
-        result = super().result()
-        if self.finished and self._posterior is not None:
-            result["posterior"] = posterior_result(self._posterior, self._plan.parameters)
-        return result
+    def _posterior_found(self) -> PosteriorFound | None:
+        return None if self._posterior is None else posterior_found(self._posterior, self._plan.parameters)
 
     @property
     def _budget(self) -> int:
         return self._settings.budget
 
-    def _row(self, number: int, trial: Trial) -> Mapping[str, object]:
+    def _row(self, number: int, trial: Trial) -> TriedOnce:
         action = trial.requests[0].action
-        return {
-            "action_si": {name: getattr(action, name) for name in self._plan.actions.names},
-            "measured": self._measured_at[number],
-            "discrepancy": None if trial.cost is None else abs(trial.cost),
-            "difference": trial.cost if self._knows_actions else None,
-        }
+        return TriedOnce(
+            theta=self._values(trial.point),
+            action_si={name: getattr(action, name) for name in self._plan.actions.names},
+            measured=self._measured_at[number],
+            discrepancy=None if trial.cost is None else abs(trial.cost),
+            difference=trial.cost if self._knows_actions else None,
+        )
 
 
 def _number(pour: MeasuredPour, name: str) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from orchestrator.plan import RecordedPour
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.calibration.prior import region_of
 from orchestrator.strategies.display import displayed_action
+from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from sim_engine.action import Action, described
@@ -107,6 +108,56 @@ def choose_holdout(strata: list[Stratum], count: int, rng: np.random.Generator) 
     order = sorted(range(len(strata)), key=lambda i: strata[i].lower)
     groups = np.array_split(np.array(order), count) if count else []
     return frozenset(int(rng.choice(group)) for group in groups)
+
+
+class DesignPoint(Part):
+    """A pour of the design."""
+
+    number: int
+    """From 1, in the order made."""
+
+    split: str
+    """'train', or 'test' for those that calibration does not see."""
+
+
+class PouredPoint(DesignPoint):
+    """A pour that was weighed."""
+
+    action: dict[str, float | None]
+    """Searched dimensions in display units."""
+
+    action_si: dict[str, float]
+    """The same in SI."""
+
+    spillage: float | None
+    """r = spilled / poured; None below 5 % poured, where it is undefined."""
+
+    poured: float
+    """Fraction of the load that left the pourer."""
+
+    invalid_tries: int
+    """Actions of the same stratum that could not be made."""
+
+
+class GivenUpPoint(DesignPoint):
+    """A pour that could not be made, or was not weighed."""
+
+    given_up: str
+    """Why."""
+
+
+class DesignPoured(Learnt):
+    """The pours that calibration learns from."""
+
+    kind: Literal["pours"] = "pours"
+
+    pours: tuple[PouredPoint | GivenUpPoint, ...]
+    """In the order made."""
+
+    @property
+    def measured(self) -> tuple[PouredPoint, ...]:
+        """Those that were weighed."""
+        return tuple(pour for pour in self.pours if isinstance(pour, PouredPoint))
 
 
 @dataclass
@@ -217,23 +268,24 @@ class DesignedPours:
         """Pours done, pours in all."""
         return self._current, len(self._planned)
 
-    def result(self) -> dict[str, object]:
-        """The pours so far, in the order made; actions in display units."""
-        rows: list[dict[str, object]] = []
+    def result(self) -> DesignPoured:
+        """The pours so far, in the order made."""
+        rows: list[PouredPoint | GivenUpPoint] = []
         for number, planned in enumerate(self._planned[: self._current], start=1):
             if planned.measured is None:
-                rows.append({"number": number, "split": planned.split, "given_up": planned.given_up})
+                rows.append(GivenUpPoint(number=number, split=planned.split, given_up=planned.given_up or ""))
                 continue
             action = planned.measured.action
+            values = {name: getattr(action, name) for name in self._actions.names}
             rows.append(
-                {
-                    "number": number,
-                    "split": planned.split,
-                    "action": displayed_action({name: getattr(action, name) for name in self._actions.names}),
-                    "action_si": {name: getattr(action, name) for name in self._actions.names},
-                    "spillage": planned.measured.spillage,
-                    "poured": planned.measured.poured,
-                    "invalid_tries": len(planned.notes),
-                }
+                PouredPoint(
+                    number=number,
+                    split=planned.split,
+                    action=displayed_action(values),
+                    action_si=values,
+                    spillage=planned.measured.spillage,
+                    poured=planned.measured.poured,
+                    invalid_tries=len(planned.notes),
+                )
             )
-        return {"pours": rows}
+        return DesignPoured(pours=tuple(rows))

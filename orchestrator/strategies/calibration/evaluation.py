@@ -6,11 +6,14 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from sim_engine.liquid import SimulationParameters
@@ -24,6 +27,58 @@ class ScoredPour:
 
     scene: str
     pour: MeasuredPour
+
+
+class ScoredPair(Part):
+    """A weighed pour beside its simulation with one θ."""
+
+    theta: str
+    """Label of the θ."""
+
+    split: str
+    """'train', 'test' or 'transfer'."""
+
+    scene: str
+    """Where it was poured."""
+
+    measured: float | None
+    """r, as weighed."""
+
+    simulated: float | None
+    """c_s; None where it is not defined."""
+
+    reason: str
+    """Why it is not."""
+
+
+class Scores(Learnt):
+    """How well one or several θ reproduce weighed pours."""
+
+    kind: Literal["evaluation"] = "evaluation"
+
+    simulations: int
+    """Those that were answered."""
+
+    undefined: dict[str, int]
+    """Simulations without c_s, by label of θ."""
+
+    discrepancy: dict[str, dict[str, float | None]]
+    """Mean |r − c_s| by label of θ and split."""
+
+    random_median: dict[str, float | None]
+    """Median of the random θ's, by split."""
+
+    thetas: dict[str, SimulationParameters]
+    """The θ by label."""
+
+    pairs: tuple[ScoredPair, ...]
+    """Every weighed pour with its simulation."""
+
+    mean_predictor: dict[str, float | None] = Field(default_factory=dict)
+    """What the mean of the training pours comes to, by split."""
+
+    regression: dict[str, float | None] = Field(default_factory=dict)
+    """What a GP regression of the training pours comes to, by split."""
 
 
 @dataclass
@@ -117,30 +172,31 @@ class Evaluation:
         known = [score for score in scores if score is not None]
         return median(known) if known else None
 
-    def result(self) -> dict[str, object]:
+    def result(self) -> Scores:
         """Scores by θ and split, and every pair of measured and simulated spillage."""
         splits = list(dict.fromkeys(case.scored.pour.split for case in self._cases))
-        return {
-            "simulations": self.progress()[0],
-            "undefined": sum(case.answered and case.simulated is None for case in self._cases),
-            "discrepancy": {
-                label: {split: self.discrepancy(label, split) for split in splits} for label in self._thetas
+        answered = [case for case in self._cases if case.answered]
+        return Scores(
+            simulations=len(answered),
+            undefined={
+                label: sum(case.theta == label and case.simulated is None for case in answered)
+                for label in self._thetas
             },
-            "random_median": {split: self.random_median(split) for split in splits},
-            "thetas": {label: theta.model_dump() for label, theta in self._thetas.items()},
-            "pairs": [
-                {
-                    "theta": case.theta,
-                    "split": case.scored.pour.split,
-                    "scene": case.scored.scene,
-                    "measured": case.scored.pour.spillage,
-                    "simulated": case.simulated,
-                    "reason": case.reason,
-                }
-                for case in self._cases
-                if case.answered
-            ],
-        }
+            discrepancy={label: {split: self.discrepancy(label, split) for split in splits} for label in self._thetas},
+            random_median={split: self.random_median(split) for split in splits},
+            thetas=dict(self._thetas),
+            pairs=tuple(
+                ScoredPair(
+                    theta=case.theta,
+                    split=case.scored.pour.split,
+                    scene=case.scored.scene,
+                    measured=case.scored.pour.spillage,
+                    simulated=case.simulated,
+                    reason=case.reason,
+                )
+                for case in answered
+            ),
+        )
 
 
 def random_parameters(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
-from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, described
+from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, TriedOnPours, described
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.settings import DesignSettings
 from orchestrator.strategies.trials import Trial
@@ -77,9 +77,14 @@ class DiscrepancyOverPours(Calibration[S]):
         costs = tuple(max(known) if score is None else score for _, score in scores)
         return Data(tuple(point for point, _ in scores), costs)
 
-    def _row(self, number: int, trial: Trial) -> Mapping[str, object]:
+    def _row(self, number: int, trial: Trial) -> TriedOnPours:
         known = [cost for cost in trial.costs.values() if cost is not None]
-        return {"discrepancy": _score(trial), "defined": len(known), "largest": max(known, default=None)}
+        return TriedOnPours(
+            theta=self._values(trial.point),
+            discrepancy=_score(trial),
+            defined=len(known),
+            largest=max(known, default=None),
+        )
 
 
 class BestOfDesign(DiscrepancyOverPours[S]):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from actors.optimizer.core.problem import Point, Posterior
+from orchestrator.strategies.learnt import Part
 from sim_engine.space import Space
 
 Array = NDArray[np.float64]
@@ -24,10 +25,57 @@ TIED = 0.6
 """|Correlation| from which two parameters make up for each other."""
 
 
-def posterior_result(posterior: Posterior, space: Space) -> dict[str, object]:
-    """JSON-ready: mean, 90 % region per parameter, which are open, correlations, ties in words, and the draws.
+class RemainingDiscrepancy(Part):
+    """How far θ that fit stay from the pours: the region's ends and the median of mean |r − c_s|."""
+
+    low: float
+    median: float
+    high: float
+
+
+class PosteriorSummary(Part):
+    """Which θ fit the weighed pours, without the draws.
 
     Correlations are those of the searched box' unit cube, where logarithmic axes are by their logarithm.
+    """
+
+    level: float
+    """Share of the posterior in the regions."""
+
+    mean: dict[str, float]
+    """Mean of the draws."""
+
+    region: dict[str, tuple[float, float]]
+    """Both ends of each parameter's region."""
+
+    open: tuple[str, ...]
+    """Parameters of which the pours say next to nothing."""
+
+    correlation: tuple[tuple[float, ...], ...]
+    """Rows and columns in the parameters' order."""
+
+    directions: tuple[str, ...]
+    """Which parameters make up for each other, in words."""
+
+    remaining_discrepancy: RemainingDiscrepancy
+
+    effective: float
+    """How many independent draws they are worth."""
+
+
+class PosteriorFound(PosteriorSummary):
+    """Which θ fit the weighed pours."""
+
+    thetas: tuple[dict[str, float], ...]
+    """Draws of the searched parameters, of equal weight."""
+
+    def summary(self) -> PosteriorSummary:
+        """The same without the draws."""
+        return PosteriorSummary.model_validate(self.model_dump(exclude={"thetas"}))
+
+
+def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
+    """What draws of a posterior say.
 
     Args:
         posterior: draws in the unit cube.
@@ -37,17 +85,19 @@ def posterior_result(posterior: Posterior, space: Space) -> dict[str, object]:
     low, high = region(points)
     lower, upper, names = space.decode(tuple(low)), space.decode(tuple(high)), space.names
     lacking = np.quantile(posterior.discrepancies, [(1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2])
-    return {
-        "level": LEVEL,
-        "mean": space.decode(tuple(points.mean(axis=0))),
-        "region": {name: [lower[name], upper[name]] for name in names},
-        "open": _open(points, names),
-        "correlation": _correlation(points).tolist(),
-        "directions": _ties(points, names),
-        "remaining_discrepancy": dict(zip(("low", "median", "high"), map(float, lacking), strict=True)),
-        "effective": posterior.effective,
-        "thetas": [space.decode(tuple(point)) for point in posterior.points],
-    }
+    return PosteriorFound(
+        level=LEVEL,
+        mean=space.decode(tuple(points.mean(axis=0))),
+        region={name: (lower[name], upper[name]) for name in names},
+        open=tuple(_open(points, names)),
+        correlation=tuple(tuple(row) for row in _correlation(points).tolist()),
+        directions=tuple(_ties(points, names)),
+        remaining_discrepancy=RemainingDiscrepancy(
+            low=float(lacking[0]), median=float(lacking[1]), high=float(lacking[2])
+        ),
+        effective=posterior.effective,
+        thetas=tuple(space.decode(tuple(point)) for point in posterior.points),
+    )
 
 
 def region(points: Array) -> tuple[Array, Array]:

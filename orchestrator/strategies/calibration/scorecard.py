@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Slots
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.design import MeasuredPour
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
+from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, Scores
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
+
+BySplit = dict[str, float | None]
 
 CALIBRATED = "theta"
 """Label of θ* in the results."""
@@ -50,7 +52,7 @@ class Scorecard:
         self._pours: dict[str, list[MeasuredPour]] = {}
         for scored in pours:
             self._pours.setdefault(scored.pour.split, []).append(scored.pour)
-        self._baselines: dict[str, dict[str, float | None]] | None = None
+        self._baselines: tuple[BySplit, BySplit] | None = None
 
     @property
     def finished(self) -> bool:
@@ -83,40 +85,29 @@ class Scorecard:
         numbers = [part.progress() for part in self._parts]
         return sum(done for done, _ in numbers), sum(total for _, total in numbers)
 
-    def result(self) -> dict[str, object]:
+    def result(self) -> Scores:
         """Mean |r − c_s| by label and split, the random θ's median by split, and the rivals without a simulator."""
         ours, rivals = (part.result() for part in self._parts)
-        result: dict[str, object] = {
-            key: {**_mapping(ours[key]), **_mapping(rivals[key])} for key in ("discrepancy", "thetas")
-        }
-        result["random_median"] = rivals["random_median"]
-        result["simulations"] = self.progress()[0]
-        result["undefined"] = {CALIBRATED: ours["undefined"], "random": rivals["undefined"]}
-        result["pairs"] = [*_list(ours["pairs"]), *_list(rivals["pairs"])]
-        if self.finished:
-            result |= self._without_simulator()
-        return result
+        mean_predictor, regression = self._without_simulator() if self.finished else ({}, {})
+        return Scores(
+            simulations=ours.simulations + rivals.simulations,
+            undefined=ours.undefined | rivals.undefined,
+            discrepancy=ours.discrepancy | rivals.discrepancy,
+            random_median=rivals.random_median,
+            thetas=ours.thetas | rivals.thetas,
+            pairs=(*ours.pairs, *rivals.pairs),
+            mean_predictor=mean_predictor,
+            regression=regression,
+        )
 
-    def _without_simulator(self) -> dict[str, dict[str, float | None]]:
+    def _without_simulator(self) -> tuple[BySplit, BySplit]:
+        """What the mean predictor and the regression come to; worked out once."""
         if self._baselines is None:
             train = self._pours.get("train", [])
             unseen = {split: pours for split, pours in self._pours.items() if split != "train"}
-            self._baselines = {
-                "mean_predictor": {split: mean_predictor_discrepancy(train, p) for split, p in unseen.items()},
-                "regression": {
-                    split: regression_discrepancy(self._actions, train, p)
-                    for split, p in unseen.items()
-                    if split == "test"
-                },
-            }
+            test = {split: pours for split, pours in unseen.items() if split == "test"}
+            self._baselines = (
+                {split: mean_predictor_discrepancy(train, pours) for split, pours in unseen.items()},
+                {split: regression_discrepancy(self._actions, train, pours) for split, pours in test.items()},
+            )
         return self._baselines
-
-
-def _mapping(value: object) -> Mapping[str, object]:
-    assert isinstance(value, Mapping)
-    return value
-
-
-def _list(value: object) -> list[object]:
-    assert isinstance(value, list)
-    return value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,9 +25,12 @@ from orchestrator.requests import (
 from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.deployment.compromise import Compromise
 from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.learnt import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.deployment.pours import PourTrial, former_pours, trust
+from orchestrator.strategies.deployment.pours import Foretold, PourTrial, former_pours, trust
 from orchestrator.strategies.deployment.settings import SearchSettings
+from orchestrator.strategies.deployment.trust import Compared
+from orchestrator.strategies.deployment.window import WindowFound
 from orchestrator.strategies.display import displayed_action, displayed_map
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.settings import DeploymentSettings
@@ -36,6 +38,7 @@ from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.action import Action, described
 from sim_engine.liquid import SimulationParameters
+from sim_engine.spread import Spread
 from sim_engine.task import Scene
 
 MAX_REFUSED = 20
@@ -310,59 +313,82 @@ class Deployment(ABC, Generic[S]):
     @property
     def best_values(self) -> dict[str, float] | None:
         """The action to use from now on, by posterior mean [SI]; None before the end, or if nothing was learnt."""
-        if self._final is not None and self._final.best_point is not None:
-            return self._plan.actions.decode(self._final.best_point)
-        return None
+        if self._final is None or self._final.best_point is None:
+            return None
+        return self._plan.actions.decode(self._final.best_point)
 
     def progress(self) -> tuple[int, int]:
         """Steps done, steps in all."""
         return min(self._counted, self._plan.pours), self._plan.pours
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> dict[str, object]:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
         """How far the first pours bore out what was predicted."""
         return trust(weighed)
 
-    def result(self) -> dict[str, object]:
-        """What was learnt so far; actions in display units and in SI."""
-        weighed = [p for p in self._pours if p.status == "weighed" and p.cost is not None]
-        result: dict[str, object] = {
-            "strategy": self._plan.strategy,
-            "scene": self._scene.name,
-            "loss": self._plan.loss_name,
-            "simulations": self._trials.answered,
-            "simulations_lost": self._trials.lost,
-            "simulations_refused": sum(trial.refused for trial in self._trials.all),
-            "pours": [p.row(self._compromise.names) for p in self._pours if p.status != "pouring"],
-            "former_pours": len(self._former),
-            "refused_pours": self._refused,
-            "failed_pours": sum(p.status == "failed" for p in self._pours),
-            "trust": self._trusted(weighed),
-        }
-        if weighed:
-            best = min(weighed, key=lambda p: p.cost if p.cost is not None else math.inf)
-            for name, trial in (("first", weighed[0]), ("best", best), ("latest", weighed[-1])):
-                result[f"{name}_loss"] = trial.cost
-                result[f"{name}_spillage"] = trial.row(self._compromise.names)["spillage"]
-        if self._refused >= MAX_REFUSED:
-            result["gave_up"] = f"{self._refused} pours were refused as invalid; the action space hardly allows any"
-        if self._compromise.names:
-            result["objectives"] = list(self._compromise.names)
-        if self._compromise.front is not None:
-            result["front"] = self._compromise.front
+    def result(self) -> Deployed:
+        """What was learnt so far."""
+        names, front = self._compromise.names, self._compromise.front
         latest = self._final or self._latest_map
-        if latest is not None and latest.surrogate is not None:
-            result["map"] = displayed_map(latest.surrogate, self._plan.actions)
-        values = self.best_values
-        if values is not None and self._final is not None:
-            result |= {
-                "action": displayed_action(values),
-                "action_si": values,
-                "predicted_loss": self._final.best_mean,
-                "predicted_deviation": self._final.best_deviation,
-                "predicted_scatter": self._scatter(self._final, self._final.best_noise),
-                "hyperparameters": self._final.hyperparameters,
-            }
-        return result
+        return Deployed(
+            strategy=self._plan.strategy,
+            scene=self._scene.name,
+            loss=self._plan.loss_name,
+            simulations=self._trials.answered,
+            simulations_lost=self._trials.lost,
+            simulations_refused=sum(trial.refused for trial in self._trials.all),
+            pours=tuple(p.row(names) for p in self._pours if p.status != "pouring"),
+            simulated=tuple(
+                SimulatedAction(action_si=self._plan.actions.decode(trial.point), loss=trial.cost)
+                for trial in self._trials.all
+                if trial.closed and trial.cost is not None
+            ),
+            former_pours=len(self._former),
+            refused_pours=self._refused,
+            failed_pours=sum(p.status == "failed" for p in self._pours),
+            trust=self._trusted([p for p in self._pours if p.status == "weighed" and p.cost is not None]),
+            gave_up=self._gave_up,
+            objectives=names,
+            front=None if front is None else tuple(front),
+            map=None if latest is None else displayed_map(latest.surrogate, self._plan.actions),
+            recommended=None if self._final is None else self._recommended(self._final),
+            risk=None if self._final is None else self._risk_found(self._final),
+            window=self._window_found(),
+        )
+
+    @property
+    def _gave_up(self) -> str | None:
+        if self._refused < MAX_REFUSED:
+            return None
+        return f"{self._refused} pours were refused as invalid; the action space hardly allows any"
+
+    def _recommended(self, final: Suggestion) -> Recommended | None:
+        """What the last answer recommends, and what to expect of it."""
+        if final.best_point is None or final.best_mean is None or final.best_deviation is None:
+            return None
+        values = self._plan.actions.decode(final.best_point)
+        spillage = self._spillage(final.best_point)
+        return Recommended(
+            action=displayed_action(values),
+            action_si=values,
+            predicted_loss=final.best_mean,
+            predicted_deviation=final.best_deviation,
+            predicted_scatter=self._scatter(final, final.best_noise),
+            predicted_spillage=None if spillage is None else spillage.mean,
+            predicted_spillage_deviation=None if spillage is None else spillage.deviation,
+            hyperparameters=final.hyperparameters,
+        )
+
+    def _spillage(self, point: Point) -> Spread | None:
+        """r = spilled / poured over the simulations of an action, where they are kept."""
+        return None
+
+    def _risk_found(self, final: Suggestion) -> RiskFound | None:
+        """What errors of execution do to the recommended action."""
+        return None
+
+    def _window_found(self) -> WindowFound | None:
+        """How far the recommended action may be missed."""
+        return None
 
 
 def _objective(observed: Sequence[tuple[Point, Vector]], index: int) -> Data:

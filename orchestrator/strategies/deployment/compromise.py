@@ -10,6 +10,7 @@ from actors.optimizer.core.problem import Data, Point, Suggestion
 from orchestrator.requests import Simulate
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.front import random_weights, scalarised, undominated
+from orchestrator.strategies.deployment.learnt import FrontAction
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.trials import Trial
@@ -30,7 +31,7 @@ class Compromise:
         self._rng = rng
         self._vectors: dict[Simulate, Vector] = {}
         self._weights: Vector | None = None
-        self.front: list[dict[str, object]] | None = None
+        self.front: list[FrontAction] | None = None
 
     @property
     def wanted(self) -> bool:
@@ -97,10 +98,10 @@ class Compromise:
             values = actions.decode(candidates[i])
             deviations = [answer.prediction_deviations[i] for answer in answers]
             self.front.append(
-                {
-                    "action": displayed_action(values),
-                    "action_si": values,
-                    "objectives": dict(zip(self.names, means[i], strict=True)),
-                    "deviations": dict(zip(self.names, deviations, strict=True)),
-                }
+                FrontAction(
+                    action=displayed_action(values),
+                    action_si=values,
+                    objectives=dict(zip(self.names, means[i], strict=True)),
+                    deviations=dict(zip(self.names, deviations, strict=True)),
+                )
             )

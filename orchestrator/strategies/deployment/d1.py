@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
-from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
+from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
 from orchestrator.config.yaml.sections import Count, PositiveCount
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
 from orchestrator.strategies.deployment.risk import RiskSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
-from orchestrator.strategies.deployment.window import SafeWindow, WindowSettings
+from orchestrator.strategies.deployment.window import SafeWindow, WindowFound, WindowSettings
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.settings import Complaints, Premises
 from orchestrator.strategies.sound import is_sound
@@ -252,19 +252,12 @@ class OneShotPlanning(Deployment[D1Settings]):
         checks = 0 if self._window is None else sum(len(t.requests) for t in self._trials.all[len(self._searched) :])
         return answered + self._counted, self._settings.rounds * repeats + checks + pours
 
-    def result(self) -> dict[str, object]:
-        """As every deployment; with r = spilled / poured over the simulations of the recommended action.
+    def _spillage(self, point: Point) -> Spread | None:
+        """These seeds took part in choosing the action; `orchestrator.strategies.repeats` has fresh ones."""
+        tried = [trial for trial in self._searched if trial.point == point]
+        return Spread.of([r for trial in tried for q in trial.requests if (r := self._spillages.get(q)) is not None])
 
-        These seeds took part in choosing the action; `orchestrator.strategies.repeats` has fresh ones.
-        """
-        result = super().result()
-        if self._final is not None and self._final.best_point is not None:
-            tried = [trial for trial in self._searched if trial.point == self._final.best_point]
-            known = [r for trial in tried for q in trial.requests if (r := self._spillages.get(q)) is not None]
-            spillage = Spread.of(known)
-            result["predicted_spillage"] = None if spillage is None else spillage.mean
-            result["predicted_spillage_deviation"] = None if spillage is None else spillage.deviation
-        if self._window is not None and self._window.closed:
-            simulations = sum(len(trial.requests) for trial in self._trials.all[len(self._searched) :])
-            result["window"] = {**self._window.result(), "simulations": simulations}
-        return result
+    def _window_found(self) -> WindowFound | None:
+        if self._window is None or not self._window.closed:
+            return None
+        return self._window.result(sum(len(trial.requests) for trial in self._trials.all[len(self._searched) :]))

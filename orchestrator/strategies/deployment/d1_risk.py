@@ -12,6 +12,7 @@ from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Failed, Outcome, Prediction, Request, Simulate
 from orchestrator.strategies.deployment.base import MAX_REFUSED, Deployment
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.learnt import RiskFound
 from orchestrator.strategies.deployment.risk import Disturbances, Draw
 from orchestrator.strategies.deployment.window import SafeWindow
 from sim_engine.action import Action
@@ -155,18 +156,22 @@ class RobustPlanning(OneShotPlanning):
         index = min(range(len(suggestion.predictions)), key=suggestion.predictions.__getitem__)
         return suggestion.risk.expected[index], suggestion.risk.spreads[index]
 
-    def result(self) -> dict[str, object]:
-        """As D1; with the measure, and mean and spread over the disturbances."""
-        result = super().result()
+    @property
+    def _gave_up(self) -> str | None:
         if self._nothing_allowed:
-            result["gave_up"] = "at every action that was tried the cups touch as planned, or every simulation failed"
-        if self._final is not None and (known := self._answer(self._final)) is not None:
-            result["risk"] = {
-                "measure": self._risk.measure,
-                "level": self._risk.tail,
-                "value": self._final.best_mean,
-                "expected": known[0],
-                "spread": known[1],
-                "thetas": len(self._plan.thetas) if self._risk.theta == "posterior" else 0,
-            }
-        return result
+            return "at every action that was tried the cups touch as planned, or every simulation failed"
+        return super()._gave_up
+
+    def _risk_found(self, final: Suggestion) -> RiskFound | None:
+        """The measure, and mean and spread over the disturbances."""
+        known = self._answer(final)
+        if known is None or final.best_mean is None:
+            return None
+        return RiskFound(
+            measure=self._risk.measure,
+            level=self._risk.tail,
+            value=final.best_mean,
+            expected=known[0],
+            spread=known[1],
+            thetas=len(self._plan.thetas) if self._risk.theta == "posterior" else 0,
+        )

@@ -10,10 +10,10 @@ from orchestrator.config.yaml.sections import Count, CountOrFree
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.deployment.pours import PourTrial
+from orchestrator.strategies.deployment.pours import Foretold, PourTrial
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
-from orchestrator.strategies.deployment.trust import TrustCheck, TrustOrAlways, TrustSettings
+from orchestrator.strategies.deployment.trust import Compared, TrustCheck, TrustOrAlways, TrustSettings
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.settings import Complaints, Premises
 from sim_engine.liquid import SimulationParameters
@@ -245,7 +245,7 @@ class Hybrid(Deployment[D3Settings]):
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> dict[str, object]:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
         return super()._trusted(weighed) if self._check is None else self._check.result()
 
     def progress(self) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from actors.optimizer.core.problem import Point
 from orchestrator.plan import ExistingPours
@@ -12,6 +13,7 @@ from orchestrator.requests import Prediction
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.display import displayed_action
+from orchestrator.strategies.learnt import Part
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
 from sim_engine.space import Space
@@ -20,6 +22,62 @@ from sim_engine.task import Scene
 TRUST_POURS = 5
 TRUST_LIMIT = 3.0
 """Mean |z| of the first pours above which the predictions are called untrustworthy."""
+
+
+Status = Literal["pouring", "weighed", "refused", "failed"]
+
+
+class PourRow(Part):
+    """A real pour of a deployment: what was chosen and expected, and what came of it."""
+
+    number: int
+    """From 1; a refused one does not count, and the next one bears its number."""
+
+    status: Status
+    """'refused': an invalid action, nothing was poured. 'failed': something went wrong under way."""
+
+    reason: str
+    """Why it was refused or failed."""
+
+    action: dict[str, float | None]
+    """Searched dimensions in display units."""
+
+    action_si: dict[str, float]
+    """The same in SI."""
+
+    predicted: float | None
+    """Expected loss, in the loss' own unit; None where nothing was known."""
+
+    predicted_deviation: float | None
+    """How well that mean is known."""
+
+    predicted_scatter: float | None
+    """How much a single pour differs from it."""
+
+    loss: float | None
+    """In its own unit; of a failed pour the worst, where it counts."""
+
+    objectives: dict[str, float]
+    """Each by its name, where there are several."""
+
+    spillage: float | None
+    """r = spilled / poured; None below 5 % poured, and where nothing was weighed."""
+
+    spilled_g: float | None
+    """Beside the receiver."""
+
+    retained_g: float | None
+    """Left in the pourer."""
+
+
+class Foretold(Part):
+    """How far the first pours were from what was predicted."""
+
+    z_scores: tuple[float, ...]
+    """Weighed minus predicted loss, in standard deviations."""
+
+    alarm: bool
+    """They were so far from it that the predictions should not be trusted."""
 
 
 @dataclass
@@ -38,31 +96,30 @@ class PourTrial:
     predicted: Prediction | None
     noise: float
     cost: float | None = None
-    status: str = "pouring"
+    status: Status = "pouring"
     reason: str = ""
     mishap: bool = False
     measurement: PourMeasurement | None = None
     vector: Vector | None = None
 
-    def row(self, objectives: tuple[str, ...]) -> dict[str, object]:
+    def row(self, objectives: tuple[str, ...]) -> PourRow:
         """As results have it; `objectives` are their names, where there are any."""
-        weighed = self.measurement
-        values = {} if self.vector is None else dict(zip(objectives, self.vector, strict=False))
-        return {
-            "number": self.number,
-            "status": self.status,
-            "reason": self.reason,
-            "action": displayed_action(self.values),
-            "action_si": self.values,
-            "predicted": None if self.predicted is None else self.predicted.mean,
-            "predicted_deviation": None if self.predicted is None else self.predicted.deviation,
-            "predicted_scatter": None if self.predicted is None else self.predicted.scatter,
-            "loss": self.cost,
-            **({"objectives": values} if objectives else {}),
-            "spillage": None if weighed is None else normalised_spillage(weighed.fractions),
-            "spilled_g": None if weighed is None else weighed.spilled * 1e3,
-            "retained_g": None if weighed is None else weighed.retained * 1e3,
-        }
+        weighed, predicted = self.measurement, self.predicted
+        return PourRow(
+            number=self.number,
+            status=self.status,
+            reason=self.reason,
+            action=displayed_action(self.values),
+            action_si=self.values,
+            predicted=None if predicted is None else predicted.mean,
+            predicted_deviation=None if predicted is None else predicted.deviation,
+            predicted_scatter=None if predicted is None else predicted.scatter,
+            loss=self.cost,
+            objectives={} if self.vector is None else dict(zip(objectives, self.vector, strict=False)),
+            spillage=None if weighed is None else normalised_spillage(weighed.fractions),
+            spilled_g=None if weighed is None else weighed.spilled * 1e3,
+            retained_g=None if weighed is None else weighed.retained * 1e3,
+        )
 
 
 def former_pours(
@@ -78,7 +135,7 @@ def former_pours(
     return tuple(found)
 
 
-def trust(weighed: Sequence[PourTrial]) -> dict[str, object]:
+def trust(weighed: Sequence[PourTrial]) -> Foretold:
     """How far the first pours were from what was predicted, in predicted deviations (noise included).
 
     A prior from an untrustworthy simulation makes D3 worse than no prior at all, so people should be told.
@@ -89,4 +146,4 @@ def trust(weighed: Sequence[PourTrial]) -> dict[str, object]:
             spread = math.hypot(trial.predicted.deviation, trial.noise)
             scores.append((trial.cost - trial.predicted.mean) / max(spread, 1e-9))
     mean = sum(map(abs, scores)) / len(scores) if scores else None
-    return {"z_scores": scores, "alarm": bool(len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)}
+    return Foretold(z_scores=tuple(scores), alarm=len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)

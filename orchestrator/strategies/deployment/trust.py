@@ -14,6 +14,7 @@ from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Section, word_or
 from orchestrator.requests import Ask, Decision
 from orchestrator.strategies.deployment.pours import PourTrial
+from orchestrator.strategies.learnt import Part
 
 FEWEST_POURS = 3
 """Pours before which nothing is said: one or two may be bad luck."""
@@ -67,6 +68,37 @@ class Comparison:
     def z(self) -> float:
         """By how many deviations it was worse (or, below 0, better) than simulated."""
         return (self.weighed - self.simulated) / self.deviation
+
+
+class Compared(Part):
+    """The first pours beside what the simulations alone say of their actions, and what followed."""
+
+    z_scores: tuple[float, ...]
+    """By how many deviations each was worse than simulated."""
+
+    alarm: bool
+    """The simulator promised too much."""
+
+    better: bool
+    """The simulator promised too little, by as much as would be an alarm the other way."""
+
+    mean_z: float
+    """Mean of max(z, 0)."""
+
+    limit: float
+    """From which mean on it is an alarm."""
+
+    policy: str
+    """What the campaign asks for on an alarm."""
+
+    followed: str | None
+    """What followed; None without an alarm, or while nobody has said."""
+
+    pours: tuple[Comparison, ...]
+    """The compared pours."""
+
+    text: str
+    """All of it in a sentence."""
 
 
 class TrustCheck:
@@ -157,19 +189,16 @@ class TrustCheck:
         worse = f"worse by {self.mean_z:.1f} deviations in the mean, limit {self._settings.limit:g}"
         return f"weighed for simulated {pairs}; {worse}"
 
-    def result(self) -> dict[str, object]:
-        """JSON-ready: every comparison, whether it is an alarm, and what followed."""
-        return {
-            "z_scores": [one.z for one in self.comparisons],
-            "alarm": self.alarm,
-            "better": self.better,
-            "mean_z": self.mean_z,
-            "limit": self._settings.limit,
-            "policy": self._settings.policy,
-            "followed": self.policy,
-            "pours": [
-                {"number": c.number, "simulated": c.simulated, "deviation": c.deviation, "weighed": c.weighed}
-                for c in self.comparisons
-            ],
-            "text": self._text if self.comparisons else "",
-        }
+    def result(self) -> Compared:
+        """Every comparison, whether it is an alarm, and what followed."""
+        return Compared(
+            z_scores=tuple(one.z for one in self.comparisons),
+            alarm=self.alarm,
+            better=self.better,
+            mean_z=self.mean_z,
+            limit=self._settings.limit,
+            policy=self._settings.policy,
+            followed=self.policy,
+            pours=tuple(self.comparisons),
+            text=self._text if self.comparisons else "",
+        )

@@ -10,6 +10,7 @@ from actors.optimizer.core.problem import Point
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Section
 from orchestrator.strategies.display import displayed_action
+from orchestrator.strategies.learnt import Part
 from sim_engine.space import Space
 
 PLACES = 40
@@ -35,6 +36,67 @@ class WindowSettings(Section):
         """The tolerance, which settings without a complaint have."""
         assert self.tolerance is not None, "required"
         return self.tolerance
+
+
+class WindowEnds(Part):
+    """How far one dimension may be missed."""
+
+    low: float
+    """Lower end [SI]."""
+
+    high: float
+    """Upper end [SI]."""
+
+    cut_off: tuple[Way, ...]
+    """The ends that are the searched box'."""
+
+
+class Outline(Part):
+    """What the surrogate expects along one dimension."""
+
+    values: tuple[float, ...]
+    """Places, upwards [SI]."""
+
+    expected: tuple[float, ...]
+    """Losses there."""
+
+
+class CheckedAction(Part):
+    """An action that was simulated to see whether it lies inside."""
+
+    axis: str | None
+    """The dimension that is missed; None for the action itself."""
+
+    action_si: dict[str, float]
+    """Searched dimensions [SI]."""
+
+    loss: float | None
+    """Mean loss; None where nothing could be used."""
+
+    inside: bool
+    """Whether it passed."""
+
+
+class WindowFound(Part):
+    """How far one may miss the planned action, one dimension at a time."""
+
+    tolerance: float
+    """Largest loss inside, in the loss' own unit."""
+
+    axes: dict[str, WindowEnds]
+    """By dimension; empty if the action itself is not inside."""
+
+    outline: dict[str, Outline]
+    """By dimension."""
+
+    display: dict[Way, dict[str, float | None]]
+    """The ends in the units of people."""
+
+    checks: tuple[CheckedAction, ...]
+    """All that was simulated."""
+
+    simulations: int
+    """How many that took."""
 
 
 @dataclass(frozen=True)
@@ -180,44 +242,39 @@ class SafeWindow:
         end = 0.0 if way == "low" else 1.0
         return (*self._centre[:index], u + (end - u) * place / PLACES, *self._centre[index + 1 :])
 
-    def result(self) -> dict[str, object]:
-        """JSON-ready.
-
-        Returns:
-            'axes': ends in SI, empty if the action itself is not inside; an end that is the searched box' is in
-            'cut_off'. 'display': the same in the units of people. 'checks': all that was simulated. 'outline': what
-            the surrogate had expected.
-        """
+    def result(self, simulations: int) -> WindowFound:
+        """What was found with that many simulations."""
         ends: dict[Way, dict[str, float]] = {"low": {}, "high": {}}
         cut_off: dict[str, list[Way]] = {}
         if not self._fails(Check(self._centre)):
             for (name, way), side in self._sides.items():
                 ends[way][name] = self._actions.decode(self._at(name, way, side.inside))[name]
                 cut_off.setdefault(name, []).extend([way] if side.inside == PLACES else [])
-        return {
-            "tolerance": self._tolerance,
-            "axes": {
-                name: {"low": ends["low"][name], "high": ends["high"][name], "cut_off": cut_off[name]}
+        return WindowFound(
+            tolerance=self._tolerance,
+            axes={
+                name: WindowEnds(low=ends["low"][name], high=ends["high"][name], cut_off=tuple(cut_off[name]))
                 for name in cut_off
             },
-            "outline": {name: self._profile(name) for name in self._actions.names},
-            "display": {way: displayed_action(values) for way, values in ends.items()},
-            "checks": [
-                {
-                    "axis": check.axis or None,
-                    "action_si": self._actions.decode(check.point),
-                    "loss": loss,
-                    "inside": not self._fails(check),
-                }
+            outline={name: self._profile(name) for name in self._actions.names},
+            display={way: displayed_action(values) for way, values in ends.items()},
+            checks=tuple(
+                CheckedAction(
+                    axis=check.axis or None,
+                    action_si=self._actions.decode(check.point),
+                    loss=loss,
+                    inside=not self._fails(check),
+                )
                 for check, loss in self._losses.items()
-            ],
-        }
+            ),
+            simulations=simulations,
+        )
 
-    def _profile(self, name: str) -> dict[str, list[float]]:
+    def _profile(self, name: str) -> Outline:
         """What the surrogate expects along one dimension, upwards: values [SI] and losses."""
         down, up = (list(enumerate(self._expected[name, way])) for way in _WAYS)
         low: list[tuple[Way, int, float]] = [("low", *row) for row in reversed(down[1:])]
         high: list[tuple[Way, int, float]] = [("high", *row) for row in up]
         along = low + high
         values = [self._actions.decode(self._at(name, way, place))[name] for way, place, _ in along]
-        return {"values": values, "expected": [loss for _, _, loss in along]}
+        return Outline(values=tuple(values), expected=tuple(loss for _, _, loss in along))

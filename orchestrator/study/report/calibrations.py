@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from orchestrator.report import style
+from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.drawing import Drawn, colour, look, strategy_of
-from orchestrator.study.report.gather import UNCALIBRATED, Calibrated, Gathered, mean, running_least
+from orchestrator.study.report.gather import UNCALIBRATED, Found, Gathered, mean, running_least
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate
 
 
@@ -30,7 +30,7 @@ def error(one: Estimate) -> list[list[float]]:
     return [[np.nan_to_num(one.mean - one.low)], [np.nan_to_num(one.high - one.mean)]]
 
 
-def _boxes(known: Mapping[str, Calibrated]) -> Drawn:
+def _boxes(known: Mapping[str, Found]) -> Drawn:
     figure, axes = style.new_figure(size=(1.6 + 1.25 * len(known), 4.2))
     rows: list[list[object]] = []
     for place, (name, one) in enumerate(known.items(), start=1):
@@ -56,7 +56,7 @@ def _boxes(known: Mapping[str, Calibrated]) -> Drawn:
     )
 
 
-def _against_simulations(known: Mapping[str, Calibrated]) -> Drawn:
+def _against_simulations(known: Mapping[str, Found]) -> Drawn:
     figure, axes = style.new_figure(size=(6.4, 4.2))
     rows: list[list[object]] = []
     for name, one in known.items():
@@ -93,20 +93,19 @@ def _against_simulations(known: Mapping[str, Calibrated]) -> Drawn:
     )
 
 
-def _curve(name: str, result: Mapping[str, Any], expected: list[list[float]]) -> list[tuple[int, float]]:
+def _curve(name: str, result: Calibrated, expected: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
     """(simulations, best discrepancy so far)."""
-    final = (int(result["simulations"]), float(result["predicted_discrepancy"]))
     if strategy_of(name) == "C3":
-        each = result["training_pours"]
-        values = [float("nan") if t["discrepancy"] is None else t["discrepancy"] for t in result["trials"]]
+        each = result.training_pours
+        values = [float("nan") if t.discrepancy is None else t.discrepancy for t in result.trials]
         return [(each * (i + 1), value) for i, value in enumerate(running_least(values))]
     if strategy_of(name) == "C4":
         best = running_least([max(value, 0.0) for _, value in expected])
-        return [(int(spent), value) for (spent, _), value in zip(expected, best, strict=True)]
-    return [final]
+        return [(spent, value) for (spent, _), value in zip(expected, best, strict=True)]
+    return [] if result.found is None else [(result.simulations, result.found.predicted_discrepancy)]
 
 
-def _over_theta(study: StudyPlan, known: Mapping[str, Calibrated]) -> Drawn:
+def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
     figure, grid = style.new_figure(1, len(known), size=(1.0 + 3.4 * len(known), 3.9), squeeze=False)
     rows: list[list[object]] = []
     names: list[str] = []
@@ -114,32 +113,32 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Calibrated]) -> Drawn:
     shown = None
     top = 100 * max((_largest(one) for one in known.values()), default=1.0)
     for axes, (name, one) in zip(grid[0], known.items(), strict=True):
-        maps = [result["map"] for result in one.results if result.get("map")]
-        searched = one.results[0]["searched"]
-        names = list(maps[0]["over"]) if maps else (searched * 2)[:2]
+        found = [result.found for result in one.results if result.found is not None]
+        maps = [theta.map for theta in found if theta.map is not None]
+        names = list(maps[0].over) if maps else [*found[0].searched, *found[0].searched][:2]
         settings = {"cmap": "viridis", "vmin": 0.0, "vmax": top}
         if strategy_of(name) in ("C1", "C2"):
             tried: dict[tuple[float, float], list[float]] = {}
             for result in one.results:
-                for trial in result["trials"]:
-                    if trial["discrepancy"] is not None:
-                        place = (trial["theta"][names[0]], trial["theta"][names[1]])
-                        tried.setdefault(place, []).append(100 * trial["discrepancy"])
+                for trial in result.trials:
+                    if trial.discrepancy is not None:
+                        place = (trial.theta[names[0]], trial.theta[names[1]])
+                        tried.setdefault(place, []).append(100 * trial.discrepancy)
             places = list(tried)
             values = [mean(tried[place]) for place in places]
             shown = axes.scatter([p[0] for p in places], [p[1] for p in places], c=values, marker="s", s=70, **settings)
             rows += [[name, "trial", names[0], x, names[1], y, v] for (x, y), v in zip(places, values, strict=True)]
         elif maps:
-            alike = [m for m in maps if m["over"] == names]
-            surface = 100 * np.mean([np.maximum(m["mean"], 0.0) for m in alike], axis=0)
-            xs, ys = alike[0]["axes"][names[0]], alike[0]["axes"][names[1]]
+            alike = [m for m in maps if list(m.over) == names]
+            surface = 100 * np.mean([np.maximum(m.mean, 0.0) for m in alike], axis=0)
+            xs, ys = alike[0].axes[names[0]], alike[0].axes[names[1]]
             shown = axes.pcolormesh(xs, ys, surface, shading="nearest", **settings)
             rows += [
                 [name, "surrogate", names[0], x, names[1], y, float(surface[j, i])]
                 for j, y in enumerate(ys)
                 for i, x in enumerate(xs)
             ]
-        stars = [(r["theta"][names[0]], r["theta"][names[1]]) for r in one.results]
+        stars = [(getattr(theta.theta, names[0]), getattr(theta.theta, names[1])) for theta in found]
         axes.plot([x for x, _ in stars], [y for _, y in stars], "x", color=style.BEST, markersize=8, label="θ*")
         rows += [[name, "theta*", names[0], x, names[1], y, ""] for x, y in stars]
         for axis, limit, scale in (
@@ -165,6 +164,6 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Calibrated]) -> Drawn:
     )
 
 
-def _largest(one: Calibrated) -> float:
-    values = [t["discrepancy"] for r in one.results for t in r["trials"] if t["discrepancy"] is not None]
+def _largest(one: Found) -> float:
+    values = [t.discrepancy for r in one.results for t in r.trials if t.discrepancy is not None]
     return float(np.percentile(values, 90)) if values else 0.0

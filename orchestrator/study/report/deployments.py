@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from orchestrator.report import style
-from orchestrator.report.units import LossUnit, deployment_unit
+from orchestrator.report.units import LossUnit, deployment_unit, largest_loss
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.calibrations import error
 from orchestrator.study.report.drawing import Drawn, colour, legend, log_axis, look
 from orchestrator.study.report.gather import Gathered, Key, at_pour, mean
-from orchestrator.study.report.intervals import SHARE, Estimate, Range, estimate
+from orchestrator.study.report.intervals import Estimate, Range, estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,9 +43,7 @@ def places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str], lis
 
 def loss_range(study: StudyPlan) -> Range:
     """What a loss can be: a share, or anything from 0."""
-    plan = study.deployments[0].plan
-    masses = plan.objectives is not None or plan.loss.name in ("grams", "particles")
-    return (0.0, math.inf) if masses else (0.0, max(plan.loss.retained_weight, SHARE[1]))
+    return (0.0, largest_loss(study.deployments[0].plan))
 
 
 def mean_loss(study: StudyPlan, losses: Sequence[float]) -> Estimate:

@@ -5,17 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
+from orchestrator.results import learnt_by
 from orchestrator.stages import CALIBRATION, EVALUATION
+from orchestrator.strategies.calibration.base import Calibrated
+from orchestrator.strategies.calibration.evaluation import Scores
+from orchestrator.strategies.calibration.scorecard import CALIBRATED
+from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.study.cells import FINAL, Cell, cells_of
+from orchestrator.study.folder import CellResult
 from orchestrator.study.plan import StudyPlan
+from orchestrator.study.strategies import FinalPoured
 
 UNCALIBRATED = "uncalibrated"
 
 
 @dataclass
-class Calibrated:
+class Found:
     """What one strategy found in its repetitions at the compared level.
 
     Attributes:
@@ -29,9 +35,9 @@ class Calibrated:
     test: list[list[float]] = field(default_factory=list)
     train: list[list[float]] = field(default_factory=list)
     simulations: list[int] = field(default_factory=list)
-    results: list[Mapping[str, Any]] = field(default_factory=list)
+    results: list[Calibrated] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
-    expected: list[list[list[float]]] = field(default_factory=list)
+    expected: list[tuple[tuple[int, float], ...]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,7 @@ class Gathered:
         cpu_s, seconds: of all cells.
     """
 
-    calibrated: dict[str, Calibrated] = field(default_factory=dict)
+    calibrated: dict[str, Found] = field(default_factory=dict)
     losses: dict[Key, list[list[float]]] = field(default_factory=dict)
     numbers: dict[Key, list[int]] = field(default_factory=dict)
     finals: dict[Key, dict[int, list[Final]]] = field(default_factory=dict)
@@ -86,7 +92,7 @@ class Gathered:
         return dict(zip(self.numbers.get(key, []), at_pour(self.best_so_far(key), pour), strict=True))
 
 
-def gather(study: StudyPlan, results: Mapping[str, Mapping[str, Any]]) -> Gathered:
+def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
     """Sort what the finished cells came to.
 
     Args:
@@ -101,45 +107,45 @@ def gather(study: StudyPlan, results: Mapping[str, Mapping[str, Any]]) -> Gather
             continue
         data = results[cell.id]
         found.finished += 1
-        found.simulations += data["simulations"]
-        found.pours += data["pours"]
-        found.cpu_s += data["cpu_s"]
-        found.seconds += data["seconds"]
+        found.simulations += data.simulations
+        found.pours += data.pours
+        found.cpu_s += data.cpu_s
+        found.seconds += data.seconds
         if cell.kind in ("calibration", "uncalibrated") and cell.level == study.compared:
-            _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Calibrated()), cell, data)
+            _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Found()), cell, data)
         elif cell.kind == "deployment":
             key = Key(cell.level, receivers[cell.receiver], cell.arm)
-            found.losses.setdefault(key, []).append(_losses(cell, data))
+            found.losses.setdefault(key, []).append(_losses(data))
             found.numbers.setdefault(key, []).append(cell.repetition)
         elif cell.kind == "final":
             key = Key(cell.level, receivers[cell.receiver], cell.arm)
-            one = data["results"][FINAL]
-            pour = Final(float(one["loss"]), float(one["spillage"]), bool(one["made"]))
+            one = learnt_by(data.results, FINAL, FinalPoured)
+            pour = Final(one.loss, one.spillage, one.made)
             found.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
     found.calibrated = {name: found.calibrated[name] for name in order if name in found.calibrated}
     return found
 
 
-def _note_calibration(noted: Calibrated, cell: Cell, data: Mapping[str, Any]) -> None:
+def _note_calibration(noted: Found, cell: Cell, data: CellResult) -> None:
     pairs = [
-        (pair["split"], abs(pair["measured"] - pair["simulated"]))
-        for pair in data["results"][EVALUATION]["pairs"]
-        if pair["theta"] == "theta" and pair["simulated"] is not None
+        (pair.split, abs(pair.measured - pair.simulated))
+        for pair in learnt_by(data.results, EVALUATION, Scores).pairs
+        if pair.theta == CALIBRATED and pair.measured is not None and pair.simulated is not None
     ]
     noted.test.append([difference for split, difference in pairs if split == "test"])
     noted.train.append([difference for split, difference in pairs if split == "train"])
     noted.numbers.append(cell.repetition)
-    result = data["results"].get(CALIBRATION)
-    noted.simulations.append(0 if result is None else result["simulations"])
+    result = learnt_by(data.results, CALIBRATION, Calibrated) if CALIBRATION in data.results else None
+    noted.simulations.append(0 if result is None else result.simulations)
     if result is not None:
         noted.results.append(result)
-        noted.expected.append(data.get("expected", []))
+        noted.expected.append(data.expected)
 
 
-def _losses(cell: Cell, data: Mapping[str, Any]) -> list[float]:
-    rows = next(iter(data["results"].values()))["pours"]
-    counted = [row for row in rows if row["status"] in ("weighed", "failed")]
-    return [math.nan if row["loss"] is None else float(row["loss"]) for row in counted]
+def _losses(data: CellResult) -> list[float]:
+    (deployed,) = (one for one in data.results.values() if isinstance(one, Deployed))
+    counted = [pour for pour in deployed.pours if pour.status in ("weighed", "failed")]
+    return [math.nan if pour.loss is None else pour.loss for pour in counted]
 
 
 def running_least(values: Sequence[float]) -> list[float]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orchestrator.report.units import deployment_unit
+from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.deployments import checkpoints, loss_range, mean_loss, most_pours, places
 from orchestrator.study.report.effects import ALL, Effect, at_pour_of, effect, tests_of
@@ -188,10 +189,10 @@ def _effect_row(
     return [compared, of, level, receiver, count, one.difference.scaled(factor), f"{one.better} of {count}", chance]
 
 
-def _thetas(results: Sequence[object]) -> str:
-    texts = []
-    for name in results[0]["searched"] if results else ():  # type: ignore[index]
-        values = [result["theta"][name] for result in results]  # type: ignore[index]
+def _thetas(results: Sequence[Calibrated]) -> str:
+    texts, found = [], [one.found for one in results if one.found is not None]
+    for name in found[0].searched if found else ():
+        values = [getattr(one.theta, name) for one in found]
         texts.append(f"{name} {np.mean(values):.3g} ± {np.std(values):.2g}")
     return ", ".join(texts)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from actors.balance.dialects import DIALECTS
+from actors.balance.doors import dialects
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.settling import SettlingRule
 from actors.balance.spec import SerialBalanceSpec
@@ -87,7 +87,7 @@ def driver(virtual: Any) -> Iterator[Callable[..., tuple[VirtualSerialBalance, S
         balance.close()
 
 
-@pytest.fixture(params=list(DIALECTS))
+@pytest.fixture(params=list(dialects()))
 def each_dialect(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name

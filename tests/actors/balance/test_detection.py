@@ -11,7 +11,8 @@ from dataclasses import asdict
 import pytest
 import serial
 
-from actors.balance.dialects import DIALECTS, LineSettings
+from actors.balance.dialects.dialect import LineSettings
+from actors.balance.doors import dialects
 from actors.balance.errors import BalanceError, LineSettingsError, UnknownDialectError
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.settling import SettlingRule
@@ -43,7 +44,7 @@ def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable
 def test_the_dialect_is_found_out_and_then_used(unknown, voice):
     far, balance = unknown(voice)
     said = balance.connect()
-    assert said.startswith(DIALECTS[OF_VOICE.get(voice, voice)].title)
+    assert said.startswith(dialects()[OF_VOICE.get(voice, voice)].title)
     far.put(0.2)
     assert balance.weigh().mass == pytest.approx(0.2, abs=1e-9)
 
@@ -82,7 +83,7 @@ def test_where_nothing_answers_it_is_said_what_was_tried(unknown):
     said = str(caught.value)
     assert said.startswith(f"balance kern-1 ({far.port}): no balance recognised (looked for Kern KCP, older Kern")
     assert "Nothing came at all: is the balance switched on" in said
-    assert "9600 baud 8N1: Sartorius SBI → nothing, older Kern (s/w/t) → nothing, Kern KCP, MT-SICS → nothing" in said
+    assert "9600 baud 8N1: Sartorius SBI → nothing, older Kern (s/w/t) → nothing, Kern KCP, Mettler-Toledo" in said
 
 
 def test_gibberish_is_said_to_be_a_matter_of_speed_and_parity(unknown):
@@ -94,6 +95,19 @@ def test_gibberish_is_said_to_be_a_matter_of_speed_and_parity(unknown):
             balance.connect()
     finally:
         far.close()
+
+
+@pytest.mark.parametrize("voice", ["kcp", "kern-swt", "mt-sics", "sbi"])
+def test_a_balance_that_takes_its_time_is_recognised_all_the_same(unknown, voice):
+    far, balance = unknown(voice)
+    far.faults(delay=0.9)  # a default answer_time is 1 s
+    assert balance.connect().startswith(dialects()[voice].title)
+
+
+def test_a_longer_answer_time_counts_where_only_the_dialect_is_named(unknown):
+    far, balance = unknown("kcp", dialect="kcp", answer_time=2.5)
+    far.faults(delay=2.0)
+    assert balance.connect().startswith("Kern KCP")
 
 
 def test_another_dialect_than_the_one_named_is_shown_as_it_came(unknown):

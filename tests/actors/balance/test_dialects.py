@@ -8,14 +8,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from actors.balance.dialects import DIALECTS, KCP, KERN_SWT, MT_SICS, SBI
 from actors.balance.dialects.dialect import Dialect
-from actors.balance.dialects.kern_swt import KernSwt
-from actors.balance.dialects.sbi import Sbi
+from actors.balance.dialects.kcp import KCP
+from actors.balance.dialects.kern_swt import KERN_SWT, KernSwt
+from actors.balance.dialects.mt_sics import MT_SICS
+from actors.balance.dialects.sbi import SBI, Sbi
+from actors.balance.doors import dialects
 from actors.balance.reading import Acknowledgement, Answer, FrameError, Reading, Status
 from tests.depth import examples
 
-SPEAKERS: tuple[Dialect, ...] = (*DIALECTS.values(), KernSwt(short=True), Sbi(identified=True))
+SPEAKERS: tuple[Dialect, ...] = (*dialects().values(), KernSwt(short=True), Sbi(identified=True))
 
 TYPED = [
     (MT_SICS, b"S S       0.00 g", Status.STABLE, "0.00", "g"),

@@ -7,15 +7,15 @@ import time
 
 import pytest
 
+from actors.balance.doors import voices
 from actors.balance.errors import BalanceFaultError, CommandError, NotStableError, OutOfRangeError, UnitError
 from actors.balance.settling import SettlingRule
 from actors.balance.virtual_balance import Load
-from actors.balance.virtual_serial.voice import VOICES
 
 from .conftest import SOON
 
 
-@pytest.mark.parametrize("voice", VOICES)
+@pytest.mark.parametrize("voice", voices())
 def test_a_tared_balance_weighs_what_is_added(driver, voice):
     far, balance = driver(voice)
     far.put(0.35)

@@ -65,6 +65,7 @@ def write_inputs(folder: Path) -> None:
     spoil("heavy.yaml", "mass: 100 g", "mass: 120 g")
     spoil("close.yaml", "[60 mm, 100 mm]", "[10 mm, 12 mm]")
     spoil("unwritable.yaml", "directory: runs", "directory: beaker.yaml/runs")
+    spoil("passwd.yaml", "directory: runs", "directory: /etc/passwd")
     start, end = small.CAMPAIGN.index("calibration:"), small.CAMPAIGN.index("deployment:")
     uncalibrated = small.CAMPAIGN[:start] + small.CAMPAIGN[end:]
     spoil("plan-only.yaml", "[0 N/m, 0.1 N/m]", "0.05 N/m", uncalibrated)
@@ -102,7 +103,7 @@ def write_inputs(folder: Path) -> None:
 BAD: dict[str, str] = {
     # files
     "run nowhere.yaml": "nowhere.yaml: no such file",
-    "run folder": "folder: is a directory; name a YAML file in it",
+    "run folder": "folder: is a directory; name a file in it",
     "run binary.yaml": "binary.yaml: is not text in UTF-8 (byte 128)",
     "run null.yaml": "null.yaml:2:7: not YAML: an unprintable character (code 0)",
     "run empty.yaml": "empty.yaml:1:1: the file is empty",
@@ -118,8 +119,9 @@ BAD: dict[str, str] = {
     "plan calibrate-only.yaml": "calibrate-only.yaml: has no 'deployment' section",
     # vessels and scenes
     "run heavy.yaml": "narrow holds 113.1 mL to the brim, 120.2 mL asked for",
-    "calibrate unwritable.yaml": "beaker.yaml/runs: can't be written: Not a directory",
-    "plan unwritable.yaml": "beaker.yaml/runs: can't be written: Not a directory",
+    "calibrate unwritable.yaml": "beaker.yaml/runs can't be written: ",
+    "plan unwritable.yaml": "unwritable.yaml:32:22: outputs.directory: ",
+    "calibrate passwd.yaml": "passwd.yaml:32:22: outputs.directory: /etc/passwd can't be written: /etc/passwd is",
     "run close.yaml": "deployment.actions: deployment into 'narrow': the vessels touch at every action that was",
     "run open-mesh.yaml": "open.stl: not watertight: 3 edge(s)",
     "run solid-mesh.yaml": "solid.stl: no cavity: the mesh is one closed skin",

@@ -204,6 +204,13 @@ def test_balance_that_is_unplugged_or_silent_is_told_with_what_to_do(
         tmp_path / "a.yaml", controller.address, "balance: {placement: tray, port: /dev/serial/by-id/nothing}"
     )
     assert "isn't there" in checked(missing)["balance port"]["found"]
+    for port, says in (("/dev/null", "not a serial port"), (tmp_path, "a folder"), (missing, "a file")):
+        wrong = hardware.write_laboratory(
+            tmp_path / "c.yaml", controller.address, f"balance: {{placement: tray, port: {port}}}"
+        )
+        checks = checked(wrong)
+        assert (checks["balance port"]["state"], "balance" in checks) == ("fail", False)
+        assert says in checks["balance port"]["found"]
     present = hardware.write_laboratory(
         tmp_path / "b.yaml", controller.address, f"balance: {{placement: tray, port: {balance.port}, dialect: kcp}}"
     )

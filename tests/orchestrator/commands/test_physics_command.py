@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.text import Text
 from typer.testing import CliRunner
 
 from orchestrator.cli import app
 from orchestrator.report import physics as report
-from orchestrator.report.style import INK, new_figure
+from orchestrator.report import style
+from orchestrator.report.style import INK
 from sim_engine.validation import suite
 from sim_engine.validation.result import CaseResult, Figure, Measurement, Series, reported, within
+from tests.orchestrator.reported import strays
 
 ROOT = Path(__file__).parents[3]
 runner = CliRunner()
@@ -133,7 +137,44 @@ def test_many_panels_go_into_rows_and_spreads_are_bands(tmp_path: Path) -> None:
     assert banded.mean() < plain.mean() - 0.003  # a band darkens
 
 
-def test_references_can_be_told_apart_and_have_their_curve_s_colour() -> None:
+def saved(figure: Figure, monkeypatch: pytest.MonkeyPatch) -> Any:
+    drawn: list[Any] = []
+    monkeypatch.setattr(style, "save", lambda canvas, path: drawn.append(canvas) or path)
+    report.draw(figure, Path("figure.png"))
+    return drawn[0]
+
+
+@pytest.mark.parametrize("panels", [1, 6])
+def test_the_legend_lies_on_no_curve_and_no_number_is_tiny(panels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("slow pour", "standard pour", "fast pour")
+    curves = tuple(
+        Series(name, (250.0, 435.0, 757.0, 1_000.0, 1_320.0, 4_000.0), (0.3, 0.2, 0.15, 0.1, 0.1, 0.1), panel=panel)
+        for panel in range(panels)
+        for name in names
+    )
+    words = tuple(f"panel {panel}" for panel in range(panels))
+    canvas = saved(Figure(words, words, words, curves, log_x=True), monkeypatch)
+    assert strays(canvas) == []
+    assert [axes.get_legend() for axes in canvas.axes] == [None] * panels
+    (legend,) = canvas.legends
+    assert [text.get_text() for text in legend.get_texts()] == list(names)
+    below = legend.get_window_extent().y1
+    assert all(axes.get_window_extent().y0 > below for axes in canvas.axes)
+    smallest = min(text.get_fontsize() for text in canvas.findobj(Text) if text.get_text())
+    assert smallest / 72 / canvas.get_figwidth() > 0.01  # of the picture's width: 8 pixels on a page 800 wide
+    ticks = canvas.axes[0].get_xticklabels()
+    boxes = [tick.get_window_extent() for tick in ticks]
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def test_a_figure_is_drawn_again_from_what_is_kept_of_it() -> None:
+    case = a_case("good", height(0.0397), figure=FIGURE)
+    record = report.case_record(case, case.run(None, suite.Effort()), None, "solver")  # type: ignore[arg-type]
+    assert report.figure_of(json.loads(json.dumps(record))) == FIGURE
+    assert report.figure_of({**record, "figure": None}) is None
+
+
+def test_references_can_be_told_apart_and_have_their_curve_s_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     few, many = (1.0, 2.0, 3.0), tuple(float(i) for i in range(30))
     curves = (
         Series("cone, 2,000 particles", many, many),
@@ -144,8 +185,7 @@ def test_references_can_be_told_apart_and_have_their_curve_s_colour() -> None:
         Series("theory, C_d 1", many, many, "reference"),
         Series("theory, C_d 0.61", many, many, "reference"),
     )
-    axes = new_figure(size=(3, 2))[1]
-    report._panel(axes, Figure(("",), ("",), ("",), curves), 0)
+    (axes,) = saved(Figure(("",), ("",), ("",), curves), monkeypatch).axes
     drawn = {line.get_label(): line for line in axes.get_lines()}
     for subject in ("cone", "jug"):
         curve, points = drawn[f"{subject}, 2,000 particles"], drawn[f"{subject}, experiment"]

@@ -124,6 +124,7 @@ def test_the_balance_shown_on_that_page_is_one():
         (SIMPLE + "dialect: KCP", "hardware", r"'KCP' is not known here; did you mean 'kcp'\?"),
         (SIMPLE + "baud: fast", "hardware", r"baud: should be a whole number"),
         (SIMPLE + "repeatability: 0.1", "hardware", r"0.1 has no unit; write '0.1 g'"),
+        (SIMPLE + "repeatability: 0.1 kg", "hardware", r"lab.yaml:3:16: repeatability: 0.1 kg is outside 0 … 10 g"),
         (SIMPLE + "placment: tray", "hardware", r"did you mean 'placement'\?"),
         (SIMPLE + "settling: {span: 5 s, deadline: 2 s}", "hardware", r"'deadline' should be longer than 'span'"),
         (SIMPLE + "settling: {readings: 1}", "hardware", r"readings: 1 is too small; at least 2"),

@@ -15,7 +15,14 @@ import pytest
 from actors.bench.planning import planner
 from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-from orchestrator.config.schema import campaign_schema, laboratory_schema, schema_text, study_schema, vessel_schema
+from orchestrator.config.schema import (
+    campaign_schema,
+    laboratory_schema,
+    result_schema,
+    schema_text,
+    study_schema,
+    vessel_schema,
+)
 from orchestrator.config.yaml.source import Document
 from sim_engine.action import DEG, Action
 from sim_engine.vessel.spec import MeshShape
@@ -62,6 +69,10 @@ def test_shipped_file_names_its_schema_and_satisfies_it(path: Path) -> None:
 def test_committed_schema_is_current(kind: str) -> None:
     name = {"campaigns": "campaign", "vessels": "vessel", "laboratories": "laboratory", "studies": "study"}[kind]
     assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(SCHEMAS[kind]())
+
+
+def test_committed_schema_of_results_is_current() -> None:
+    assert (CONFIGS / "schema" / "result.json").read_text(encoding="utf-8") == schema_text(result_schema())
 
 
 def test_schema_refuses_what_an_editor_should_underline() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +15,14 @@ from orchestrator.config.load import load_campaign
 from orchestrator.plan import CampaignPlan
 from orchestrator.report.names import receiver_names
 from orchestrator.report.regimes import best_action_warnings, campaign_warnings, lines, numbers_line, regimes_of
-from orchestrator.report.summary import summarise, summary_table
+from orchestrator.report.summary import summarise
+from orchestrator.report.table import summary_table
 from sim_engine.action import DEG
+from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from tests.end_to_end import small
 from tests.orchestrator import watched
-from tests.orchestrator.reported import shown
+from tests.orchestrator.reported import changed, shown
 
 CAMPAIGNS = Path(__file__).parents[3] / "configs" / "campaigns"
 SLOW = Space((Axis("angular_velocity", 5 * DEG, 10 * DEG), Axis("max_angle", 70 * DEG, 75 * DEG)))
@@ -78,24 +79,27 @@ def test_calibration_counts_with_the_middle_of_the_particles_that_it_searches() 
     assert not thin(20_000, 50_000)
 
 
-def test_the_recommended_action_is_judged_with_the_calibrated_number_of_particles() -> None:
+def test_the_recommended_action_is_judged_with_the_calibrated_number_of_particles(results: dict[str, Any]) -> None:
     plan = deploying(QUICK)
     best = {"angular_velocity": 90 * DEG, "max_angle": 115 * DEG}
-    deployed = {"strategy": "D3", "scene": "narrow cup", "pours": [], "action_si": best}
+    learnt = results["narrow cup"]
+    deployed = changed(learnt, recommended=changed(learnt.recommended, action_si=best))
     assert best_action_warnings(plan, {"narrow cup": deployed}) == {"narrow cup": []}
-    coarse = {"theta": {"particles": 200}, "trials": []}
+    coarse = changed(
+        results["calibration"], found=changed(results["calibration"].found, theta=SimulationParameters(particles=200))
+    )
     (told,) = best_action_warnings(plan, {"calibration": coarse, "narrow cup": deployed})["narrow cup"]
     assert told.kind == "thin_stream"
-    assert best_action_warnings(plan, {"narrow cup": {**deployed, "action_si": None}}) == {}
+    assert best_action_warnings(plan, {"narrow cup": changed(deployed, recommended=None)}) == {}
 
 
-def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, dict[str, Any]]) -> None:
+def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, Any]) -> None:
     plan = watched.campaign()
     spaces = campaign_warnings(deploying(SLOW))
     deployed = {"narrow cup": results["narrow cup"]}
     best = {"narrow cup": [one.worst for one in spaces["narrow cup"]]}
     summary = summarise(plan, deployed, not_covered=spaces, best_not_covered=best)
-    written = json.loads(json.dumps(summary, allow_nan=False))
+    written = summary.model_dump(mode="json")
     assert [one["kind"] for one in written["not_covered"]["narrow cup"]] == ["dribbling", "wetting"]
     assert [one["kind"] for one in written["receivers"]["narrow cup"]["not_covered"]] == ["dribbling", "wetting"]
     text = " ".join(shown(summary_table(plan, summary)).split())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from orchestrator.report import figures as figures_module
 from orchestrator.report import maps as maps_module
 from orchestrator.report.campaign import draw_figures
 from orchestrator.report.figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
-from orchestrator.report.maps import SurrogatePicture, draw_surrogate
+from orchestrator.report.maps import SurrogatePicture, draw_surrogate, draw_trials
+from orchestrator.report.posterior import draw_posterior
 from orchestrator.report.results import (
     calibration_picture,
     deployment_picture,
@@ -23,17 +25,20 @@ from orchestrator.report.results import (
     evaluation_of,
     pour_series,
 )
-from orchestrator.report.style import display_value, display_values
-from orchestrator.report.summary import summarise, summary_table
+from orchestrator.report.style import display_value, display_values, log_ticks
+from orchestrator.report.summary import summarise
+from orchestrator.report.table import summary_table
+from orchestrator.report.trust import draw_trust, trust_title
 from orchestrator.report.units import loss_unit
+from orchestrator.strategies.deployment.trust import Compared, Comparison
 from sim_engine.action import DEG, Action
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
 from tests.orchestrator import watched
-from tests.orchestrator.reported import is_picture, shown
+from tests.orchestrator.reported import changed, is_picture, shown, strays
 
 
-def test_run_gets_every_figure_that_its_results_allow(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
+def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], tmp_path: Path) -> None:
     drawn = draw_figures(tmp_path / "figures", watched.campaign(), results)
     assert set(drawn) == {
         "discrepancy map",
@@ -45,14 +50,14 @@ def test_run_gets_every_figure_that_its_results_allow(results: dict[str, dict[st
     assert all(is_picture(path) for path in drawn.values())
 
 
-def test_unfinished_run_gets_the_figures_it_can(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
+def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_path: Path) -> None:
     assert draw_figures(tmp_path, watched.campaign(), {}) == {}
     only_pours = draw_figures(tmp_path, watched.campaign(), {"narrow cup": results["narrow cup"]})
     assert set(only_pours) == {"spillage against pours", "loss map narrow"}
 
 
 def test_a_figure_that_fails_does_not_take_the_others_with_it(
-    results: dict[str, dict[str, Any]], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    results: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "spillage.png").mkdir()
     drawn = draw_figures(tmp_path, watched.campaign(), results)
@@ -61,32 +66,32 @@ def test_a_figure_that_fails_does_not_take_the_others_with_it(
     assert "figure 'spillage against pours' was not drawn" in caplog.text
 
 
-def test_discrepancy_map_shows_every_useful_trial_and_theta_in_percent(results: dict[str, dict[str, Any]]) -> None:
+def test_discrepancy_map_shows_every_useful_trial_and_theta_in_percent(results: dict[str, Any]) -> None:
     result = results["calibration"]
     picture = calibration_picture(watched.campaign(), result)
     assert picture is not None
-    assert picture.best == result["theta"]
-    assert list(picture.costs) == [100 * t["discrepancy"] for t in result["trials"] if t["discrepancy"] is not None]
+    assert picture.best == result.found.theta.model_dump()
+    assert list(picture.costs) == [100 * t.discrepancy for t in result.trials if t.discrepancy is not None]
     assert picture.mean is not None
-    assert np.allclose(picture.mean, 100 * np.array(result["map"]["mean"]))
+    assert np.allclose(picture.mean, 100 * np.array(result.found.map.mean))
 
 
-def in_three_axes(results: dict[str, dict[str, Any]]) -> tuple[Any, dict[str, Any]]:
+def in_three_axes(results: dict[str, Any]) -> tuple[Any, Any]:
     """A plan that searches friction too, and what its calibration gave: a map over particles and cohesion."""
     plan = watched.campaign()
     assert plan.calibration is not None
     box = Space((*watched.THETA.axes, Axis("friction", 0.0, 0.5)))
-    result = results["calibration"]
-    trials = [{**t, "theta": {**t["theta"], "friction": 0.1}} for t in result["trials"]]
-    cut = {**result["map"], "over": ["particles", "friction"], "held": {"cohesion": 0.04}}
-    cut["axes"] = {"particles": cut["axes"]["particles"], "friction": list(np.linspace(0.0, 0.5, 30))}
-    theta = {**result["theta"], "friction": 0.2, "cohesion": 0.04}
+    result: Any = results["calibration"]
+    trials = [changed(trial, theta={**trial.theta, "friction": 0.1}) for trial in result.trials]
+    axes = {"particles": result.found.map.axes["particles"], "friction": np.linspace(0.0, 0.5, 30).tolist()}
+    cut = changed(result.found.map, over=("particles", "friction"), held={"cohesion": 0.04}, axes=axes)
+    theta = changed(result.found.theta, friction=0.2, cohesion=0.04)
     plan = replace(plan, calibration=replace(plan.calibration, parameters=box))
-    return plan, {**result, "trials": trials, "map": cut, "theta": theta}
+    return plan, changed(result, trials=trials, found=changed(result.found, map=cut, theta=theta, posterior=None))
 
 
 def test_map_of_three_parameters_says_where_the_third_was_held_and_marks_theta(
-    results: dict[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    results: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan, result = in_three_axes(results)
     drawn: list[Any] = []
@@ -100,13 +105,13 @@ def test_map_of_three_parameters_says_where_the_third_was_held_and_marks_theta(
     assert any(text.startswith("others at θ*: cohesion 0.04 N/m") for text in said)
     scatters = [c for c in drawn[0].axes[0].collections if isinstance(c, PathCollection)]
     star = next(c for c in scatters if len(c.get_offsets()) == 1 and c.get_sizes()[0] > 300)
-    assert star.get_offsets()[0].tolist() == pytest.approx([result["theta"]["particles"], 0.2])
+    assert star.get_offsets()[0].tolist() == pytest.approx([result.found.theta.particles, 0.2])
     dots = next(c for c in scatters if len(c.get_offsets()) == len(picture.points))
     assert dots.get_offsets()[0].tolist() == pytest.approx([picture.points[0]["particles"], 0.1])
 
 
 def test_three_parameters_get_their_trials_against_each_of_them_as_well(
-    results: dict[str, dict[str, Any]], tmp_path: Path
+    results: dict[str, Any], tmp_path: Path
 ) -> None:
     plan, result = in_three_axes(results)
     drawn = draw_figures(tmp_path, plan, {"calibration": result})
@@ -118,14 +123,17 @@ def test_three_parameters_get_their_trials_against_each_of_them_as_well(
 
 
 def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
-    results: dict[str, dict[str, Any]],
+    results: dict[str, Any],
 ) -> None:
-    plan, deployed = watched.campaign(), dict(results["narrow cup"])
-    deployed |= {"predicted_loss": -0.013, "predicted_deviation": 0.014}
-    deployed["pours"] = [{**p, "predicted": -0.02, "predicted_deviation": 0.01} for p in deployed["pours"]]
-    deployed["map"] = {**deployed["map"], "mean": (np.array(deployed["map"]["mean"]) - 0.5).tolist()}
+    plan, learnt = watched.campaign(), results["narrow cup"]
+    deployed = changed(
+        learnt,
+        recommended=changed(learnt.recommended, predicted_loss=-0.013, predicted_deviation=0.014),
+        pours=[changed(pour, predicted=-0.02, predicted_deviation=0.01) for pour in learnt.pours],
+        map=changed(learnt.map, mean=(np.array(learnt.map.mean) - 0.5).tolist()),
+    )
     summary = summarise(plan, {"narrow cup": deployed})
-    assert summary["receivers"]["narrow cup"]["predicted_loss"] == -0.013
+    assert summary.receivers["narrow cup"].predicted_loss == -0.013
     assert "0.00 ± 1.40 %" in shown(summary_table(plan, summary))
     assert "-" not in loss_unit(Loss()).text(-0.013, 0.014)
     assert pour_series(plan, {"narrow cup": deployed}, loss_unit(Loss()))[0].predicted == [(0.0, 1.0)] * 4
@@ -135,9 +143,7 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
     assert picture.mean.min() == 0.0
 
 
-def test_receivers_are_called_by_their_own_name_unless_two_share_it(
-    results: dict[str, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_receivers_are_called_by_their_own_name_unless_two_share_it(results: dict[str, Any], tmp_path: Path) -> None:
     plan = watched.campaign()
     assert plan.deployment is not None
     deployed = {"narrow cup": results["narrow cup"]}
@@ -151,20 +157,21 @@ def test_receivers_are_called_by_their_own_name_unless_two_share_it(
     assert pour_series(twins, deployed, loss_unit(Loss()))[0].receiver == "narrow cup (D3)"
 
 
-def test_loss_map_numbers_its_pours_as_the_log_does(results: dict[str, dict[str, Any]]) -> None:
+def test_loss_map_numbers_its_pours_as_the_log_does(results: dict[str, Any]) -> None:
     picture = deployment_picture(watched.campaign(), results["narrow cup"])
     assert picture is not None
     assert picture.numbers == [1, 2, 3, 4]
-    assert picture.best == results["narrow cup"]["action_si"]
+    assert picture.best == results["narrow cup"].recommended.action_si
 
 
-def test_bars_of_the_test_discrepancy_are_the_evaluations_scores(results: dict[str, dict[str, Any]]) -> None:
-    evaluation = evaluation_of(results)
+def test_bars_of_the_test_discrepancy_are_the_evaluations_scores(results: dict[str, Any]) -> None:
+    scored = changed(results["evaluation"], mean_predictor={"test": 0.2}, regression={"test": 0.1})
+    evaluation = evaluation_of({"evaluation": scored})
     assert evaluation is not None
-    train, test = discrepancy_groups(evaluation, {"test": {"mean_predictor": 0.2, "regression": 0.1}})
+    train, test = discrepancy_groups(evaluation)
     assert (train.pours, test.pours) == (6, 2)
-    assert test.calibrated == results["evaluation"]["discrepancy"]["calibrated"]["test"]
-    assert float(np.median(test.random)) == pytest.approx(results["evaluation"]["random_median"]["test"])
+    assert test.calibrated == scored.discrepancy["calibrated"]["test"]
+    assert float(np.median(test.random)) == pytest.approx(scored.random_median["test"])
     assert (train.mean_predictor, test.mean_predictor, test.regression) == (None, 0.2, 0.1)
 
 
@@ -236,3 +243,119 @@ def test_losses_are_shown_in_their_own_unit() -> None:
     assert loss_unit(Loss("grams")).text(2.46) == "2.46 g"
     assert loss_unit(Loss("particles")).text(17.0) == "17 particles"
     assert "0.5 × retained" in loss_unit(Loss(retained_weight=0.5)).label
+
+
+def kept(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Figures as they are saved."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(maps_module.style, "save", lambda figure, path: drawn.append(figure) or path)
+    return drawn
+
+
+def at_the_edges(**changes: Any) -> SurrogatePicture:
+    """Observations and the best in the corners of the box."""
+    corners = [{"particles": n, "cohesion": c} for n in (500.0, 4000.0) for c in (0.0, 0.1)]
+    picture = SurrogatePicture("corners", "loss [%]", watched.THETA, corners, [1.0, 2.0, 3.0, 4.0], best=corners[3])
+    return replace(picture, **changes)
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_what_lies_on_an_edge_of_the_box_is_drawn_whole(mapped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, grid = kept(monkeypatch), np.linspace(0.0, 1.0, 100).reshape(10, 10)
+    numbered = at_the_edges(mean=grid, deviation=grid, numbers=[1, 2, 3, 4], best_name="best action")
+    (draw_surrogate if mapped else draw_trials)(Path("map.png"), numbered)
+    assert strays(drawn[0]) == []
+
+
+def test_a_best_action_at_an_end_of_the_box_is_said_to_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, grid = kept(monkeypatch), np.zeros((5, 5))
+    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, best_name="best action"))
+    inside = {"particles": 1000.0, "cohesion": 0.05}
+    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, best=inside))
+    said = [" ".join(text.get_text() for text in figure.findobj(Text)) for figure in drawn]
+    assert "best action has particles at its upper end (4 000) and cohesion at its upper end (0.1 N/m)" in said[0]
+    assert "end" not in said[1]
+
+
+def test_a_surrogate_that_expects_the_impossible_does_not_stretch_the_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, grid = kept(monkeypatch), np.full((5, 5), 20.0)
+    grid[0, 0] = 500.0
+    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, largest=100.0))
+    bars = [axes for axes in drawn[0].axes if axes.get_label() == "<colorbar>"]
+    assert [bar.get_ylim()[1] for bar in bars] == pytest.approx([100.0, 100.0])
+
+
+def test_simulations_stand_beside_the_pours_of_a_loss_map(
+    results: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed, drawn = results["narrow cup"], kept(monkeypatch)
+    picture = deployment_picture(watched.campaign(), deployed)
+    assert picture is not None
+    assert len(picture.simulated) == deployed.simulations - deployed.simulations_lost
+    draw_surrogate(Path("map.png"), picture)
+    crosses = [c for c in drawn[0].axes[0].collections if c.get_label() == "simulation"]
+    assert [len(c.get_offsets()) for c in crosses] == [len(picture.simulated)]
+    assert strays(drawn[0]) == []
+
+
+def compared(rows: list[tuple[float, float, float]], limit: float = 2.5) -> Compared:
+    """A trust result of (simulated, deviation, weighed)."""
+    pours = tuple(Comparison(number, *row) for number, row in enumerate(rows, start=1))
+    mean = sum(max(pour.z, 0.0) for pour in pours) / len(pours)
+    return Compared(
+        z_scores=tuple(pour.z for pour in pours),
+        alarm=mean > limit,
+        better=False,
+        mean_z=mean,
+        limit=limit,
+        policy="D2",
+        followed=None,
+        pours=pours,
+        text="",
+    )
+
+
+def test_the_title_of_the_first_pours_says_which_were_worse_and_which_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    one_bad = compared([(0.016, 0.015, 0.15), (0.028, 0.01, 0.03), (0.027, 0.012, 0.02)])
+    assert trust_title(one_bad) == "pours 2 and 3 as simulated, pour 1 worse by 8.9 σ: alarm"
+    assert trust_title(compared([(0.02, 0.01, 0.021), (0.02, 0.01, 0.015)])) == "pours 1 and 2 as simulated"
+    assert trust_title(compared([(0.5, 0.01, 0.1)])) == "pour 1 better by 40.0 σ"
+    drawn = kept(monkeypatch)
+    draw_trust(Path("trust.png"), one_bad, unit=loss_unit(Loss()), receiver="narrow")
+    assert strays(drawn[0]) == []
+    assert len([line for line in drawn[0].axes[1].lines if line.get_linestyle() == "--"]) == 1  # the mean is a bar
+
+
+def test_predictors_that_have_nothing_to_say_get_no_bar_and_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = kept(monkeypatch)
+    groups = [DiscrepancyGroup("training pours", 7, 0.06), DiscrepancyGroup("test pours", 3, 0.01, [0.02, 0.03], 0.04)]
+    draw_discrepancy(Path("bars.png"), groups, title="bars")
+    said = [text.get_text() for text in drawn[0].findobj(Text)]
+    assert not [text for text in said if "n/a" in text]
+    places = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in drawn[0].axes[0].patches]
+    assert len(places) == 4
+    assert all(end <= begin for (_, end), (begin, _) in itertools.pairwise(sorted(places)))
+    assert strays(drawn[0]) == []
+
+
+def test_ticks_of_a_logarithmic_axis_are_numbers_that_people_read() -> None:
+    assert log_ticks(500.0, 1500.0) == [500.0, 700.0, 1000.0, 1500.0]
+    assert log_ticks(500.0, 4000.0) == [500.0, 1000.0, 2000.0]
+    assert len(log_ticks(250.0, 500.0)) >= 3
+
+
+def test_the_posterior_has_axes_with_plain_numbers_and_nothing_is_cut(
+    results: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn, result = kept(monkeypatch), results["calibration"]
+    theta = {**result.found.theta.model_dump(), "particles": 4000.0, "cohesion": 0.0}
+    draw_posterior(Path("posterior.png"), result.found.posterior, watched.THETA, theta)
+    drawn[0].draw_without_rendering()
+    said = [text.get_text() for text in drawn[0].findobj(Text)]
+    assert not [text for text in said if "10^" in text]
+    assert said.count("draws") == 2
+    assert strays(drawn[0]) == []
+    cloud = drawn[0].axes[2]
+    (star,) = [line for line in cloud.lines if line.get_marker() == "*"]
+    (place,) = cloud.transData.transform(np.column_stack(star.get_data()))
+    assert cloud.bbox.padded(-5).contains(*place)

@@ -6,59 +6,88 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 
 from orchestrator.report.style import display_value, display_values
-from orchestrator.report.summary import print_summary, summarise, summary_table, write_summary
+from orchestrator.report.summary import (
+    NotSimulated,
+    PoolUse,
+    RunSummary,
+    Totals,
+    summarise,
+    summary_schema,
+    write_summary,
+)
+from orchestrator.report.table import print_summary, summary_table
+from orchestrator.results import decode_results
+from orchestrator.strategies.deployment.pours import Foretold
 from tests.orchestrator import watched
-from tests.orchestrator.reported import shown
+from tests.orchestrator.reported import changed, shown
+
+BUSY = PoolUse(pool_busy=0.974, pool_useful=0.41, arm_longest_wait_s=0.061, arm_mean_wait_s=0.03)
 
 
-def test_summary_tells_theta_discrepancies_losses_actions_and_files(
-    results: dict[str, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dict[str, Any], tmp_path: Path) -> None:
     plan = watched.campaign()
-    baselines = {"test": {"mean_predictor": 0.1234, "regression": None}}
+    results = {**results, "evaluation": changed(results["evaluation"], mean_predictor={"test": 0.1234})}
     figures = {"spillage against pours": tmp_path / "spillage.png"}
     summary = summarise(
         plan,
         results,
         figures=figures,
         recording=tmp_path / "campaign.rrd",
-        baselines=baselines,
-        totals={"simulations": 60},
+        totals=Totals(simulations=60),
     )
     deployed = results["narrow cup"]
-    losses = [pour["loss"] for pour in deployed["pours"]]
-    receiver = summary["receivers"]["narrow cup"]
-    assert summary["theta"] == results["calibration"]["theta"]
-    assert summary["simulations"] == 60
-    assert summary["discrepancy"]["test"]["calibrated"] == results["evaluation"]["discrepancy"]["calibrated"]["test"]
-    assert summary["discrepancy"]["test"]["random_theta"] == results["evaluation"]["random_median"]["test"]
-    assert (receiver["first_loss"], receiver["best_loss"]) == (losses[0], min(losses))
-    assert receiver["best_pour"] == 1 + losses.index(min(losses))
-    assert receiver["best_action"] == deployed["action"]
+    losses = [pour.loss for pour in deployed.pours]
+    receiver = summary.receivers["narrow cup"]
+    assert summary.theta == results["calibration"].found.theta
+    assert summary.simulations == 60
+    assert summary.discrepancy["test"]["calibrated"] == results["evaluation"].discrepancy["calibrated"]["test"]
+    assert summary.discrepancy["test"]["random_theta"] == results["evaluation"].random_median["test"]
+    assert (receiver.first_loss, receiver.best_loss) == (losses[0], min(losses))
+    assert receiver.best_pour == 1 + losses.index(min(losses))
+    assert receiver.best_action == deployed.recommended.action
 
     text = shown(summary_table(plan, summary))
-    assert display_value("particles", summary["theta"]["particles"]) in text
+    assert display_value("particles", summary.theta.particles) in text
     assert "12.34" in text
-    assert f"{100 * min(losses):.2f} % (pour {receiver['best_pour']})" in text
-    assert display_values(deployed["action_si"]) in text
+    assert f"{100 * min(losses):.2f} % (pour {receiver.best_pour})" in text
+    assert display_values(deployed.recommended.action_si) in text
     assert "campaign.rrd" in text
 
 
-def test_summary_file_reads_back_as_what_was_summarised(results: dict[str, dict[str, Any]], tmp_path: Path) -> None:
+def test_summary_file_has_what_was_summarised_and_the_results_read_back(
+    results: dict[str, Any], tmp_path: Path
+) -> None:
     summary = summarise(watched.campaign(), results)
     path = write_summary(tmp_path / "run", summary)
     assert path.name == "summary.json"
-    assert json.loads(path.read_text(encoding="utf-8")) == summary
+    written = json.loads(path.read_text(encoding="utf-8"))
+    assert RunSummary.model_validate({**written, "results": results}) == summary
+    assert decode_results(written["results"]) == results
     assert [p.name for p in path.parent.iterdir()] == ["summary.json"]
 
 
+def test_summary_file_is_what_its_schema_says(results: dict[str, Any], tmp_path: Path) -> None:
+    plan = watched.campaign()
+    warning = NotSimulated(kind="wetting", share=0.1, text="", action_si={"x_offset": 0.1}, hit=1, tried=5)
+    summary = summarise(plan, results, totals=Totals(occupancy={"narrow cup": BUSY}))
+    written = json.loads(write_summary(tmp_path, changed(summary, not_covered={"cup": (warning,)})).read_text())
+    validator = jsonschema.Draft202012Validator(summary_schema())
+    validator.validate(written)
+    kinds = {one["kind"] for one in written["results"].values()}
+    assert kinds == {"calibration", "evaluation", "deployment"}
+    written["results"]["calibration"]["kind"] = "guess"
+    assert not validator.is_valid(written)
+
+
 def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_events(
-    results: dict[str, dict[str, Any]],
+    results: dict[str, Any],
 ) -> None:
-    poured = {**results["narrow cup"], "failed_pours": 2, "trust": {"z_scores": [9.0, 9.0, 9.0], "alarm": True}}
+    trust = Foretold(z_scores=(9.0, 9.0, 9.0), alarm=True)
+    poured = changed(results["narrow cup"], failed_pours=2, trust=trust)
     plan = watched.campaign()
     text = shown(summary_table(plan, summarise(plan, {"narrow cup": poured}, dropped_events=12)))
     assert "the simulator may not fit this vessel" in text
@@ -66,23 +95,22 @@ def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_ev
     assert "lacks 12 events" in text
 
 
-def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results: dict[str, dict[str, Any]]) -> None:
+def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results: dict[str, Any]) -> None:
     plan = watched.campaign()
-    planned = {**results["narrow cup"], "strategy": "D1", "pours": []}
-    nothing = {split: {"mean_predictor": None, "regression": None} for split in ("train", "test", "transfer")}
-    text = shown(summary_table(plan, summarise(plan, {"narrow cup": planned}, baselines=nothing)))
+    planned = changed(results["narrow cup"], strategy="D1", pours=())
+    text = shown(summary_table(plan, summarise(plan, {"narrow cup": planned})))
     assert "best expected" in text
-    assert display_values(planned["action_si"]) in text
+    assert display_values(planned.recommended.action_si) in text
     for absent in ("pours", "first", "best measured", "mean |measured", "—"):
         assert absent not in text
-    fruitless = {**planned, "predicted_loss": None, "action_si": None}
+    fruitless = changed(planned, recommended=None)
     text = shown(summary_table(plan, summarise(plan, {"narrow cup": fruitless})))
     assert "best expected" not in text
     assert "narrow: nothing was learnt" in text
 
 
 def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
-    results: dict[str, dict[str, Any]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    results: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")
     plan = watched.campaign()
@@ -91,20 +119,14 @@ def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
     print_summary(plan, summary)
     lines = capsys.readouterr().err.splitlines()
     assert any(line.endswith(str(recording)) for line in lines)
-    action = display_values(results["narrow cup"]["action_si"])
+    action = display_values(results["narrow cup"].recommended.action_si)
     assert any("narrow" in line and "D3" in line and action in line for line in lines)
 
 
-def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results: dict[str, dict[str, Any]]) -> None:
+def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results: dict[str, Any]) -> None:
     plan = watched.campaign()
-    busy = {
-        "pool_busy": 0.974,
-        "pool_useful": 0.41,
-        "arm_longest_wait_s": 0.061,
-        "arm_mean_wait_s": 0.03,
-    }
-    summary = summarise(plan, results, totals={"occupancy": {"deployment:narrow": busy}})
-    assert summary["occupancy"]["deployment:narrow"] == busy
+    summary = summarise(plan, results, totals=Totals(occupancy={"deployment:narrow": BUSY}))
+    assert summary.occupancy["deployment:narrow"] == BUSY
     text = " ".join(shown(summary_table(plan, summary)).split())
     assert "narrow: pool 97 % busy while there was work (41 % of the time)" in text
     assert "the arm waited 0.061 s at most" in text
@@ -113,5 +135,5 @@ def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results:
 def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:
     plan = watched.campaign()
     summary = summarise(plan, {})
-    assert (summary["theta"], summary["receivers"]) == (None, {})
+    assert (summary.theta, summary.receivers) == (None, {})
     assert "narrow-cup" in shown(summary_table(plan, summary))

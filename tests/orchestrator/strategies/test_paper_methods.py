@@ -88,7 +88,7 @@ def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, 
     assert {problem.plain for problem in asked} == {paper}
     assert {len(problem.data.points[0]) for problem in asked} == ({2} if paper else {4})
     assert all(cost >= 0.0 for cost in asked[-1].data.costs) is paper
-    assert ("posterior" in results["calibration"]) is not paper
+    assert (results["calibration"].found.posterior is None) is paper
 
 
 def test_how_c4_averages_is_written_down_and_may_not_change_under_a_run(folder: Path) -> None:
@@ -164,7 +164,7 @@ def test_the_papers_methods_run_and_stand_in_figures_and_tables(tmp_path: Path) 
     for cell in cells_of(plan):
         run_cell(plan, cell, plan.folder, ToyLaboratory)  # type: ignore[arg-type]
     alone = read_result(plan.folder, "deployment.small.D3-paper.deployment-narrow.01")
-    assert (alone["simulations"], alone["pours"]) == (4, 2), "none beside the pours"
+    assert (alone.simulations, alone.pours) == (4, 2), "none beside the pours"
     found = gather(plan, finished_results(plan.folder, cells_of(plan)))
     drawn = {one.number: one for one in (*draw_calibrations(plan, found), *draw_deployments(plan, found))}
     boxes, curves, losses = (drawn[number].rows for number in ("3b", "3c", "6"))

@@ -23,6 +23,7 @@ from orchestrator.errors import LearningError
 from orchestrator.events import Event, RequestFinished
 from orchestrator.plan import CampaignPlan
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulated, Suggest
+from orchestrator.results import encode_result
 from orchestrator.strategies.calibration.c1 import UniformGrid
 from orchestrator.strategies.calibration.c2 import StratifiedSampling
 from orchestrator.strategies.calibration.c3 import BayesianCalibration
@@ -172,7 +173,7 @@ def test_whatever_fails_every_question_has_numbers_and_the_end_is_an_answer_or_a
     assert all(math.isfinite(u) for q in questions for point in q.data.points for u in point)
     if name != "D1, risk":  # what was executed may lie beside the box
         assert all(0.0 <= u <= 1.0 for q in questions for point in q.data.points for u in point)
-    json.dumps(strategy.result(), allow_nan=False)
+    json.dumps(encode_result(strategy.result()), allow_nan=False)
 
 
 def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
@@ -182,7 +183,7 @@ def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
     design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 4, 1, 0)
     Play(weighed, answer=lost)(design)
     assert len(design.measured) == 3
-    assert "no numbers" in str(design.result()["pours"][1]["given_up"])  # type: ignore[index]
+    assert "no numbers" in str(design.result().pours[1].given_up)
 
 
 # -- through scheduler and journal ---------------------------------------------------------------------------------

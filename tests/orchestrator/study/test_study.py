@@ -25,7 +25,15 @@ from orchestrator.requests import Failed, Poured, Slots
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.study.cells import cells_of
 from orchestrator.study.code import code_now, warning
-from orchestrator.study.folder import RESULT, StudyError, finished_results, is_finished, opened, run_folder
+from orchestrator.study.folder import (
+    RESULT,
+    CellResult,
+    StudyError,
+    finished_results,
+    is_finished,
+    opened,
+    run_folder,
+)
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 from orchestrator.study.strategies import FinalPour
 from orchestrator.study.worker import in_this_process, run_cell
@@ -101,14 +109,14 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
     # C1 is scored from the grid, with the pours of its own repetition
     results = finished_results(disturbed.folder, cells)
     scored = [results[f"calibration.small.C1.0{n}"] for n in (1, 2)]
-    assert all(one["results"]["calibration"]["simulations"] == 4 * 4 for one in scored)
-    assert all(one["simulations"] == 6 for one in scored), "the grid was simulated again"
-    assert scored[0]["results"]["calibration"]["trials"] != scored[1]["results"]["calibration"]["trials"]
-    splits = [[p["split"] for p in results[f"pours.small.0{n}"]["results"]["pours"]["pours"]] for n in (1, 2)]
-    actions = [[p["action"] for p in results[f"pours.small.0{n}"]["results"]["pours"]["pours"]] for n in (1, 2)]
+    assert all(one.results["calibration"].simulations == 4 * 4 for one in scored)
+    assert all(one.simulations == 6 for one in scored), "the grid was simulated again"
+    assert scored[0].results["calibration"].trials != scored[1].results["calibration"].trials
+    splits = [[p.split for p in results[f"pours.small.0{n}"].results["pours"].pours] for n in (1, 2)]
+    actions = [[p.action for p in results[f"pours.small.0{n}"].results["pours"].pours] for n in (1, 2)]
     assert actions[0] == actions[1]
     assert splits[0] != splits[1]
-    theta = results["calibration.small.C4.01"]["results"]["calibration"]["theta"]
+    theta = results["calibration.small.C4.01"].results["calibration"].found.theta.model_dump()
     resolved = run_folder(disturbed.folder, "deployment.small.D3.deployment-narrow.01") / "resolved.json"
     assert load_campaign(resolved).parameters.model_dump() == theta
 
@@ -170,19 +178,19 @@ def test_a_final_pour_is_the_recommended_action_with_fresh_chance_and_its_code_i
     cells = cells_of(study)
     assert [cell.kind for cell in cells] == ["deployment", "final", "final"]
     learnt, *again = (run_cell(study, cell, study.folder, ToyLaboratory) for cell in cells)  # type: ignore[arg-type]
-    values = learnt["results"]["deployment:narrow"]["action_si"]
-    finals = [one["results"]["final"] for one in again]
+    values = learnt.results["deployment:narrow"].recommended.action_si
+    finals = [one.results["final"] for one in again]
     action = study.deployments[0].plan.scenes[0].action(values)
     hidden = study.levels[0].bench.liquid
     least = toy_study.spilled(action, hidden, 0) - 0.01
     for one in finals:
-        assert one["action_si"] == action.values()
-        assert one["made"]
-        assert least <= one["loss"] == one["spillage"] <= least + 0.02
-    measured = [pour["loss"] for pour in learnt["results"]["deployment:narrow"]["pours"]]
-    assert len({*measured, *(one["loss"] for one in finals)}) == len(measured) + 2, "a seed was used again"
-    assert [one["pours"] for one in again] == [1, 1]
-    assert learnt["code"] == code_now()
+        assert one.action_si == action.values()
+        assert one.made
+        assert least <= one.loss == one.spillage <= least + 0.02
+    measured = [pour.loss for pour in learnt.results["deployment:narrow"].pours]
+    assert len({*measured, *(one.loss for one in finals)}) == len(measured) + 2, "a seed was used again"
+    assert [one.pours for one in again] == [1, 1]
+    assert learnt.code == code_now()
 
 
 def test_the_cells_of_a_worker_share_a_simulator_and_none_of_them_closes_it(tmp_path: Path) -> None:
@@ -191,7 +199,7 @@ def test_the_cells_of_a_worker_share_a_simulator_and_none_of_them_closes_it(tmp_
     study = small(tmp_path, **changes, calibration=None)
     log = tmp_path / "simulator.log"
     simulators = InProcessSimulatorPool(make=make_fake(log=log))
-    pours = [run_cell(study, c, study.folder, in_this_process(simulators))["pours"] for c in cells_of(study)]
+    pours = [run_cell(study, c, study.folder, in_this_process(simulators)).pours for c in cells_of(study)]
     assert len(pours) > 1
     assert all(pours)
     happened = [line.split()[0] for line in log.read_text(encoding="utf-8").splitlines()]
@@ -206,7 +214,7 @@ def test_an_action_that_can_not_be_poured_and_none_at_all_have_the_worst_loss(tm
     costing = Costing.of(replace(plan, loss=replace(plan.loss, retained_weight=3.0)), scene, SimulationParameters())
     none = FinalPour(costing, None, 1)
     assert none.finished
-    assert (none.ask(Slots(1, 1)), none.result()["loss"], none.result()["made"]) == ([], 3.0, False)
+    assert (none.ask(Slots(1, 1)), none.result().loss, none.result().made) == ([], 3.0, False)
     action = scene.action(plan.actions.decode([0.5] * plan.actions.dimension))
     for outcome in (
         Failed("invalid_action", "cups touch"),
@@ -219,17 +227,16 @@ def test_an_action_that_can_not_be_poured_and_none_at_all_have_the_worst_loss(tm
         assert one.ask(Slots(1, 1)) == []
         one.tell(request, outcome)
         assert one.finished
-        assert (one.result()["loss"], one.result()["spillage"], one.result()["made"]) == (3.0, 1.0, False)
+        assert (one.result().loss, one.result().spillage, one.result().made) == (3.0, 1.0, False)
 
 
 def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tmp_path: Path) -> None:
-    same = {"code": code_now()}
-    older = {"code": {**code_now(), "strategies": "0123456789ab"}}
+    same = CellResult(results={}, simulations=0, pours=0, cpu_s=0.0, seconds=0.0, expected=(), code=code_now())
+    older = same.model_copy(update={"code": {**code_now(), "strategies": "0123456789ab"}})
     assert warning({}) is None
     assert warning({"a": same, "b": same}) is None
-    text = warning({"a": same, "b": older, "c": {}, "d": {}}) or ""
+    text = warning({"a": same, "b": older, "c": same}) or ""
     assert "1 finished by other code (strategies: changed since)" in text
-    assert "2 finished before versions were noted" in text
     assert "\n" not in text
     (tmp_path / "a.py").write_text("x = 1", encoding="utf-8")
     before = sources(tmp_path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,14 @@ import numpy as np
 import pytest
 
 from orchestrator.config.study.sections import load_study
+from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta, TriedOnPours
+from orchestrator.strategies.calibration.evaluation import ScoredPair, Scores
+from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.pours import Foretold, PourRow
+from orchestrator.strategies.display import DisplayedMap
 from orchestrator.study.cells import Cell, cells_of
 from orchestrator.study.code import code_now, told
-from orchestrator.study.folder import run_folder, write_result
+from orchestrator.study.folder import CellResult, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.deployments import draw_deployments
 from orchestrator.study.report.drawing import look
@@ -23,6 +29,8 @@ from orchestrator.study.report.gather import at_pour, gather, running_least
 from orchestrator.study.report.intervals import Estimate, estimate
 from orchestrator.study.report.page import write_report
 from orchestrator.study.report.tables import pours_needed, tables
+from orchestrator.study.strategies import FinalPoured
+from sim_engine.liquid import SimulationParameters
 from tests.orchestrator.study_files import read, written
 
 FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7", "final")
@@ -37,45 +45,103 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> StudyPlan:
 DISCREPANCY = {"": (0.10, 0.10), "C1": (0.03, 0.05), "C2": (0.05, 0.05), "C3": (0.02, 0.04), "C4": (0.01, 0.03)}
 
 
-def made_up(cell: Cell) -> dict[str, Any]:
+def made_up(cell: Cell) -> CellResult:
     """A cell's result as the worker would have written it."""
     results: dict[str, Any] = {}
     if cell.kind in ("calibration", "uncalibrated"):
         off = DISCREPANCY[cell.arm][cell.repetition - 1]
-        results["evaluation"] = {
-            "pairs": [
-                {"theta": "theta", "split": split, "measured": 0.3, "simulated": 0.3 + sign * off}
-                for split, sign in (("test", 1), ("test", -1), ("train", 1))
-            ]
-            + [{"theta": "theta", "split": "test", "measured": 0.3, "simulated": None}]
-        }
+        pairs = [(split, 0.3 + sign * off) for split, sign in (("test", 1), ("test", -1), ("train", 1))]
+        results["evaluation"] = Scores(
+            simulations=4,
+            undefined={"theta": 1},
+            discrepancy={"theta": {"test": off, "train": off}},
+            random_median={},
+            thetas={"theta": SimulationParameters()},
+            pairs=tuple(
+                ScoredPair(theta="theta", split=split, scene="cup", measured=0.3, simulated=simulated, reason="")
+                for split, simulated in [*pairs, ("test", None)]
+            ),
+        )
     if cell.kind == "calibration":
-        axes = {"particles": [500.0, 1000.0, 1500.0], "cohesion": [0.0, 0.05, 0.1]}
-        results["calibration"] = {
-            "simulations": 12,
-            "training_pours": 4,
-            "searched": ["particles", "cohesion"],
-            "theta": {"particles": 700 + 10 * cell.repetition, "cohesion": 0.04},
-            "predicted_discrepancy": 0.04,
-            "trials": [
-                {"theta": {"particles": 600 + 100 * i, "cohesion": 0.02 * i}, "discrepancy": d}
-                for i, d in enumerate((0.2, None, 0.1, 0.3))
-            ],
-            "map": {"over": ["particles", "cohesion"], "axes": axes, "mean": np.full((3, 3), 0.1).tolist()},
-        }
+        flat = tuple(tuple(row) for row in np.full((3, 3), 0.1).tolist())
+        found = CalibratedTheta(
+            theta=SimulationParameters(particles=700 + 10 * cell.repetition, cohesion=0.04),
+            searched=("particles", "cohesion"),
+            predicted_discrepancy=0.04,
+            predicted_deviation=0.01,
+            hyperparameters=None,
+            map=DisplayedMap(
+                over=("particles", "cohesion"),
+                held={},
+                axes={"particles": (500.0, 1000.0, 1500.0), "cohesion": (0.0, 0.05, 0.1)},
+                mean=flat,
+                deviation=flat,
+            ),
+        )
+        trials = tuple(
+            TriedOnPours(
+                theta={"particles": 600 + 100 * i, "cohesion": 0.02 * i}, discrepancy=d, defined=4, largest=None
+            )
+            for i, d in enumerate((0.2, None, 0.1, 0.3))
+        )
+        results["calibration"] = Calibrated(
+            strategy=cell.arm, simulations=12, lost=0, undefined=0, training_pours=4, trials=trials, found=found
+        )
     if cell.kind == "deployment":
         losses = {"D1": [0.08], "D2": [0.5, 0.2, 0.1], "D3": [0.1, 0.3, 0.05]}[cell.arm.split("-")[0]]
         off = 0.02 if cell.repetition == 1 else 0.0
-        results["deployment:narrow"] = {"pours": [{"status": "weighed", "loss": loss + off} for loss in losses]}
-        results["deployment:narrow"]["pours"].append({"status": "refused", "loss": 1.0})
+        rows = [*(("weighed", loss + off) for loss in losses), ("refused", 1.0)]
+        results["deployment:narrow"] = poured(cell.arm, rows)
     if cell.kind == "final":
         loss = {"D1": 0.09, "D2": 0.2, "D3": 0.06}[cell.arm.split("-")[0]] + 0.02 * (cell.repetition == 1)
         made = (cell.level, cell.arm, cell.repetition) != ("large", "D2", 2)
-        results["final"] = {"loss": loss, "spillage": loss / 2, "made": True, "reason": ""}
-        if not made:
-            results["final"] |= {"loss": 1.0, "spillage": 1.0, "made": False}
-    expected = [[4, 0.2], [5, 0.3], [6, -0.1]]
-    return {"results": results, "simulations": 10, "pours": 3, "cpu_s": 36.0, "seconds": 72.0, "expected": expected}
+        loss, spillage = (loss, loss / 2) if made else (1.0, 1.0)
+        results["final"] = FinalPoured(action_si=None, loss=loss, spillage=spillage, made=made, reason="")
+    return CellResult(
+        results=results,
+        simulations=10,
+        pours=3,
+        cpu_s=36.0,
+        seconds=72.0,
+        expected=((4, 0.2), (5, 0.3), (6, -0.1)),
+        code=code_now(),
+    )
+
+
+def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
+    """A deployment of which only its pours matter."""
+    pours = [
+        PourRow(
+            number=number,
+            status=status,
+            reason="",
+            action={},
+            action_si={},
+            predicted=None,
+            predicted_deviation=None,
+            predicted_scatter=None,
+            loss=loss,
+            objectives={},
+            spillage=None,
+            spilled_g=None,
+            retained_g=None,
+        )
+        for number, (status, loss) in enumerate(rows, start=1)
+    ]
+    return Deployed(
+        strategy=arm,
+        scene="narrow",
+        loss="normalised",
+        simulations=0,
+        simulations_lost=0,
+        simulations_refused=0,
+        pours=tuple(pours),
+        simulated=(),
+        former_pours=0,
+        refused_pours=1,
+        failed_pours=0,
+        trust=Foretold(z_scores=(), alarm=False),
+    )
 
 
 def rows(folder: Path, name: str) -> list[dict[str, str]]:
@@ -105,7 +171,7 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
     assert "A repetition resamples the pours" in page
     assert "Student&#x27;s t over repetitions" in page
     assert "test pours recur between repetitions" in page
-    assert "before versions were noted" in page
+    assert "Code: 1 different for" in page
 
     boxes = {row["strategy"]: row for row in rows(tmp_path, "figure-3b")}
     assert list(boxes) == ["uncalibrated", "C1", "C2", "C3", "C4"]
@@ -194,11 +260,14 @@ def test_recommended_actions_are_compared_by_their_own_pours(study: StudyPlan) -
 
 
 def test_the_page_tells_by_how_many_codes_the_cells_were_made(study: StudyPlan) -> None:
-    old, new = {"results": {}}, {"results": {}, "code": code_now()}
+    def made_with(code: dict[str, str]) -> CellResult:
+        return CellResult(results={}, simulations=0, pours=0, cpu_s=0.0, seconds=0.0, expected=(), code=code)
+
+    old, new = made_with({**code_now(), "solver": "another"}), made_with(code_now())
     text = told({"a": old, "b": new, "c": new})
     assert text.startswith("Code: 2 different for 3 cells: 2 of decant ")
     assert f"solver {code_now()['solver']}" in text
-    assert text.endswith("1 of before versions were noted.")
+    assert text.endswith("solver another.")
 
 
 def test_effects_are_differences_within_repetitions() -> None:

@@ -10,13 +10,20 @@ import numpy as np
 import pytest
 
 from actors.optimizer.core.problem import Posterior
-from orchestrator.commands.campaigns import theta_file
 from orchestrator.config.load import load_parameters, load_posterior
 from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.publish import theta_file
 from orchestrator.report.posterior import draw_posterior, posterior_lines
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.design import MeasuredPour
-from orchestrator.strategies.calibration.posterior import central, left_open, region
+from orchestrator.strategies.calibration.posterior import (
+    PosteriorFound,
+    PosteriorSummary,
+    RemainingDiscrepancy,
+    central,
+    left_open,
+    region,
+)
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.action import DEG
@@ -37,7 +44,7 @@ def summed(action: Any, theta: SimulationParameters, rng: np.random.Generator) -
     return float(0.1 + 0.5 * speed * both + 0.005 * rng.standard_normal())
 
 
-def calibrated(spill: Any, truth: Any, seed: int = 0, **changes: Any) -> dict[str, Any]:
+def calibrated(spill: Any, truth: Any, seed: int = 0, **changes: Any) -> Any:
     rng = np.random.default_rng(seed)
     pours = []
     for _ in range(16):
@@ -49,46 +56,46 @@ def calibrated(spill: Any, truth: Any, seed: int = 0, **changes: Any) -> dict[st
 
 
 @pytest.fixture(scope="module")
-def determined() -> dict[str, Any]:
+def determined() -> Any:
     return calibrated(calibration_spill, weighed, 1)
 
 
 @pytest.fixture(scope="module")
-def tied() -> dict[str, Any]:
+def tied() -> Any:
     truth = SimulationParameters(cohesion=0.05, friction=0.25)
     return calibrated(
         summed, lambda action, _, rng: summed(action, truth, rng), parameters=TIED, fixed_parameters={"particles": 2000}
     )
 
 
-def test_the_region_holds_the_truth_and_is_smaller_than_what_was_searched(determined: dict[str, Any]) -> None:
-    posterior = determined["posterior"]
-    assert json.loads(json.dumps(posterior, allow_nan=False)) == posterior
-    for name, (low, high) in posterior["region"].items():
+def test_the_region_holds_the_truth_and_is_smaller_than_what_was_searched(determined: Any) -> None:
+    posterior = determined.found.posterior
+    assert PosteriorFound.model_validate_json(json.dumps(posterior.model_dump(), allow_nan=False)) == posterior
+    for name, (low, high) in posterior.region.items():
         assert low <= getattr(TRUE_THETA, name) <= high, name
         assert PARAMETERS.contains({**PARAMETERS.decode((0.5, 0.5)), name: low})
-    low, high = posterior["region"]["particles"]
+    low, high = posterior.region["particles"]
     assert np.log(high / low) < 0.7 * np.log(8)
-    assert posterior["effective"] > 50
+    assert posterior.effective > 50
 
 
 @pytest.mark.slow
 def test_regions_of_nine_tenths_mostly_hold_the_truth() -> None:
     held = []
     for seed in range(8):
-        region = calibrated(calibration_spill, weighed, seed)["posterior"]["region"]
+        region = calibrated(calibration_spill, weighed, seed).found.posterior.region
         held += [low <= getattr(TRUE_THETA, name) <= high for name, (low, high) in region.items()]
     assert sum(held) >= 12  # of 16; fewer than that has a chance of 2 % if nine in ten held
 
 
-def test_parameters_that_make_up_for_each_other_are_named(tied: dict[str, Any]) -> None:
-    posterior = tied["posterior"]
-    said = " ".join(posterior["directions"])
+def test_parameters_that_make_up_for_each_other_are_named(tied: Any) -> None:
+    posterior = tied.found.posterior
+    said = " ".join(posterior.directions)
     assert "cohesion and friction make up for each other: more of one, less of the other" in said
-    sums = [0.5 * (t["cohesion"] / 0.1 + t["friction"] / 0.5) for t in posterior["thetas"]]
+    sums = [0.5 * (t["cohesion"] / 0.1 + t["friction"] / 0.5) for t in posterior.thetas]
     low, high = np.quantile(sums, [0.05, 0.95])
     assert low <= 0.5 <= high
-    apart = np.ptp(np.quantile([t["cohesion"] / 0.1 for t in posterior["thetas"]], [0.05, 0.95]))
+    apart = np.ptp(np.quantile([t["cohesion"] / 0.1 for t in posterior.thetas], [0.05, 0.95]))
     assert high - low < 0.6 * apart  # the sum is known, neither of the two is
 
 
@@ -128,51 +135,55 @@ def test_the_central_theta_is_a_draw_on_a_bent_ridge_and_not_the_mean_beside_it(
 @pytest.mark.parametrize("seed", range(3))
 def test_the_best_theta_is_one_that_the_pours_do_not_exclude(seed: int) -> None:
     result = calibrated(calibration_spill, weighed, seed)
-    for name, (low, high) in result["posterior"]["region"].items():
-        assert low <= result["theta"][name] <= high, name
+    for name, (low, high) in result.found.posterior.region.items():
+        assert low <= getattr(result.found.theta, name) <= high, name
 
 
-def test_what_is_expected_and_the_map_are_those_of_the_theta_that_is_recommended(tied: dict[str, Any]) -> None:
-    grids, theta = tied["map"], tied["theta"]
-    assert grids["over"] == ["cohesion", "friction"] or not grids["held"]
-    x, y = (int(np.argmin(np.abs(np.array(grids["axes"][name]) - theta[name]))) for name in ("cohesion", "friction"))
-    assert grids["mean"][y][x] == pytest.approx(tied["predicted_discrepancy"], abs=0.01)
+def test_what_is_expected_and_the_map_are_those_of_the_theta_that_is_recommended(tied: Any) -> None:
+    grids, theta = tied.found.map, tied.found.theta.model_dump()
+    assert grids.over == ("cohesion", "friction") or not grids.held
+    x, y = (int(np.argmin(np.abs(np.array(grids.axes[name]) - theta[name]))) for name in ("cohesion", "friction"))
+    assert grids.mean[y][x] == pytest.approx(tied.found.predicted_discrepancy, abs=0.01)
 
 
 def test_people_read_what_is_determined_and_what_is_not() -> None:
-    said = {
-        "level": 0.9,
-        "region": {"particles": [900.0, 1300.0], "cohesion": [0.001, 0.097]},
-        "open": ["cohesion"],
-        "directions": [],
-    }
+    said = PosteriorSummary(
+        level=0.9,
+        mean={},
+        region={"particles": (900.0, 1300.0), "cohesion": (0.001, 0.097)},
+        open=("cohesion",),
+        correlation=(),
+        directions=(),
+        remaining_discrepancy=RemainingDiscrepancy(low=0.0, median=0.0, high=0.0),
+        effective=100.0,
+    )
     assert posterior_lines(said, PARAMETERS) == [
         "90 % of the θ that fit the pours have particles 900 … 1 300 (searched 500 … 4 000)",
         "the pours don't determine cohesion (0 … 0.1 N/m): nearly all of what was searched fits them as well as θ*",
     ]
 
 
-def test_theta_file_carries_the_posterior_and_can_still_be_planned_with(
-    determined: dict[str, Any], tmp_path: Path
-) -> None:
-    content = theta_file(determined)
+def test_theta_file_carries_the_posterior_and_can_still_be_planned_with(determined: Any, tmp_path: Path) -> None:
+    content = theta_file(determined.found)
     path = tmp_path / "theta.json"
     path.write_text(json.dumps(content), encoding="utf-8")
-    assert load_parameters(path) == SimulationParameters.model_validate(determined["theta"])
+    assert load_parameters(path) == determined.found.theta
     assert len(content["posterior"]) >= 50
     assert sum(one["weight"] for one in content["posterior"]) == pytest.approx(1.0)
     for one in content["posterior"]:
         assert SimulationParameters.model_validate(one["theta"]).friction == 0.1  # what was fixed stays so
 
 
-def test_the_posterior_is_drawn(determined: dict[str, Any], tmp_path: Path) -> None:
-    path = draw_posterior(tmp_path / "posterior.png", determined["posterior"], PARAMETERS, determined["theta"])
+def test_the_posterior_is_drawn(determined: Any, tmp_path: Path) -> None:
+    path = draw_posterior(
+        tmp_path / "posterior.png", determined.found.posterior, PARAMETERS, determined.found.theta.model_dump()
+    )
     assert is_picture(path)
 
 
-def test_a_prediction_takes_turns_with_thetas_of_the_posterior(determined: dict[str, Any], tmp_path: Path) -> None:
+def test_a_prediction_takes_turns_with_thetas_of_the_posterior(determined: Any, tmp_path: Path) -> None:
     path = tmp_path / "theta.json"
-    path.write_text(json.dumps(theta_file(determined)), encoding="utf-8")
+    path.write_text(json.dumps(theta_file(determined.found)), encoding="utf-8")
     thetas = load_posterior(path, 4)
     assert len(set(thetas)) > 1
     action = SCENE.action({"angular_velocity": 80 * DEG, "max_angle": 100 * DEG})
@@ -181,8 +192,8 @@ def test_a_prediction_takes_turns_with_thetas_of_the_posterior(determined: dict[
     played = Play(calibration_spill)(several)
     assert [request.parameters for request in played.simulations] == [*thetas, *thetas]
     Play(calibration_spill)(one)
-    spreads: Any = [strategy.result()["over_seeds"] for strategy in (one, several)]
-    assert spreads[1]["spilled"]["deviation"] > spreads[0]["spilled"]["deviation"]
+    spreads: Any = [strategy.result().over_seeds for strategy in (one, several)]
+    assert spreads[1]["spilled"].deviation > spreads[0]["spilled"].deviation
 
 
 def test_thetas_are_drawn_by_their_weights_and_a_file_without_them_says_so(tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def test_a_stratum_without_a_possible_action_is_given_up_with_its_reason():
     design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 2, 0, 1)
     Play(never)(design)
     assert design.measured == ()
-    assert "cups touch" in str(design.result()["pours"][0]["given_up"])
+    assert "cups touch" in str(design.result().pours[0].given_up)
 
 
 def test_weighed_pours_survive_the_journal():
@@ -169,7 +169,7 @@ def test_failed_and_leaking_simulations_never_reach_the_fit():
     assert lost
     assert len(final.data) == 40 - len(lost)
     assert all(map(math.isfinite, final.data.costs))
-    assert strategy.result()["lost"] == len(lost)
+    assert strategy.result().lost == len(lost)
     assert true_discrepancy(strategy.theta) < 0.03
 
 
@@ -229,15 +229,15 @@ def calibrated_in_four():
 def test_of_four_parameters_the_result_maps_the_two_that_matter_with_the_others_at_theta_star():
     strategy, _ = calibrated_in_four()
     result = strategy.result()
-    drawn, theta = result["map"], result["theta"]
-    assert drawn["over"] == ["cohesion", "friction"]
-    assert drawn["held"] == {"particles": theta["particles"], "viscosity": theta["viscosity"]}
-    mean, deviation = np.array(drawn["mean"]), np.array(drawn["deviation"])
+    drawn, theta = result.found.map, result.found.theta.model_dump()
+    assert drawn.over == ("cohesion", "friction")
+    assert drawn.held == {"particles": theta["particles"], "viscosity": theta["viscosity"]}
+    mean, deviation = np.array(drawn.mean), np.array(drawn.deviation)
     assert mean.shape == deviation.shape == (30, 30)
     # the map goes through θ*: what it says there is what the result expects there, and nowhere is less expected
-    across, up = (np.abs(np.array(drawn["axes"][name]) - theta[name]).argmin() for name in drawn["over"])
-    assert mean[up, across] == pytest.approx(result["predicted_discrepancy"], abs=0.01)
-    assert mean.min() > result["predicted_discrepancy"] - 1e-4
+    across, up = (np.abs(np.array(drawn.axes[name]) - theta[name]).argmin() for name in drawn.over)
+    assert mean[up, across] == pytest.approx(result.found.predicted_discrepancy, abs=0.01)
+    assert mean.min() > result.found.predicted_discrepancy - 1e-4
     assert mean.max() > 5 * mean.min()
 
 

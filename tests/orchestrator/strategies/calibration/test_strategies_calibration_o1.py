@@ -71,11 +71,11 @@ def test_the_theta_found_is_far_better_than_a_random_one_and_reported_as_c4_does
     Play(calibration_spill)(evaluation)
     assert evaluation.discrepancy("theta", "test") < 0.5 * random_score()
     result = strategy.result()
-    assert result["strategy"] == name
-    assert abs(result["predicted_discrepancy"] - evaluation.discrepancy("theta", "train")) < 0.02
-    assert result["predicted_deviation"] > 0.0
-    assert np.array(result["map"]["mean"]).shape == (30, 30)
-    assert all({"theta", "discrepancy"} <= row.keys() for row in result["trials"])
+    assert result.strategy == name
+    assert abs(result.found.predicted_discrepancy - evaluation.discrepancy("theta", "train")) < 0.02
+    assert result.found.predicted_deviation > 0.0
+    assert np.array(result.found.map.mean).shape == (30, 30)
+    assert all(row.theta and row.discrepancy is not None for row in result.trials)
 
 
 def test_c1_tries_the_middles_of_equal_cells():
@@ -103,9 +103,9 @@ def test_theta_star_of_c1_is_the_grid_point_with_the_least_mean_discrepancy():
             errors.setdefault(request.parameters, []).append(error)
     best = min(errors, key=lambda theta: np.mean(errors[theta]))
     assert strategy.theta == best
-    assert strategy.result()["predicted_discrepancy"] == pytest.approx(np.mean(errors[best]))
+    assert strategy.result().found.predicted_discrepancy == pytest.approx(np.mean(errors[best]))
     expected = np.std(errors[best], ddof=1) / np.sqrt(len(errors[best]))
-    assert strategy.result()["predicted_deviation"] == pytest.approx(expected)
+    assert strategy.result().found.predicted_deviation == pytest.approx(expected)
 
 
 def test_c3_learns_from_every_theta_before_the_next_one():
@@ -141,7 +141,7 @@ def test_a_theta_that_was_lucky_on_the_one_pour_that_it_made_is_not_chosen(name)
     strategy = make(name)
     Play(calibration_spill, answer=sticky)(strategy)
     assert strategy.theta.cohesion < 0.06
-    assert strategy.result()["undefined"] > 0
+    assert strategy.result().undefined > 0
 
 
 @pytest.mark.parametrize("name", STRATEGIES)

@@ -11,6 +11,7 @@ import pytest
 
 from orchestrator.config.campaign.check import touch
 from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
+from orchestrator.results import encode_result
 from orchestrator.strategies.deployment.base import MAX_REFUSED
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
@@ -60,9 +61,9 @@ def test_a_refusal_has_no_cost_takes_no_budget_and_its_place_is_told(name: str) 
     assert len(played.real_spills) == {"D1": 1, "D2": 5, "D3": 5}[name]
     done, total = strategy.progress()
     assert done == total
-    assert result["simulations_lost"] == 0
-    assert {row["loss"] for row in result["pours"] if row["status"] == "refused"} <= {None}
-    json.dumps(result, allow_nan=False)
+    assert result.simulations_lost == 0
+    assert {row.loss for row in result.pours if row.status == "refused"} <= {None}
+    json.dumps(encode_result(result), allow_nan=False)
 
 
 def out_of_reach(request: Request) -> Outcome | None:
@@ -80,7 +81,7 @@ def test_what_only_the_arm_refuses_is_learnt_though_simulations_go_well_there() 
         assert len(played.real_spills) == 4
         assert not questions(played)[-1].infeasible
         assert strategy.best_values["x_offset"] >= NEAREST
-        refused.append(strategy.result()["refused_pours"])
+        refused.append(strategy.result().refused_pours)
     assert 0 < sum(refused) <= 12
 
 
@@ -94,10 +95,10 @@ def test_a_plan_that_the_arm_refuses_is_replaced_by_the_next_best_one() -> None:
 
     refused, strategy = 0, make("D1", 2, pours=1, iterations=8)
     played = Play(narrow_cup, answer=refused_twice)(strategy)
-    assert [row["status"] for row in strategy.result()["pours"]] == ["refused", "refused", "weighed"]
+    assert [row.status for row in strategy.result().pours] == ["refused", "refused", "weighed"]
     assert len({pour.action for pour in played.pours}) == 3
     assert strategy.best_values == {
-        name: pytest.approx(value) for name, value in strategy.result()["pours"][-1]["action_si"].items()
+        name: pytest.approx(value) for name, value in strategy.result().pours[-1].action_si.items()
     }
 
 
@@ -129,6 +130,6 @@ def test_real_vessels_that_touch_are_learnt_in_a_few_refusals() -> None:
     for seed in range(2):
         strategy = RealOnly(spaces, scene, THETA, seed)
         played = Play(spill)(strategy)
-        refusals.append(strategy.result()["refused_pours"])
+        refusals.append(strategy.result().refused_pours)
         assert len(played.real_spills) == 8
     assert 0 < sum(refusals) <= 16  # type: ignore[operator]

@@ -11,7 +11,10 @@ import pytest
 from orchestrator.codec import decode_request, encode_request
 from orchestrator.errors import RunError
 from orchestrator.requests import Failed, Simulate, Suggest
+from orchestrator.results import decode_result, encode_result
 from orchestrator.stages import with_posterior
+from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.posterior import PosteriorFound, RemainingDiscrepancy
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
@@ -61,12 +64,12 @@ def test_what_is_promised_under_errors_is_what_comes(level: float) -> None:
     strategy = risky(1, risk=plans.risk("cvar" if level else "expected", level or 0.9, ERRORS))
     Play(two_valleys)(strategy)
     result: Any = strategy.result()
-    losses = np.sort(true_losses(result["action_si"]))
-    assert result["risk"]["expected"] == pytest.approx(losses.mean(), abs=0.04)
-    assert result["risk"]["spread"] == pytest.approx(losses.std(), abs=0.05)
-    assert result["predicted_loss"] == pytest.approx(losses[int(level * len(losses)) :].mean(), abs=0.06)
-    assert result["predicted_scatter"] > 0.8 * losses.std()
-    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    losses = np.sort(true_losses(result.recommended.action_si))
+    assert result.risk.expected == pytest.approx(losses.mean(), abs=0.04)
+    assert result.risk.spread == pytest.approx(losses.std(), abs=0.05)
+    assert result.recommended.predicted_loss == pytest.approx(losses[int(level * len(losses)) :].mean(), abs=0.06)
+    assert result.recommended.predicted_scatter > 0.8 * losses.std()
+    assert decode_result(json.loads(json.dumps(encode_result(result), allow_nan=False))) == result
 
 
 def test_each_action_is_simulated_as_planned_and_under_errors_within_the_budget() -> None:
@@ -154,7 +157,7 @@ def test_where_every_action_touches_nothing_is_recommended(errors: PoseError) ->
     played = Play(touching_below(1.0))(strategy)
     assert not played.pours
     assert strategy.best_values is None
-    assert "touch" in str(strategy.result()["gave_up"])
+    assert "touch" in str(strategy.result().gave_up)
 
 
 def test_lost_simulations_are_left_out() -> None:
@@ -210,17 +213,38 @@ def test_thetas_of_the_calibration_before_are_borne_and_a_campaign_without_says_
         return min(two_valleys(action, theta, rng) + 4.0 * theta.cohesion, 1.0)
 
     plan = deployment_plan(strategy="D1", pours=0, risk=plans.risk(pose_error=ERRORS, theta="posterior"))
-    rows = [{"cohesion": 0.001 * i} for i in range(100)]
-    results: Any = {"calibration": {"theta": THETA.model_dump(), "posterior": {"thetas": rows}}}
-    informed = with_posterior(plan, results)
+    rows = tuple({"cohesion": 0.001 * i} for i in range(100))
+    posterior = PosteriorFound(
+        level=0.9,
+        mean={},
+        region={},
+        open=(),
+        correlation=(),
+        directions=(),
+        remaining_discrepancy=RemainingDiscrepancy(low=0.0, median=0.0, high=0.0),
+        effective=100.0,
+        thetas=rows,
+    )
+    found = CalibratedTheta(
+        theta=THETA,
+        searched=("cohesion",),
+        predicted_discrepancy=0.0,
+        predicted_deviation=0.0,
+        hyperparameters=None,
+        map=None,
+        posterior=posterior,
+    )
+    calibrated = Calibrated(strategy="C4", simulations=0, lost=0, undefined=0, training_pours=2, trials=(), found=found)
+    informed = with_posterior(plan, {"calibration": calibrated})
     assert 50 <= len(informed.thetas) <= 100
     strategy = risky(risk=informed.settings.risk, thetas=informed.thetas)  # type: ignore[attr-defined]
     played = Play(spill)(strategy)
     assert len({request.parameters.cohesion for request in played.simulations}) > 10
     result: Any = strategy.result()
-    assert result["risk"]["expected"] > true_losses(result["action_si"]).mean() + 0.1  # mean cohesion costs 0.2
+    assert result.risk.expected > true_losses(result.recommended.action_si).mean() + 0.1  # mean cohesion costs 0.2
+    pointless = calibrated.model_copy(update={"found": found.model_copy(update={"posterior": None})})
     with pytest.raises(RunError, match="C4"):
-        with_posterior(plan, {"calibration": {"theta": {}}})
+        with_posterior(plan, {"calibration": pointless})
 
 
 def test_a_prediction_bears_the_errors_and_counts_cups_that_touch_as_the_worst() -> None:
@@ -236,9 +260,9 @@ def test_a_prediction_bears_the_errors_and_counts_cups_that_touch_as_the_worst()
     played = Play(spill)(strategy)
     assert [request.pose_error for request in played.simulations] == errors
     result: Any = strategy.result()
-    assert (result["touching"], result["simulations_lost"]) == (1, 0)
-    assert result["over_seeds"]["loss"]["mean"] == pytest.approx((1.0 + 0.1 + 0.3 + 0.5) / 4)
-    assert result["over_seeds"]["spilled"]["count"] == 3
+    assert (result.touching, result.simulations_lost) == (1, 0)
+    assert result.over_seeds["loss"].mean == pytest.approx((1.0 + 0.1 + 0.3 + 0.5) / 4)
+    assert result.over_seeds["spilled"].count == 3
 
 
 def test_a_simulation_that_was_asked_for_with_an_error_is_made_with_it() -> None:

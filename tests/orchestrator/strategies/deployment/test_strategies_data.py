@@ -130,7 +130,7 @@ def test_a_hybrid_pours_first_where_the_former_pours_and_the_simulations_say(tmp
     played = Play(narrow_cup)(hybrid)
     first = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
     assert (len(first.data), len(first.simulated), first.acquisition) == (3, 6, "lcb")
-    assert hybrid.result()["former_pours"] == 3
+    assert hybrid.result().former_pours == 3
 
 
 def test_planning_with_the_same_campaign_learns_from_no_pour(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_planning_with_the_same_campaign_learns_from_no_pour(tmp_path: Path) -> 
     planner = OneShotPlanning(dataclasses.replace(plan, settings=D1Settings()), plan.scenes[0], THETA, 1)
     played = Play(narrow_cup)(planner)
     assert len(played.pours) == 1
-    assert planner.result()["former_pours"] == 0
+    assert planner.result().former_pours == 0
     assert not any("former" in decision.text for decision in planner.decisions)
 
 
@@ -201,7 +201,7 @@ def test_several_receivers_get_each_their_own_pours(tmp_path: Path) -> None:
         tmp_path, both + "  data: {from: pours.csv}\n"
     )
     plan = deployment(tmp_path, both + "  data: {from: pours.csv, receiver: mug}\n")
-    narrow, mug = (RealOnly(plan, scene, THETA, 1).result()["former_pours"] for scene in plan.scenes)
+    narrow, mug = (RealOnly(plan, scene, THETA, 1).result().former_pours for scene in plan.scenes)
     assert (narrow, mug) == (0, 3)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
+from orchestrator.results import encode_result
 from orchestrator.strategies.deployment.base import MAX_REFUSED
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
@@ -43,12 +44,12 @@ def test_a_campaign_stays_in_its_box_keeps_its_budget_and_reports_json(name):
             {"angular_velocity": request.action.angular_velocity, "x_offset": request.action.x_offset}
         )
     result = strategy.result()
-    assert json.loads(json.dumps(result, allow_nan=False))["strategy"] == name
+    assert json.loads(json.dumps(encode_result(result), allow_nan=False))["strategy"] == name
     done, total = strategy.progress()
     assert done == total
-    assert set(result["action"]) == {"angular_velocity_deg_s", "x_offset_mm"}
-    assert 15 <= result["action"]["angular_velocity_deg_s"] <= 120
-    assert np.array(result["map"]["mean"]).shape == (25, 25)
+    assert set(result.recommended.action) == {"angular_velocity_deg_s", "x_offset_mm"}
+    assert 15 <= result.recommended.action["angular_velocity_deg_s"] <= 120
+    assert np.array(result.map.mean).shape == (25, 25)
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
@@ -88,8 +89,8 @@ def test_d1_recommends_an_action_that_spills_little_and_needs_no_pour():
         assert Play(narrow_cup)(strategy).pours == []
         values.append(quiet_spill(strategy.best_values))
         result = strategy.result()
-        assert abs(result["predicted_loss"] - values[-1]) < 0.1
-        assert result["predicted_deviation"] > 0.0
+        assert abs(result.recommended.predicted_loss - values[-1]) < 0.1
+        assert result.recommended.predicted_deviation > 0.0
     assert np.mean(values) < 0.05
 
 
@@ -105,11 +106,11 @@ def test_d1_predicts_the_spillage_of_its_action_whatever_it_minimised():
     strategy = make("D1", pours=0, loss=Loss("grams"))
     told = Play(lambda *pour: 0.1 + 0.5 * narrow_cup(*pour))(strategy).told
     result = strategy.result()
-    chosen = SCENE.action(result["action_si"])
+    chosen = SCENE.action(result.recommended.action_si)
     simulated = [o.outcome.fractions for r, o in told if isinstance(r, Simulate) and r.action == chosen]
     assert len(simulated) == 2
-    assert result["predicted_spillage"] == pytest.approx(np.mean([f.spilled / f.poured for f in simulated]))
-    assert result["predicted_loss"] > 10 * result["predicted_spillage"]  # in grams of 200
+    assert result.recommended.predicted_spillage == pytest.approx(np.mean([f.spilled / f.poured for f in simulated]))
+    assert result.recommended.predicted_loss > 10 * result.recommended.predicted_spillage  # in grams of 200
 
 
 def test_a_zero_mean_pours_worse_than_a_constant_one():
@@ -162,8 +163,8 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
     assert [r.number for r in played.pours] == [1, 2, 3, 4]
     final = [r for r in played.asked if isinstance(r, Suggest)][-1].problem
     assert len(final.data) == (4 if entered else 3)
-    row = strategy.result()["pours"][1]
-    assert (row["status"], row["loss"]) == ("failed", entered)
+    row = strategy.result().pours[1]
+    assert (row.status, row.loss) == ("failed", entered)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +184,7 @@ def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_pape
 
     strategy = make(name, pours=5, **changes)
     played = Play(narrow_cup, answer=second_touches_third_is_not_weighed)(strategy)
-    assert [pour["status"] for pour in strategy.result()["pours"]].count("failed") == 2
+    assert [pour.status for pour in strategy.result().pours].count("failed") == 2
     second = ACTIONS.encode(played.pours[1].action.values())
     last = [request for request in played.asked if isinstance(request, Suggest)][-1].problem
     assert [pytest.approx(point) for point in last.failed] == ([second] if warns else [])
@@ -198,12 +199,12 @@ def test_touching_vessels_are_avoided_and_cost_no_pour():
     strategy = make("D2", 1, pours=8)
     played = Play(touches_when_near)(strategy)
     result = strategy.result()
-    assert result["refused_pours"] > 0
+    assert result.refused_pours > 0
     assert len(played.real_spills) == 8
-    assert [r["number"] for r in result["pours"] if r["status"] == "weighed"] == list(range(1, 9))
+    assert [r.number for r in result.pours if r.status == "weighed"] == list(range(1, 9))
     hybrid = make("D3", 1, pours=4, model="scaled")
     Play(touches_when_near)(hybrid)
-    assert hybrid.result()["refused_pours"] <= 1  # simulations have told most of it
+    assert hybrid.result().refused_pours <= 1  # simulations have told most of it
     assert hybrid.best_values["x_offset"] >= 0.10
 
 
@@ -214,7 +215,7 @@ def test_a_space_without_a_possible_action_ends_with_an_explanation():
     strategy = make("D2", pours=3)
     played = Play(never)(strategy)
     assert len(played.pours) == MAX_REFUSED
-    assert "refused as invalid" in strategy.result()["gave_up"]
+    assert "refused as invalid" in strategy.result().gave_up
 
 
 def test_a_simulator_that_is_wrong_raises_the_alarm_and_a_right_one_does_not():
@@ -224,8 +225,8 @@ def test_a_simulator_that_is_wrong_raises_the_alarm_and_a_right_one_does_not():
     wrong, right = make("D3", 1, pours=5), make("D3", 1, pours=5)
     Play(upside_down, narrow_cup)(wrong)
     Play(narrow_cup)(right)
-    assert wrong.result()["trust"]["alarm"]
-    assert not right.result()["trust"]["alarm"]
+    assert wrong.result().trust.alarm
+    assert not right.result().trust.alarm
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_simulations_that_are_found_wrong_are_ended() -> None:
         r for s, r in log.steps[third + 1 :] if isinstance(s, Slots) and any(isinstance(x, Simulate) for x in r)
     ]
     assert len(play.pours) == 5
-    assert strategy.result()["trust"]["followed"] == "D2"  # type: ignore[index]
+    assert strategy.result().trust.followed == "D2"
 
 
 def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_pour() -> None:
@@ -136,7 +136,7 @@ def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_p
     play(log)
     assert [r.number for r in play.pours] == [1, 2, 3, 4]
     assert sum(isinstance(r, Ask) for r in play.asked) == 1
-    assert strategy.result()["trust"]["followed"] == "widen"  # type: ignore[index]
+    assert strategy.result().trust.followed == "widen"
 
 
 # -- nobody waits ----------------------------------------------------------------------------------------------------
@@ -176,8 +176,8 @@ def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
         assert len(problem.simulated) <= MOST_SIMULATIONS
         followed += 1
     assert followed == 3
-    assert log.strategy.result()["trust"]["pours"]  # type: ignore[index]  # it was checked all the same
-    assert "map" in log.strategy.result()
+    assert log.strategy.result().trust.pours  # it was checked all the same
+    assert log.strategy.result().map is not None
 
 
 def test_thinning_keeps_what_is_near_and_covers_the_rest_whatever_it_cost() -> None:

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from orchestrator.report.summary import summarise, summary_table
+from orchestrator.report.summary import summarise
+from orchestrator.report.table import summary_table
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
+from orchestrator.results import decode_result, encode_result
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
@@ -217,17 +219,17 @@ def test_only_what_nothing_beats_is_on_the_front() -> None:
 def test_the_front_is_reported_with_actions_that_pour_and_none_beats_another(strategy: str) -> None:
     found = make(strategy, (SPILLAGE, TIME), 1, pareto=True, pours=12, iterations=16)
     played = play(found)
-    result = json.loads(json.dumps(found.result(), allow_nan=False))
-    front = result["front"]
+    result = decode_result(json.loads(json.dumps(encode_result(found.result()), allow_nan=False)))
+    front = result.front
     assert len(front) >= 3
-    vectors = [(row["objectives"]["spillage"], row["objectives"]["time"]) for row in front]
+    vectors = [(row.objectives["spillage"], row.objectives["time"]) for row in front]
     assert undominated(vectors) == list(range(len(vectors)))
     assert vectors == sorted(vectors)
-    assert all(delivered(world(SCENE.action(row["action_si"]))) > 0.45 for row in front)
+    assert all(delivered(world(SCENE.action(row.action_si))) > 0.45 for row in front)
     made = {r.action for r in played.asked if isinstance(r, Simulate | Pour)}
-    assert {SCENE.action(row["action_si"]) for row in front} <= made
-    assert result["action_si"] is not None
-    assert all(row["predicted"] is None for row in result["pours"] if strategy != "D1")
+    assert {SCENE.action(row.action_si) for row in front} <= made
+    assert result.recommended.action_si is not None
+    assert all(row.predicted is None for row in result.pours if strategy != "D1")
 
 
 def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poured(tmp_path: Path) -> None:
@@ -238,14 +240,14 @@ def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poure
     )
     plan = toy_plan(tmp_path, deployment=deployment)
     summary = summarise(plan, {"deployment:cup": found.result()})
-    assert summary["loss"] == "objectives"
+    assert summary.loss == "objectives"
     console = Console(width=200)
     with console.capture() as capture:
         console.print(summary_table(plan, summary))
     text = capture.get()
     assert "spillage + time [%]" in text
-    front = found.result()["front"]
-    first = front[0]["objectives"]
+    front = found.result().front
+    first = front[0].objectives
     assert f"cup, nothing beats: spillage {100 * first['spillage']:.1f} ± " in text
     assert text.count("nothing beats") == len(front)
     assert "deg/s, max angle" in text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,7 +63,7 @@ def test_the_alarm_is_for_pours_far_from_simulation_in_its_own_deviations() -> N
     check = TrustCheck(TrustSettings(limit=2.5), worst=1.0)
     check.compare(weighed(0.5, 0.3, 0.4), said(0.1, 0.1, 0.1, deviation=0.04))
     spread = np.hypot(np.hypot(0.04, 0.03), 0.01)
-    assert check.result()["z_scores"] == pytest.approx(np.array([0.4, 0.2, 0.3]) / spread)
+    assert check.result().z_scores == pytest.approx(np.array([0.4, 0.2, 0.3]) / spread)
     assert check.alarm
     assert check.policy == "D2"
     doubtful = TrustCheck(TrustSettings(limit=2.5), worst=1.0)
@@ -102,9 +101,9 @@ def test_a_wrong_simulator_is_forgotten_from_the_alarm_on() -> None:
     alarm = [d for d in strategy.decisions if d.urgent]
     assert len(alarm) == 1
     assert alarm[0].text.startswith("trust alarm: weighed for simulated")
-    trust = strategy.result()["trust"]
-    assert (trust["alarm"], trust["followed"]) == (True, "D2")
-    assert json.loads(json.dumps(trust, allow_nan=False)) == trust
+    trust = strategy.result().trust
+    assert (trust.alarm, trust.followed) == (True, "D2")
+    assert type(trust).model_validate_json(trust.model_dump_json()) == trust
     done, total = strategy.progress()
     assert done == total
 
@@ -117,9 +116,9 @@ def pessimistic(action: Any, theta: Any, rng: Any) -> float:
 def test_a_simulator_that_promised_too_little_is_not_forgotten_and_people_are_told() -> None:
     strategy = hybrid(pours=6, per_pour=2, model="scaled")
     played = Play(pessimistic, narrow_cup)(strategy)
-    trust = strategy.result()["trust"]
-    assert np.mean(np.abs(trust["z_scores"])) > 2.5
-    assert (trust["alarm"], trust["followed"]) == (False, None)
+    trust = strategy.result().trust
+    assert np.mean(np.abs(trust.z_scores)) > 2.5
+    assert (trust.alarm, trust.followed) == (False, None)
     assert not [d for d in strategy.decisions if d.urgent]
     assert [d for d in strategy.decisions if d.text.startswith("pours are better than simulated: weighed for")]
     last = [r.problem for r in played.asked if isinstance(r, Suggest)][-1]
@@ -146,7 +145,7 @@ def test_a_right_simulator_is_used_to_the_end() -> None:
     last = [r.problem for r in played.asked if isinstance(r, Suggest)][-1]
     assert last.mean == "scaled"
     assert not [d for d in strategy.decisions if d.urgent]
-    assert strategy.result()["trust"]["followed"] is None
+    assert strategy.result().trust.followed is None
 
 
 @pytest.mark.slow
@@ -224,7 +223,7 @@ def test_a_campaign_that_asks_pauses_and_goes_on_as_answered(tmp_path: Path) -> 
         run(directory, resume=True, ask_operator=answering("lost"))
     result = run(directory, resume=True, ask_operator=answering("d2"))
     assert result.state == "finished"
-    assert next(iter(result.results.values()))["trust"]["followed"] == "D2"
+    assert next(iter(result.results.values())).trust.followed == "D2"
     with JournalReader(directory / JOURNAL_NAME) as journal:
         assert [e.body["answer"] for e in journal.entries(kinds=[Kind.OPERATOR_ANSWERED])] == ["D2"]
     # what it asked for is what a campaign asks for that has decided so beforehand
@@ -255,7 +254,7 @@ def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
     asyncio.run(paused_after_the_answer())
     result = run(directory, resume=True)
     assert result.state == "finished"
-    assert next(iter(result.results.values()))["trust"]["followed"] == "widen"
+    assert next(iter(result.results.values())).trust.followed == "widen"
 
 
 # -- pictures ----------------------------------------------------------------------------------------
@@ -272,5 +271,6 @@ def test_an_alarm_is_drawn_and_told(tmp_path: Path) -> None:
     line = trust_line(trust)
     assert line is not None
     assert "after pour 3 its simulations were forgotten" in line
+    nothing = TrustCheck(TrustSettings(), worst=1.0).result()
     with pytest.raises(ValueError, match="no pour was compared"):
-        draw_trust(tmp_path / "nothing.png", {}, unit=deployment_unit(plan.deployment), receiver="cup")
+        draw_trust(tmp_path / "nothing.png", nothing, unit=deployment_unit(plan.deployment), receiver="cup")

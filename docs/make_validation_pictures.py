@@ -1,0 +1,26 @@
+"""Draw the pictures of docs/validation.md again from the curves in docs/validation.json, without measuring.
+
+python docs/make_validation_pictures.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from orchestrator.report import physics
+
+DOCS = Path(__file__).resolve().parent
+
+
+def main() -> None:
+    """Draw what has curves; a case that was measured before they were kept is left as it is."""
+    for name, record in physics.kept_records(DOCS).items():
+        figure = physics.figure_of(record)
+        if figure is None:
+            print(f"{name}: no curves are kept")
+        elif record["image"] is not None:
+            print(physics.draw(figure, DOCS / physics.IMAGES / record["image"]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""What follows a run, whoever drove it: its recording is closed, its figures and summary and θ* are written."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from orchestrator.campaign import CampaignResult
+from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.occupancy import occupancies
+from orchestrator.plan import CampaignPlan
+from orchestrator.report import regimes
+from orchestrator.report.campaign import draw_figures
+from orchestrator.report.results import theta_of
+from orchestrator.report.summary import PoolUse, RunSummary, Totals, summarise, write_summary
+from orchestrator.strategies.calibration.base import CalibratedTheta
+
+W = TypeVar("W")
+
+FIGURES, THETA_FILE = "figures", "theta.json"
+
+KEPT_THETAS = 50
+"""Draws of the posterior in that file."""
+
+_log = logging.getLogger(__name__)
+
+
+class Recording(Protocol):
+    """The recording of a run, as far as publishing goes."""
+
+    @property
+    def path(self) -> Path:
+        """Its file."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """Events that are missing in it."""
+        ...
+
+    def close(self) -> object:
+        """Write what is left, and end it; may be called twice."""
+        ...
+
+
+@dataclass(frozen=True)
+class Published:
+    """What was written about a run.
+
+    Attributes:
+        figures: by name.
+        theta: the file of θ*, for `--parameters`; None where nothing was calibrated.
+    """
+
+    summary: RunSummary
+    figures: dict[str, Path]
+    recording: Path | None = None
+    theta: Path | None = None
+
+
+def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | None = None) -> Published:
+    """Close a run's recording, and write its figures (if the plan wants any), `theta.json` and `summary.json`.
+
+    Safe to call again: the files are then written anew.
+
+    Args:
+        plan: of the campaign.
+        result: what it came to, as `run_campaign` or `read_result` has it.
+        recording: that watched it.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    directory = result.directory
+    if recording is not None:
+        recording.close()
+    figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+    summary = summarise(
+        plan,
+        result.results,
+        figures=figures,
+        recording=None if recording is None else recording.path,
+        dropped_events=0 if recording is None else recording.dropped,
+        not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
+        best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
+        totals=_totals(plan, result),
+    )
+    write_summary(directory, summary)
+    found = theta_of(result.results)
+    theta = None if found is None else directory / THETA_FILE
+    if theta is not None and found is not None:
+        theta.write_text(json.dumps(theta_file(found), indent=2) + "\n", encoding="utf-8")
+    return Published(summary, figures, None if recording is None else recording.path, theta)
+
+
+def theta_file(found: CalibratedTheta) -> dict[str, Any]:
+    """What `theta.json` holds: θ*, and where it is known the posterior as weighted θ, each complete."""
+    theta = found.theta.model_dump()
+    if found.posterior is None:
+        return {"theta": theta}
+    draws = found.posterior.thetas
+    kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
+    return {"theta": theta, "posterior": [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]}
+
+
+def _totals(plan: CampaignPlan, result: CampaignResult) -> Totals:
+    with JournalReader(result.directory / JOURNAL_NAME) as journal:
+        found = occupancies(journal.entries(), plan.parallel_simulations)
+    return Totals(
+        mode=plan.laboratory.mode,
+        simulations=result.simulations,
+        pours=result.pours,
+        cpu_s=result.cpu_s,
+        seconds=result.seconds,
+        occupancy={
+            stage: PoolUse(
+                pool_busy=one.fraction,
+                pool_useful=one.useful / one.total if one.total > 0.0 else None,
+                arm_longest_wait_s=max(one.waits, default=None),
+                arm_mean_wait_s=sum(one.waits) / len(one.waits) if one.waits else None,
+            )
+            for stage, one in found.items()
+        },
+    )
+
+
+def worked_out(
+    work: Callable[[], dict[str, list[W]]], tell: Callable[[str], None] = _log.warning
+) -> dict[str, list[W]]:
+    """Warnings, or none if they can't be worked out: that is no reason to lose a summary."""
+    try:
+        return work()
+    except (ValueError, OSError) as error:
+        tell(f"note: whether something is not simulated could not be worked out: {error}")
+        return {}

@@ -1,0 +1,192 @@
+"""What a run came to, for people: a table in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
+from orchestrator.report.occupancy import occupancy_lines
+from orchestrator.report.posterior import posterior_lines
+from orchestrator.report.results import SPLITS
+from orchestrator.report.risk import risk_line, window_line
+from orchestrator.report.summary import ReceiverSummary, RunSummary
+from orchestrator.report.trust import trust_line
+from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
+from orchestrator.strategies.deployment.learnt import FrontAction
+from sim_engine.spread import Spread
+
+if TYPE_CHECKING:
+    from rich.console import JustifyMethod, RenderableType
+
+PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
+"""Columns of the table where stderr is no terminal: at least, at most."""
+
+
+def summary_table(plan: CampaignPlan, summary: RunSummary) -> RenderableType:
+    """The summary for the terminal: θ*, discrepancies, losses and best actions by receiver, files."""
+    from rich.console import Group
+    from rich.text import Text
+
+    parts: list[RenderableType] = [Text(f"\n{summary.campaign}  seed {summary.seed}", style="bold")]
+    parts += _theta_lines(plan, summary)
+    discrepancies = {split: row for split, row in summary.discrepancy.items() if _has_numbers(row.values())}
+    if discrepancies:
+        parts.append(_discrepancy_table(discrepancies))
+    if plan.deployment is not None:
+        known = [row for row in summary.receivers.values() if _has_losses(row)]
+        if known:
+            parts.append(_receiver_table(known, deployment_unit(plan.deployment)))
+        parts += _remarks(summary.receivers.values(), deployment_unit(plan.deployment))
+        parts += occupancy_lines(summary.occupancy)
+    files = [*summary.figures.items(), *([("recording", summary.recording)] if summary.recording else [])]
+    if files:
+        width = max(len(name) for name, _ in files)
+        # Paths stand alone at their lines' ends, unbroken: terminals make them clickable, people copy them.
+        parts.append(Text("\n".join(f"  {name:<{width}}  {path}" for name, path in files), overflow="fold"))
+    if summary.dropped_events:
+        parts.append(Text(f"  the recording lacks {summary.dropped_events} events: it could not keep up", "yellow"))
+    return Group(*parts)
+
+
+def _theta_lines(plan: CampaignPlan, summary: RunSummary) -> list[RenderableType]:
+    from rich.text import Text
+
+    if summary.theta is None:
+        return []
+    text = Text(f"θ*  {style.display_values(summary.theta.model_dump())}")
+    if summary.predicted_discrepancy is not None:
+        expected = DISCREPANCY.text(summary.predicted_discrepancy, summary.predicted_deviation or 0.0)
+        text.append(f"   expected |Δ| {expected}", style="dim")
+    if summary.posterior is None or plan.calibration is None:
+        return [text]
+    lines = posterior_lines(summary.posterior, plan.calibration.parameters)
+    return [text, *(Text(f"  {line}", style="dim") for line in lines)]
+
+
+def _has_losses(row: ReceiverSummary) -> bool:
+    """Whether it has any of the numbers that the table exists for."""
+    return _has_numbers((row.first_loss, row.best_loss, row.predicted_loss))
+
+
+def _has_numbers(values: Iterable[Any]) -> bool:
+    return any(value is not None for value in values)
+
+
+def _discrepancy_table(rows: Mapping[str, Mapping[str, float | None]]) -> RenderableType:
+    from rich.table import Table
+
+    columns = {
+        "calibrated": "θ*",
+        "random_theta": "random θ (median)",
+        "mean_predictor": "mean of training pours",
+        "regression": "GP regression",
+    }
+    shown = [name for name in columns if any(row.get(name) is not None for row in rows.values())]
+    table = Table(title="mean |measured − predicted| spillage [%]", title_justify="left", title_style="", box=_box())
+    table.add_column("")
+    for name in shown:
+        table.add_column(columns[name], justify="right")
+    for split, row in rows.items():
+        cells = [row.get(name) for name in shown]
+        table.add_row(SPLITS[split], *("—" if cell is None else f"{100 * cell:.2f}" for cell in cells))
+    return table
+
+
+def _receiver_table(rows: Sequence[ReceiverSummary], unit: LossUnit) -> RenderableType:
+    from rich.table import Table
+
+    columns: dict[str, tuple[JustifyMethod, list[str]]] = {
+        "receiver": ("left", [row.receiver for row in rows]),
+        "": ("left", [row.strategy for row in rows]),
+        "pours": ("right", [str(row.pours or "") for row in rows]),
+        "first": ("right", ["" if row.first_loss is None else unit.text(row.first_loss) for row in rows]),
+        "best measured": ("right", [_best_measured(row, unit) for row in rows]),
+        "best expected": ("right", [_best_expected(row, unit) for row in rows]),
+        "best action": ("left", [style.display_values(dict(row.best_action_si or {})) for row in rows]),
+    }
+    table = Table(title=unit.label, title_justify="left", title_style="", box=_box())
+    shown = {name: column for name, column in columns.items() if any(column[1])}
+    for name, (justify, _) in shown.items():
+        table.add_column(name, justify=justify)
+    for cells in zip(*(cells for _, cells in shown.values()), strict=True):
+        table.add_row(*(cell or "—" for cell in cells))
+    return table
+
+
+def _best_measured(row: ReceiverSummary, unit: LossUnit) -> str:
+    return "" if row.best_loss is None else f"{unit.text(row.best_loss)} (pour {row.best_pour})"
+
+
+def _best_expected(row: ReceiverSummary, unit: LossUnit) -> str:
+    if row.predicted_loss is None:
+        return ""
+    return unit.text(row.predicted_loss, row.predicted_deviation) + unit.scatter(row.predicted_scatter)
+
+
+def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[RenderableType]:
+    from rich.text import Text
+
+    remarks: list[RenderableType] = []
+    for row in rows:
+        receiver = row.receiver
+        if row.untrustworthy_simulation:
+            remarks.append(Text(f"  {receiver}: {trust_line(row.trust)}", style="yellow"))
+        if row.failed_pours:
+            remarks.append(Text(f"  {receiver}: {row.failed_pours} pour(s) failed", style="yellow"))
+        if row.gave_up:
+            remarks.append(Text(f"  {receiver}: {row.gave_up}", style="yellow"))
+        elif not _has_losses(row):
+            remarks.append(Text(f"  {receiver}: nothing was learnt; see the journal for what failed", style="yellow"))
+        remarks += [Text(f"  {receiver}, nothing beats: {_compromise(one)}") for one in row.front or ()]
+        if row.risk is not None:
+            remarks.append(Text(f"  {receiver}, {risk_line(row.risk, unit)}"))
+        if row.window is not None:
+            remarks.append(Text(f"  {receiver}, {window_line(row.window, unit)}"))
+        if row.prediction is not None:
+            remarks.append(Text(f"  {receiver}, best action: {_prediction(row.prediction)}"))
+        for one in row.not_covered:
+            remarks.append(Text(f"  {receiver}, best action, {one.kind}: {one.text}", style="yellow"))
+    return remarks
+
+
+def _compromise(one: FrontAction) -> str:
+    """'spillage 1.2 ± 0.3 %, time 40.0 ± 1.0 %  with angular velocity 41.2 deg/s, …'."""
+    parts = [
+        f"{name.replace('_', ' ')} {100 * at_least_nothing(mean):.1f} ± {100 * one.deviations[name]:.1f} %"
+        for name, mean in one.objectives.items()
+    ]
+    return f"{', '.join(parts)}  with {style.display_values(dict(one.action_si))}"
+
+
+def _prediction(over_seeds: Mapping[str, Spread]) -> str:
+    """'spilled / poured 1.2 ± 0.4 % (mean ± standard deviation of 5 fresh seeds), retained …'."""
+    shown = {name: over_seeds[name] for name in ("spillage", "spilled", "retained") if name in over_seeds}
+    if not shown:
+        return "no simulation of it could be used"
+    words = {"spillage": "spilled / poured"}
+    parts = [f"{words.get(name, name)} {spread.percent(2)}" for name, spread in shown.items()]
+    count = max(spread.count for spread in shown.values())
+    return f"{', '.join(parts)} (mean ± standard deviation, {count} fresh seeds)"
+
+
+def print_summary(plan: CampaignPlan, summary: RunSummary) -> None:
+    """Write the summary's table to stderr.
+
+    Where that is no terminal, nobody has a width to fit in: lines are as long as names and paths want them.
+    """
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    console, table = Console(stderr=True), summary_table(plan, summary)
+    if not console.is_terminal:
+        wanted = Measurement.get(console, console.options.update(max_width=LONGEST_LINE), table).maximum
+        console.width = max(PLAIN_WIDTH, wanted)
+    console.print(table)
+
+
+def _box() -> Any:
+    from rich import box
+
+    return box.SIMPLE_HEAD

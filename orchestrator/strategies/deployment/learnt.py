@@ -1,0 +1,161 @@
+"""What a deployment has learnt: D1, D2 and D3 alike, with what only some of them look for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+from orchestrator.strategies.deployment.pours import Foretold, PourRow
+from orchestrator.strategies.deployment.trust import Compared
+from orchestrator.strategies.deployment.window import WindowFound
+from orchestrator.strategies.display import DisplayedMap
+from orchestrator.strategies.learnt import Learnt, Part
+
+
+class Recommended(Part):
+    """The action to use from now on, and what to expect of it."""
+
+    action: dict[str, float | None]
+    """Searched dimensions in display units."""
+
+    action_si: dict[str, float]
+    """The same in SI."""
+
+    predicted_loss: float
+    """Expected, in the loss' own unit."""
+
+    predicted_deviation: float
+    """How well that mean is known."""
+
+    predicted_scatter: float | None
+    """How much a single pour differs from it; None where nobody knows."""
+
+    predicted_spillage: float | None = None
+    """D1: mean r = spilled / poured of its simulations, whose seeds took part in choosing it."""
+
+    predicted_spillage_deviation: float | None = None
+    """D1: standard deviation of r over these seeds."""
+
+    hyperparameters: dict[str, float] | None = None
+    """Those of the surrogate."""
+
+
+class RiskFound(Part):
+    """What errors of execution and θ that fit do to the recommended action."""
+
+    measure: Literal["expected", "cvar"]
+    """What was minimised."""
+
+    level: float
+    """Share of the worst cases that a CVaR is the mean of."""
+
+    value: float
+    """The measure, in the loss' own unit."""
+
+    expected: float
+    """Mean over the disturbances."""
+
+    spread: float
+    """Standard deviation over them."""
+
+    thetas: int
+    """θ of a posterior among them; 0 where θ is one."""
+
+
+class FrontAction(Part):
+    """An action that no other one beats in all objectives."""
+
+    action: dict[str, float | None]
+    """Searched dimensions in display units."""
+
+    action_si: dict[str, float]
+    """The same in SI."""
+
+    objectives: dict[str, float]
+    """Expected, by name."""
+
+    deviations: dict[str, float]
+    """How well each is known."""
+
+
+class SimulatedAction(Part):
+    """An action that was simulated, and what came of it."""
+
+    action_si: dict[str, float]
+    """Searched dimensions [SI]."""
+
+    loss: float
+    """Mean over its simulations, in the loss' own unit."""
+
+
+class Deployed(Learnt):
+    """What a deployment has learnt in one scene."""
+
+    kind: Literal["deployment"] = "deployment"
+
+    strategy: str
+    """'D1' to 'D3', or another one's name."""
+
+    scene: str
+    """Name of the scene."""
+
+    loss: str
+    """Name of what is minimised."""
+
+    simulations: int
+    """Those that were answered."""
+
+    simulations_lost: int
+    """Those of them that could not be used."""
+
+    simulations_refused: int
+    """Actions that were refused before anything was simulated."""
+
+    pours: tuple[PourRow, ...]
+    """All that are over, in the order made."""
+
+    simulated: tuple[SimulatedAction, ...]
+    """Actions whose simulations gave a loss, in the order of asking."""
+
+    former_pours: int
+    """Pours of before the campaign that it learnt from."""
+
+    refused_pours: int
+    """Actions that were refused before anything moved."""
+
+    failed_pours: int
+    """Pours that went wrong."""
+
+    trust: Compared | Foretold
+    """How far the first pours were from what was simulated, or else predicted."""
+
+    gave_up: str | None = None
+    """Why it ended early."""
+
+    objectives: tuple[str, ...] = ()
+    """Names of several objectives; empty with a plain loss."""
+
+    front: tuple[FrontAction, ...] | None = None
+    """What nothing beats, where that was looked for."""
+
+    map: DisplayedMap | None = None
+    """The loss over the two dimensions that matter most."""
+
+    recommended: Recommended | None = None
+    """None before the end, or if nothing was learnt."""
+
+    risk: RiskFound | None = None
+    """What was found where one plans under errors."""
+
+    window: WindowFound | None = None
+    """How far the recommended action may be missed, where that was asked for."""
+
+    @property
+    def weighed(self) -> Sequence[PourRow]:
+        """The pours that were weighed and gave a loss."""
+        return [pour for pour in self.pours if pour.status == "weighed" and pour.loss is not None]
+
+    @property
+    def best(self) -> PourRow | None:
+        """The pour with the least loss."""
+        return min(self.weighed, key=lambda pour: pour.loss or 0.0, default=None)
