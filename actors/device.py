@@ -72,6 +72,7 @@ class LocalDevice:
         """See `Device.call`."""
         executor = self._control if urgent else self._work
         future = asyncio.wrap_future(executor.submit(getattr(self._object, method), *args))
+        future.add_done_callback(_seen)
         done, _ = await asyncio.wait({future}, timeout=deadline)
         if not done:
             raise DeviceLostError(f"{self.name}: no answer to '{method}' within {deadline:g} s")
@@ -123,6 +124,7 @@ class RayDevice:
         group = "control" if urgent else "work"
         ref = getattr(self._actor, method).options(concurrency_group=group).remote(*args)
         future = asyncio.wrap_future(ref.future())
+        future.add_done_callback(_seen)
         done, _ = await asyncio.wait({future}, timeout=deadline)
         if not done:
             # It may hang for good; a new one is made before the next pour.
@@ -166,6 +168,12 @@ class RayDevice:
         self._lost = True
         with contextlib.suppress(Exception):
             ray.kill(self._actor)
+
+
+def _seen(answer: asyncio.Future[Any]) -> None:
+    """Who asked may have been cancelled since, or have given up waiting: an error is then nobody's news."""
+    if not answer.cancelled():
+        answer.exception()
 
 
 def _pid(_: Any) -> int:

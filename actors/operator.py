@@ -58,6 +58,6 @@ class Operator(Protocol):
         """
         ...
 
-    async def tell(self, text: str) -> None:
-        """Say something that needs no answer: that the arm moves in three seconds, say."""
+    async def announce(self, text: str, seconds: float) -> None:
+        """Say that something moves in so many seconds [s of the clock]; that needs no answer, and returns at once."""
         ...

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -23,10 +22,11 @@ from orchestrator.events import (
     Watchers,
 )
 from orchestrator.fingerprint import fingerprint
-from orchestrator.journal import JOURNAL_NAME, Header, Journal, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, Header, Journal, JournalError, JournalReader, Kind
 from orchestrator.lanes import Deadlines, LaneError, Lanes
 from orchestrator.plan import CampaignPlan
 from orchestrator.replay import StageHistory, read_history, replayed_events
+from orchestrator.reserve import NoSpaceError
 from orchestrator.results import Results, decode_results
 from orchestrator.runs import write_provenance
 from orchestrator.scheduler import StageScheduler
@@ -84,7 +84,8 @@ async def run_campaign(
 
     Raises:
         RunError: the run can't begin or go on: another process runs it (JournalLockedError), its journal doesn't fit
-            (JournalError, ReplayError), a person is needed (OperatorNeededError), the laboratory or a strategy fails.
+            (JournalError, ReplayError), a person is needed (OperatorNeededError), the disk is too full for a pour's
+            records (NoSpaceError), the laboratory or a strategy fails.
         LaboratoryError: the laboratory can't be opened.
     """
     run = _Run(
@@ -144,13 +145,15 @@ class _Run:
             self._state = self._journal.state()
             if self._state is State.FINISHED:
                 return self._close()
+            if any(stage.pours for stage in self._stages):
+                self._journal.reserve_space()
             try:
                 await self._run_stages(resume)
             except asyncio.CancelledError:
                 if not self._is_finished():
-                    self._come_to_rest(State.PAUSED, "paused on request")
+                    self._come_to_rest(State.PAUSED, "stopped on request")
                 raise
-            except OperatorNeededError as error:
+            except (OperatorNeededError, NoSpaceError) as error:
                 self._come_to_rest(State.PAUSED, str(error))
                 raise
             except Exception as error:
@@ -287,8 +290,11 @@ class _Run:
 
     def _hear(self, notice: Notice) -> None:
         """Something happened to the laboratory: written down, and shown."""
-        with contextlib.suppress(RunError):  # a full disk ends the run with the next write that matters
+        try:
             self._journal.append(Kind.NOTE, {"text": notice.text})
+        except JournalError:  # it ends the run with the next write that matters; until then the screen holds everything
+            self._watchers.log("error", f"can't be written down: {notice.text}")
+            return
         if notice.level != "note":
             self._watchers.emit(LogLine(level=notice.level, text=notice.text, asked=notice.asked))
 
@@ -305,10 +311,14 @@ class _Run:
         return self._state is State.FINISHED
 
     def _come_to_rest(self, state: State, reason: str) -> None:
-        self._enter(State.UNKNOWN if self._unknown_pours else state, reason)
-        self._watchers.emit(
-            CampaignClosed(state=str(self._state), results=decode_results(self._journal.stage_results()))
-        )
+        if self._unknown_pours:
+            state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: nobody knows what came of it"
+        try:
+            self._enter(state, reason)
+        except JournalError as problem:  # the next process sees it from what is missing
+            self._watchers.log("error", f"can't write that the run is {state}: {problem}")
+        results = decode_results(self._journal.stage_results())
+        self._watchers.emit(CampaignClosed(state=str(self._state), results=results))
 
     def _close(self) -> CampaignResult:
         result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)

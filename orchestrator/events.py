@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from actors.protocols import Frames, PourProgress
+from actors.protocols import PourProgress
 from orchestrator.requests import Decision, Outcome, Request
 from orchestrator.results import Results
 from orchestrator.strategies.learnt import Learnt
+from sim_engine.simulated import RecordedFrames
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +114,7 @@ class RequestFinished(Event):
     request: Request
     outcome: Outcome
     seconds: float = 0.0
-    frames: Frames | None = None
+    frames: RecordedFrames | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

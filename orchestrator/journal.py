@@ -3,7 +3,8 @@
 Every entry is one row: sequence number, stage, time, kind, JSON body. Nothing is ever changed or deleted (triggers
 refuse it). Entries written together (`append_all`) are there together or not at all, whenever the process dies. Pours
 are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL), everything else
-survives the death of the process, and a power cut but for its last moments.
+survives the death of the process, and a power cut but for its last moments. A full disk takes no pour's records away:
+see `orchestrator.reserve`.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import IO, Any, Self
 
 from orchestrator.codec import canonical, digest, first_difference
 from orchestrator.errors import RunError
+from orchestrator.reserve import MB, Reserve, free_space
 from orchestrator.states import State
 
 FORMAT = 2
@@ -206,6 +208,7 @@ class Journal(JournalReader):
         self._lock = lock
         self._connection = connection
         self._durable = False
+        self._reserve = Reserve(path.with_suffix(".reserve"))
         self.header = self._read_header()
 
     @classmethod
@@ -214,7 +217,7 @@ class Journal(JournalReader):
 
         Raises:
             JournalLockedError: another process is writing it.
-            JournalError: it holds a run already.
+            JournalError: it holds a run already, or can't be written.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as opened:
@@ -222,7 +225,7 @@ class Journal(JournalReader):
             connection = opened.enter_context(closing(_connect_writer(path)))
             if _has_tables(connection, path):
                 raise JournalError(f"{path}: holds a run already; resume that one, or begin in another directory")
-            _lay_out(connection, header)
+            _lay_out(connection, header, path)
             journal = cls(path, lock, connection)
             opened.pop_all()
             return journal
@@ -241,18 +244,34 @@ class Journal(JournalReader):
             lock = opened.enter_context(_take_lock(path))
             connection = opened.enter_context(closing(_connect_writer(path)))
             if not _has_tables(connection, path):
-                _lay_out(connection, header)
+                _lay_out(connection, header, path)
             journal = cls(path, lock, connection)
             journal._check_same_campaign(header)
             opened.pop_all()
             return journal
+
+    def reserve_space(self) -> None:
+        """Hold room on the disk for a pour's records, until the journal is closed.
+
+        Raises:
+            NoSpaceError: there isn't enough.
+        """
+        self._reserve.take()
+
+    def check_space_for_pour(self) -> None:
+        """See that whatever comes of a pour can be written down.
+
+        Raises:
+            NoSpaceError: it can't; the pour must not begin.
+        """
+        self._reserve.check_pour()
 
     def append(self, kind: Kind, body: dict[str, Any], *, stage: str = "") -> None:
         """Write one entry; it is in the file when this returns."""
         self.append_all([Draft(kind, body, stage)])
 
     def append_all(self, drafts: Sequence[Draft]) -> None:
-        """Write several entries in one transaction: all or none.
+        """Write several entries in one transaction: all or none. On a full disk the reserve makes room.
 
         Raises:
             JournalError: the file can't be written.
@@ -264,21 +283,31 @@ class Journal(JournalReader):
         now = time.time()
         rows = [(draft.stage, now, str(draft.kind), canonical(draft.body)) for draft in drafts]
         try:
+            try:
+                self._insert(rows)
+            except sqlite3.OperationalError:
+                if not self._reserve.release():
+                    raise
+                self._insert(rows)
+        except sqlite3.OperationalError as error:
+            raise JournalError(
+                f"{self.path}: can't be written ({error}; {free_space(self.path) / MB:.1f} MB are free on its disk); "
+                "what is in it is safe. Mend that and resume the run"
+            ) from error
+
+    def _insert(self, rows: Sequence[tuple[str, float, str, str]]) -> None:
+        try:
             self._connection.execute("begin immediate")
             self._connection.executemany("insert into event (stage, t, kind, body) values (?, ?, ?, ?)", rows)
             self._connection.execute("commit")
-        except BaseException as error:
+        except BaseException:
             if self._connection.in_transaction:  # SQLite itself rolls back where the disk is full
                 self._connection.execute("rollback")
-            if isinstance(error, sqlite3.OperationalError):
-                raise JournalError(
-                    f"{self.path}: can't be written ({error}); what is in it is safe. Is the disk full? "
-                    "Mend that and resume the run"
-                ) from error
             raise
 
     def close(self) -> None:
-        """Give file and lock back. May be called twice."""
+        """Give file, lock and reserve back. May be called twice."""
+        self._reserve.release()
         self._connection.close()
         self._lock.close()
 
@@ -316,12 +345,15 @@ def _has_tables(connection: sqlite3.Connection, path: Path) -> bool:
         raise JournalError(f"{path}: not a journal of Decant ({error})") from error
 
 
-def _lay_out(connection: sqlite3.Connection, header: Header) -> None:
+def _lay_out(connection: sqlite3.Connection, header: Header, path: Path) -> None:
     row = (FORMAT, header.name, canonical(header.fingerprint), header.created or time.time())
     # One transaction: a file with tables always has its header.
-    connection.executescript(f"begin immediate; {_SCHEMA}")
-    connection.execute("insert into header values (?, ?, ?, ?)", row)
-    connection.execute("commit")
+    try:
+        connection.executescript(f"begin immediate; {_SCHEMA}")
+        connection.execute("insert into header values (?, ?, ?, ?)", row)
+        connection.execute("commit")
+    except sqlite3.OperationalError as error:
+        raise JournalError(f"{path}: can't be written ({error}; {free_space(path) / MB:.1f} MB are free)") from error
 
 
 def _take_lock(path: Path) -> IO[str]:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from actors.protocols import (
     Bench,
     BenchLostError,
-    Frames,
     InvalidActionError,
     Laboratory,
     LaboratoryError,
@@ -24,6 +23,7 @@ from actors.protocols import (
 )
 from orchestrator.errors import RunError
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
+from sim_engine.simulated import RecordedFrames
 from sim_engine.task import PourTask, Scene
 
 
@@ -51,6 +51,10 @@ class PourUnknownError(LaneError):
     exit_code = 3
 
 
+SUGGESTIONS = 3
+"""How often the optimiser is asked one question: it is idempotent, and a process may die of bad luck."""
+
+
 @dataclass(frozen=True)
 class Deadlines:
     """When a request that has not answered is given up [s of wall time].
@@ -58,16 +62,16 @@ class Deadlines:
     Attributes:
         simulate: time in the pool's queue included. A pour of 50 000 particles takes minutes on one core; half an
             hour means that the pool is dead, not slow.
-        suggest: a fit to some hundred points takes seconds. Longer than the optimiser's own deadline with all retries
-            (`actors.optimizer.actor`), since only those replace a process that hangs.
+        suggest: for one answer; a fit to some hundred points takes seconds. Longer than the optimiser's own deadline
+            (`actors.optimizer.actor`), since only that replaces a process that hangs.
         pour: 90 s in a laboratory, but an operator may be fetched from another room for each of its steps, and these
-            have deadlines of their own. After it the outcome is not waited for and the pour counts as failed.
+            have deadlines of their own. After it the outcome is not waited for: nobody knows it, and a person is asked.
         pour_grace: how long a pause waits for a pour that has begun.
         cleanup: how long cancelled requests may take to let go.
     """
 
     simulate: float = 1800.0
-    suggest: float = 2000.0
+    suggest: float = 700.0
     pour: float = 6.0 * 3600.0
     pour_grace: float = 300.0
     cleanup: float = 20.0
@@ -88,7 +92,7 @@ class Lanes:
 
     async def simulate(
         self, request: Simulate, *, record: bool, started: Callable[[], None]
-    ) -> tuple[Outcome, Frames | None]:
+    ) -> tuple[Outcome, RecordedFrames | None]:
         """Run a simulation.
 
         Args:
@@ -137,7 +141,8 @@ class Lanes:
 
         Raises:
             LaneError: there is no bench, or it was lost during the pour, whose outcome nobody knows then.
-            PourNotMadeError: nothing was poured. PourUnknownError: nobody knows what was.
+            PourNotMadeError: nothing was poured.
+            PourUnknownError: nobody knows what was poured; so it is of a pour that has not been weighed in time.
             BenchLostError: it was lost before.
         """
         bench, scene = self.bench, self._scene(request.scene)
@@ -165,31 +170,36 @@ class Lanes:
                 _raise_if_cancelled()
                 return Failed("pour_failed", str(error))
             except TimeoutError:
-                return Failed("pour_failed", f"not weighed within {self.deadlines.pour:g} s")
+                raise PourUnknownError(
+                    f"the pour had begun and was not weighed within {_duration(self.deadlines.pour)}; the bench was "
+                    "told to stop, and what was poured is unknown",
+                    "; see to the bench. Resuming asks what came of it",
+                ) from None
         return Poured(measurement)
 
     async def suggest(
         self, request: Suggest, *, started: Callable[[], None], retrying: Callable[[str], None]
     ) -> Outcome:
-        """Ask the optimiser, twice if need be: the question is idempotent, and an actor may die of bad luck once.
+        """Ask the optimiser, up to `SUGGESTIONS` times. Nobody below asks again of their own accord.
 
         Raises:
-            LaneError: it failed twice. Nothing is made up in its place.
+            LaneError: it failed each time, or its machine is gone. Nothing is made up in its place.
         """
         async with self._optimiser:
             started()
-            for attempt in (1, 2):
+            for attempt in range(1, SUGGESTIONS + 1):
                 try:
                     async with asyncio.timeout(self.deadlines.suggest):
                         return Suggested(await self._laboratory.optimizer.suggest(request.problem))
                 except Exception as error:
                     reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-                    if attempt == 2:
+                    if attempt == SUGGESTIONS or isinstance(error, BenchLostError):
+                        times = "once" if attempt == 1 else f"{attempt} times"
                         raise LaneError(
-                            f"the optimiser failed twice on the same question ({reason})",
+                            f"the optimiser was asked the same question {times} and failed each time ({reason})",
                             "; nothing is lost: mend the cause and resume the run",
                         ) from error
-                    retrying(f"the optimiser failed ({reason}); it is asked once more")
+                    retrying(f"the optimiser failed ({reason}); it is asked again, for the {_ORDINAL[attempt]} time")
         raise AssertionError("unreachable")
 
     @property
@@ -205,6 +215,13 @@ class Lanes:
         except KeyError:
             known = ", ".join(sorted(self._scenes)) or "none"
             raise LaneError(f"a request names the scene '{name}', but the plan has {known}") from None
+
+
+_ORDINAL = {1: "second", 2: "third"}
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds / 3600.0:g} h" if seconds >= 3600.0 else f"{seconds:g} s"
 
 
 def _raise_if_cancelled() -> None:

@@ -15,6 +15,7 @@ from orchestrator.codec import digest
 from orchestrator.fingerprint import fingerprint
 from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader
 from orchestrator.plan import CampaignPlan
+from orchestrator.reserve import TO_BEGIN, require_space
 from orchestrator.states import State
 
 
@@ -27,8 +28,13 @@ def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
 
     Args:
         root: where runs are kept; the plan's output directory if not given.
+
+    Raises:
+        NoSpaceError: there is too little room for a run.
+        OSError: it can't be made.
     """
     parent = root or plan.outputs.directory
+    require_space(parent, TO_BEGIN, "to begin a run")
     parent.mkdir(parents=True, exist_ok=True)
     name = plan.name if plan.laboratory.mode == "virtual" else f"{plan.name}-{plan.laboratory.mode}"
     stem = f"{name}-{time.strftime('%Y%m%d')}"

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
-from actors.protocols import Frames, PourProgress
+from actors.protocols import PourProgress
 from orchestrator.codec import decode_outcome, encode_outcome, encode_request, to_json
 from orchestrator.errors import RunError
 from orchestrator.events import (
@@ -30,14 +30,15 @@ from orchestrator.events import (
     Watchers,
 )
 from orchestrator.flights import Flight, Order, free_slots, is_recorded, next_to_tell
-from orchestrator.journal import Draft, Journal, Kind
+from orchestrator.journal import Draft, Journal, JournalError, Kind
 from orchestrator.lanes import Lanes
 from orchestrator.replay import StageHistory, replay, replayed_events
-from orchestrator.requests import Ask, Decision, Outcome, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.requests import Ask, Decision, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.results import encode_result
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.unknown import needs_answer
+from orchestrator.unknown import needs_answer, weighed_by_hand
+from sim_engine.simulated import RecordedFrames
 
 _REPORT_INTERVAL = 0.3
 """Least time between two reports of a strategy's progress to watchers, unless one matters [s]."""
@@ -216,6 +217,7 @@ class StageScheduler:
                     self._append(Kind.POUR_WITHDRAWN, {"id": flight.id, "reason": reason})
                     flight.started = False
 
+                self._journal.check_space_for_pour()
                 outcome = await self._lanes.pour(request, started=started, withdrawn=withdrawn, progress=progress)
             case Suggest():
 
@@ -229,10 +231,15 @@ class StageScheduler:
                 raise needs_answer(request)
         self._finish(flight, outcome, time.monotonic() - begin, frames)
 
-    def _finish(self, flight: Flight, outcome: Outcome, seconds: float, frames: Frames | None) -> None:
+    def _finish(self, flight: Flight, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:
         written = encode_outcome(outcome)
         kind = Kind.POUR_FINISHED if isinstance(flight.request, Pour) else Kind.FINISHED
-        self._append(kind, {"id": flight.id, "outcome": written, "seconds": seconds})
+        try:
+            self._append(kind, {"id": flight.id, "outcome": written, "seconds": seconds})
+        except JournalError as error:
+            if isinstance(flight.request, Pour) and isinstance(outcome, Poured):
+                raise JournalError(f"{error}. {weighed_by_hand(flight.request, outcome.measurement)}") from error
+            raise
         # The strategy is told what the journal holds, so that a replay can't tell it anything else.
         flight.outcome = decode_outcome(written)
         self._finished += 1

@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import math
 import os
-import re
 import sys
 import termios
 import textwrap
@@ -32,7 +31,6 @@ _WORDS = {
     "done": {"done": "done", "d": "done"},
     "yes or no": {"yes": "yes", "y": "yes", "no": "no", "n": "no"},
 }
-_ANNOUNCED = re.compile(r"moves in (\d+(?:\.\d+)?) s")
 _WIDTH = 100
 _ENDS_OF_INPUT = 3
 """Ctrl-D once is a slip; so many in a row mean that the terminal is gone."""
@@ -61,7 +59,6 @@ class TerminalOperator:
         self._stdin = stdin
         self._out = out
         self._one_question = asyncio.Lock()
-        self._open: Question | None = None
         self._reminded = 0.0
         self._counting: asyncio.Task[None] | None = None
 
@@ -76,24 +73,18 @@ class TerminalOperator:
                 if self._counting is not None:
                     self._counting.cancel()  # whatever was announced is over: somebody is asked again
                 self._write(f"\a\n{_worded(question)}\n{self._expected(question)}\n> ")
-                self._open, self._reminded = question, asyncio.get_running_loop().time()
-                try:
-                    return await self._answer(question, lines)
-                finally:
-                    self._open = None
+                self._reminded = asyncio.get_running_loop().time()
+                return await self._answer(question, lines)
 
-    async def tell(self, text: str) -> None:
-        """See `Operator.tell`. What is said while a question is open is a reminder: it rings, and asks again.
+    async def announce(self, text: str, seconds: float) -> None:
+        """See `Operator.announce`. It is counted down."""
+        self._write(f"{text}\n")
+        self._counting = asyncio.create_task(self._count_down(seconds))
 
-        That something 'moves in 3 s' is counted down.
-        """
-        if self._open is None:
-            self._write(f"{text}\n")
-            if announced := _ANNOUNCED.search(text):
-                self._counting = asyncio.create_task(self._count_down(float(announced[1])))
-            return
+    def _remind(self, question: Question, left: float) -> None:
+        """Ring, and ask again; `left` is what is left until the question is given up [s]."""
         self._reminded = asyncio.get_running_loop().time()
-        self._write(f"\a\n{text}\n{_EXPECTED[self._open.wants]}\n> ")
+        self._write(f"\a\nstill waiting, {_time(left)} left: {question.text}\n{_EXPECTED[question.wants]}\n> ")
 
     async def _count_down(self, seconds: float) -> None:
         end = asyncio.get_running_loop().time() + seconds
@@ -121,7 +112,7 @@ class TerminalOperator:
             except TimeoutError:
                 left = begin + self._spec.deadline - loop.time()
                 if left > 0.0 and loop.time() >= self._reminded + self._spec.reminder:
-                    await self.tell(f"still waiting, {_time(left)} left: {question.text}")
+                    self._remind(question, left)
                 continue
             except EOFError:
                 ends += 1

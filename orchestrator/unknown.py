@@ -156,6 +156,15 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
     return Poured(PourMeasurement(loaded, spilled, retained, {"source": "weighed by the operator after a restart"}))
 
 
+def weighed_by_hand(pour: Pour, measured: PourMeasurement) -> str:
+    """Of a pour that was weighed and can't be written down: what a person types when the run is resumed."""
+    loaded, spilled, retained = (f"{1e3 * mass:.1f}" for mass in (measured.loaded, measured.spilled, measured.retained))
+    return (
+        f"Pour {pour.number} was made and weighed, and is not written down: {loaded} g loaded, {spilled} g spilled, "
+        f"{retained} g retained. Resuming asks what came of it; answer: weighed {spilled} {retained} {loaded}"
+    )
+
+
 async def _ask(
     ask: AskOperator | None, question: str, options: Sequence[str], loaded: float, on_waiting: Callable[[str], None]
 ) -> tuple[str, Outcome | None]:

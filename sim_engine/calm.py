@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_engine.course import SLICE
 from sim_engine.hydrostatics import GRAVITY, level
 from sim_engine.motion import Motion
 from sim_engine.vessel.vessel import Vessel
@@ -29,8 +30,8 @@ FREEBOARD = 0.12
 CALM = 0.06
 """Waves may be so high, in opening radii: 2.4 mm in a cup of 40 mm, about what turning it at 30 deg/s makes."""
 
-STEP = 0.02
-"""Resolution, and what the begin is a multiple of [s]."""
+STEP = SLICE
+"""Resolution [s]. A simulation can begin between two slices of its course only, and begins at a multiple of this."""
 
 FALL = 2e-3
 """A tilt that has come down so far is on its way back; less is the tremor of an arm that was read back [rad]."""

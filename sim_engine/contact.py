@@ -5,8 +5,12 @@ kept in patches with bounding spheres: a patch whose centre is farther from the 
 it, so that only the few patches near a wall are looked at closely. A lip that dips into the other's opening without
 touching its wall is no contact.
 
-Limitations: poses are checked one by one, not the way between them; walls are sampled about every half wall thickness,
-so that a touch shallower than the samples' spacing on a curved wall may be found late.
+A motion is looked at along the way that the pourer's points make (`poses_along`), never along the clock: a pour that is
+held for a minute is not looked at more coarsely than one that is not held.
+
+Limitations: poses are checked one by one, not the way between them, so that a touch between two of them may be up to
+half of `WAY` deep and unseen; walls are sampled about every half wall thickness, so that a touch shallower than the
+samples' spacing on a curved wall may be found late.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_engine.motion import Motion, PourMotion
 from sim_engine.vessel.vessel import Vessel
 
 Floats = NDArray[np.float64]
@@ -26,6 +31,12 @@ Part = Literal["rim", "wall", "underside"]
 
 TOLERANCE = 2e-4
 """Overlap that counts as a touch: below it lies the error of the interpolated distance at sharp edges [m]."""
+
+WAY = 3e-3
+"""Largest way of any point of the pourer between two poses of a motion that are looked at [m]: less than most walls."""
+
+_FIRST_LOOK = 0.02
+"""A motion is first sampled so often [s]: within that time no pour goes somewhere and comes back."""
 
 FEWEST_POINTS, MOST_POINTS = 3_000, 16_000
 PATCHES = 160
@@ -97,6 +108,64 @@ def rotations(poses: Floats) -> Floats:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
+def way_of(poses: Floats, vessel: Vessel) -> Floats:
+    """How far a vessel's points have come, at most, from pose to pose.
+
+    Args:
+        poses: shape (T, 7), x y z [m] qw qx qy qz.
+        vessel: that moves.
+
+    Returns:
+        Shape (T,) [m], from 0 on: no point of the vessel moves farther between two poses than the difference. Every
+        step is that of the bounding sphere's centre plus that of a point on it which turns about the centre.
+    """
+    centre, radius = vessel.bounding_sphere
+    steps = np.linalg.norm(np.diff(rotations(poses) @ centre + poses[:, :3], axis=0), axis=-1)
+    q = poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    # the chord is exact for small angles, where the cosine's arc would lose all of its digits
+    chord = np.minimum(np.linalg.norm(q[1:] - q[:-1], axis=1), np.linalg.norm(q[1:] + q[:-1], axis=1))
+    steps += 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)) * radius
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def thinned(way: Floats, step: float = WAY) -> NDArray[np.int64]:
+    """As few samples along a way as are at most `step` apart, or neighbours; the first and the last among them.
+
+    Args:
+        way: that was made up to every sample, shape (T,), see `way_of` [m].
+        step: [m].
+    """
+    chosen, last = [0], len(way) - 1
+    while chosen[-1] < last:
+        here = chosen[-1]
+        chosen.append(max(int(np.searchsorted(way, way[here] + step, side="right")) - 1, here + 1))
+    return np.array(chosen, dtype=np.int64)
+
+
+def poses_along(motion: Motion, pourer: Vessel, until: float) -> tuple[Floats, Floats]:
+    """A motion's poses, so dense that no point of the pourer moves by more than `WAY` from one to the next.
+
+    Args:
+        motion: planned or read back.
+        pourer: that it moves.
+        until: time after which no new poses come [s].
+
+    Returns:
+        Times (T,) [s] and poses (T, 7) x y z [m] qw qx qy qz; the first and the last one are among them.
+    """
+    times = np.linspace(0.0, until, max(math.ceil(until / _FIRST_LOOK), 1) + 1)
+    while True:
+        poses = motion.sample(times)
+        way = way_of(poses, pourer)
+        # Finer than asked for, so that few are left over when they are thinned; a jump gets no finer.
+        wide = np.flatnonzero((np.diff(way) > 0.2 * WAY) & (np.diff(times) > 1e-9))
+        if not wide.size:
+            break
+        times = np.insert(times, wide + 1, 0.5 * (times[wide] + times[wide + 1]))
+    chosen = thinned(way)
+    return times[chosen], poses[chosen]
+
+
 def _check_poses(poses: Floats) -> Floats:
     poses = np.asarray(poses, dtype=float)
     if poses.ndim != 2 or poses.shape[1] != 7 or not np.all(np.isfinite(poses)):
@@ -151,7 +220,7 @@ def first_contact(pourer: Vessel, receiver: Vessel, poses: Floats) -> Contact | 
         pourer: the moving one.
         receiver: the one that stands upright at the world's origin.
         poses: of the pourer's frame in the world, shape (T, 7), x y z [m] qw qx qy qz; no more than a few millimetres
-            apart, or a thin wall can pass another unseen.
+            apart (see `poses_along`), or a thin wall can pass another unseen.
 
     Returns:
         The contact, or None when they stay clear of each other.
@@ -183,6 +252,34 @@ def first_contact(pourer: Vessel, receiver: Vessel, poses: Floats) -> Contact | 
                 point, in_pourer = own, turn[row].T @ (own - poses[index, :3])
             return Contact(int(index), -away, point, _part(pourer, in_pourer))
     return None
+
+
+def contact_during(
+    motion: Motion,
+    pourer: Vessel,
+    receiver: Vessel,
+    *,
+    receiver_at: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Contact, float] | None:
+    """The first touch of two vessels during a motion.
+
+    Args:
+        motion: of the pourer.
+        pourer: the moving one.
+        receiver: stands upright.
+        receiver_at: where the receiver stands, x and y [m].
+
+    Returns:
+        The contact and the pourer's tilt there [rad]; None when they stay clear of each other.
+    """
+    # A planned pourer turns about one line, and comes back through the poses that it went through on its way out.
+    until = motion.phases[0].end if isinstance(motion, PourMotion) else motion.duration
+    times, poses = poses_along(motion, pourer, until)
+    poses[:, :2] -= receiver_at
+    contact = first_contact(pourer, receiver, poses)
+    if contact is None:
+        return None
+    return contact, float(motion.tilt(times[contact.index : contact.index + 1])[0])
 
 
 def _centre_gap(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:

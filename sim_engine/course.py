@@ -35,13 +35,16 @@ class Course:
 
     Attributes:
         task, motion: what is simulated.
-        start: time from which it is simulated; the liquid lies level before [s].
+        start: time from which it is simulated, a multiple of `SLICE`; the liquid lies level before [s].
         scene: its place in the engine.
         times, poured, spilled: what was seen: [s], fractions.
         frames: time, positions (N, 3) [m], states (N,).
         slices: how far it is, in `SLICE`.
         over: nothing can change any more.
         cpu_s: that the process spent on it; for pours side by side an even share.
+
+    Raises:
+        ValueError: it would start within a slice.
     """
 
     task: PourTask
@@ -60,6 +63,8 @@ class Course:
 
     def __post_init__(self) -> None:
         self.slices = round(self.start / SLICE)
+        if abs(self.start - self.clock) > 1e-9:
+            raise ValueError(f"a pour is simulated from a multiple of {SLICE:g} s on, not from {self.start:.6g} s")
 
     @property
     def clock(self) -> float:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,13 +15,14 @@ from scipy import ndimage
 
 from sim_engine.backend import Backend
 from sim_engine.calm import calm_until, liquid_velocity
-from sim_engine.contact import describe_contact, first_contact, rotations
+from sim_engine.contact import contact_during, describe_contact, rotations
 from sim_engine.course import LONGEST_TAIL, Course, follow, outcome
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fill import fill, spacing
 from sim_engine.fluid.setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.motion import Motion, plan_motion
-from sim_engine.outcome import ParticleState, PourOutcome
+from sim_engine.outcome import ParticleState
+from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.corners import equivalent_distance
@@ -37,43 +37,14 @@ if TYPE_CHECKING:
 __all__ = [
     "InvalidSceneError",
     "PourSimulator",
-    "RecordedFrames",
     "SimulationCancelled",
-    "SimulationRun",
     "check_motion",
 ]
 
 SETTLING = 0.15
 """The lattice may settle so long before the motion begins [s]."""
 
-CONTACT_POSES = 121
-
 PLANES_KEPT = 16
-
-
-@dataclass(frozen=True)
-class RecordedFrames:
-    """Particles at some times.
-
-    Attributes:
-        times: (F,) [s].
-        positions: F arrays (N, 3) float32, world [m].
-        states: F arrays (N,) uint8, `sim_engine.outcome.ParticleState`.
-        pourer_poses: (F, 7): x y z qw qx qy qz.
-    """
-
-    times: NDArray[np.float64]
-    positions: list[NDArray[np.float32]]
-    states: list[NDArray[np.uint8]]
-    pourer_poses: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class SimulationRun:
-    """A simulated pour."""
-
-    outcome: PourOutcome
-    frames: RecordedFrames | None = None
 
 
 def check_motion(
@@ -84,12 +55,9 @@ def check_motion(
     Raises:
         InvalidSceneError: with where, how deep and at which tilt.
     """
-    times = np.linspace(0.0, motion.duration, CONTACT_POSES)
-    poses = motion.sample(times)
-    poses[:, :2] -= (error.x, error.y)
-    contact = first_contact(pourer, receiver, poses)
-    if contact is not None:
-        tilt = float(motion.tilt(times[contact.index : contact.index + 1])[0])
+    found = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y))
+    if found is not None:
+        contact, tilt = found
         text = describe_contact(contact, tilt=tilt)
         raise InvalidSceneError(f"{text} ({action.display('x_offset', 'y_offset', 'height')})")
 
@@ -146,7 +114,7 @@ class PourSimulator:
         check_motion(motion, scene, task.action, pourer, receiver, error)
         return motion
 
-    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulationRun:
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """Run one pour.
 
         Args:
@@ -166,7 +134,7 @@ class PourSimulator:
 
     def simulate_many(
         self, tasks: Sequence[PourTask], *, cancelled: Callable[[], bool] | None = None
-    ) -> list[SimulationRun]:
+    ) -> list[SimulatedPour]:
         """Run many pours, of any actions, θ, vessels and seeds, in one set of kernels.
 
         On a CPU the pours follow each other; on a GPU they run side by side, as many as there is memory for. Every
@@ -188,7 +156,7 @@ class PourSimulator:
 
         motions = [self.prepare(task) for task in tasks]
         fluid = engine(self.backend)
-        runs: list[SimulationRun] = []
+        runs: list[SimulatedPour] = []
         while len(runs) < len(tasks):
             first = len(runs)
             end = first + fluid.room_for([task.parameters.particles for task in tasks[first:]])
@@ -201,7 +169,7 @@ class PourSimulator:
         tasks: Sequence[PourTask],
         motions: Sequence[Motion],
         cancelled: Callable[[], bool] | None,
-    ) -> list[SimulationRun]:
+    ) -> list[SimulatedPour]:
         """Pours that fit into one load."""
         begun = time.process_time()
         starts = [
@@ -224,7 +192,7 @@ class PourSimulator:
             if task.record_rate > 0.0:
                 course.frames[:0] = self._level_frames(task, motion, course.start)
         return [
-            SimulationRun(outcome(fluid, course, loading), recorded_frames(course, motion))
+            SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
             for course, motion in zip(courses, motions, strict=True)
         ]
 

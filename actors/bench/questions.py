@@ -77,10 +77,10 @@ class Questions:
             said = f"'{answer}' after {after:.1f} s" if answer else f"no answer within {after:.1f} s"
             self._tell(Notice("note", f"operator ({question.about}): {question.text} → {said}"))
 
-    async def say(self, text: str) -> None:
-        """Something that needs no answer."""
+    async def announce(self, text: str, seconds: float) -> None:
+        """Say that something moves in so many seconds [s of the clock]."""
         self._tell(Notice("note", f"operator told: {text}"))
-        await self._operator.tell(text)
+        await self._operator.announce(text, seconds)
 
     def take_log(self) -> list[dict[str, Any]]:
         """What was asked and answered since this was called last, JSON-ready."""

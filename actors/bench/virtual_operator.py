@@ -86,7 +86,7 @@ class VirtualOperator:
         self._answers: dict[str, list[str]] = {}
         self._again = 0
         self.heard: list[Question] = []
-        self.told: list[str] = []
+        self.announced: list[tuple[str, float]] = []
 
     def script(self, answers: Mapping[str, Sequence[str]], late: Mapping[str, float]) -> None:
         """Be as people are, for tests.
@@ -123,9 +123,9 @@ class VirtualOperator:
                 return "done"
         return "yes"
 
-    async def tell(self, text: str) -> None:
-        """See `Operator.tell`."""
-        self.told.append(text)
+    async def announce(self, text: str, seconds: float) -> None:
+        """See `Operator.announce`."""
+        self.announced.append((text, seconds))
 
 
 class PlayedOperator:
@@ -151,6 +151,6 @@ class PlayedOperator:
             await self._hands.do(question)
         return answer
 
-    async def tell(self, text: str) -> None:
-        """See `Operator.tell`."""
-        await self._person.tell(text)
+    async def announce(self, text: str, seconds: float) -> None:
+        """See `Operator.announce`."""
+        await self._person.announce(text, seconds)

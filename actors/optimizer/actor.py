@@ -9,9 +9,6 @@ from actors.protocols import LaboratoryError
 DEADLINE = 600.0
 """Longest time for one answer [s]: a fit to thousands of points takes minutes."""
 
-RETRIES = 2
-"""How often a question is asked again after a death."""
-
 
 class Proposer:
     """What runs inside the actor. It keeps nothing from one question to the next."""
@@ -24,7 +21,7 @@ class Proposer:
 
 
 class DeviceOptimizer:
-    """`Optimizer` over a `Device` that holds a `Proposer`. If its process dies, a new one is asked the same again.
+    """`Optimizer` over a `Device` that holds a `Proposer`. A process that dies is replaced; whoever asked asks again.
 
     Args:
         device: of the proposer.
@@ -37,17 +34,17 @@ class DeviceOptimizer:
         """See `Optimizer.suggest`.
 
         Raises:
-            LaboratoryError: it died more often than it may, or can't answer the question.
+            DeviceLostError: it died over the question, or took too long; a new process is there to be asked again.
+            MachineLostError: its machine is gone.
+            LaboratoryError: it can't answer the question.
         """
-        for _ in range(1 + RETRIES):
-            try:
-                suggestion: Suggestion = await self.device.call("suggest", problem, deadline=DEADLINE)
-                return suggestion
-            except MachineLostError:
-                raise
-            except DeviceLostError as error:
-                lost = error
-                await self.device.revive()
-            except ValueError as error:
-                raise LaboratoryError(f"the optimiser can't answer: {error}") from error
-        raise LaboratoryError(f"the optimiser died {1 + RETRIES} times over one question: {lost}")
+        try:
+            suggestion: Suggestion = await self.device.call("suggest", problem, deadline=DEADLINE)
+        except MachineLostError:
+            raise
+        except DeviceLostError:
+            await self.device.revive()
+            raise
+        except ValueError as error:
+            raise LaboratoryError(f"the optimiser can't answer: {error}") from error
+        return suggestion

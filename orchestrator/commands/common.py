@@ -130,6 +130,7 @@ def run_in_front_of_people(
     from actors.laboratory import open_laboratory
     from actors.protocols import LaboratoryError
     from orchestrator.campaign import run_campaign
+    from orchestrator.commands.interrupted import file_trouble, given_up_pours, interruption
     from orchestrator.commands.people import asked_about_unknown_pours, person_at_the_terminal
     from orchestrator.errors import RunError
     from orchestrator.events import Watcher
@@ -177,9 +178,15 @@ def run_in_front_of_people(
     except OSError as error:
         if error.errno is None:
             raise  # not a file's: a defect, which wants its traceback
-        raise RefusalError(f"{error}{_way_on(directory, again, not_resumed)}") from None
+        raise RefusalError(f"{file_trouble(error, directory)}{_way_on(directory, again, not_resumed)}") from None
     except (asyncio.CancelledError, KeyboardInterrupt):
-        way_on = _way_on(directory, again, not_resumed) if not_resumed else f"; nothing is lost. Go on with: {again}"
+        if not_resumed:
+            unknown = "".join(
+                f" while {pour} was under way: what it poured is unknown" for pour in given_up_pours(directory)
+            )
+            way_on = unknown + _way_on(directory, again, not_resumed)
+        else:
+            way_on = interruption(directory, plan, again)
         raise RefusalError(f"interrupted{way_on}", INTERRUPTED) from None
     finally:
         if monitor is not None:

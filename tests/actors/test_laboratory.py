@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from actors.device import DeviceLostError
 from actors.laboratory import open_laboratory
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.protocols import LaboratoryError
@@ -71,7 +72,7 @@ def test_a_question_that_makes_no_sense_is_an_error_that_says_so(fake):
 
 
 @pytest.mark.ray
-def test_optimiser_and_its_twin_propose_the_same_and_a_death_is_asked_again(ray_running, fake):
+def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running, fake):
     async def play():
         async with laboratory(True, fake) as opened:
             twin = await opened.optimizer.suggest(PROBLEM)
@@ -80,7 +81,9 @@ def test_optimiser_and_its_twin_propose_the_same_and_a_death_is_asked_again(ray_
             first = asyncio.create_task(opened.optimizer.suggest(PROBLEM))
             await asyncio.sleep(0.02)
             os.kill(victim, signal.SIGKILL)
-            answer = await first
+            with pytest.raises(DeviceLostError):
+                await first
+            answer = await opened.optimizer.suggest(PROBLEM)
             assert await opened.optimizer.device.pid() != victim
         return twin, answer
 

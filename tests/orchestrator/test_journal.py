@@ -218,7 +218,7 @@ def test_a_full_disk_is_named_and_nothing_written_is_lost(path: Path) -> None:
     journal.append(Kind.NOTE, {"text": "before"})
     pages = journal._connection.execute("pragma page_count").fetchone()[0]
     journal._connection.execute(f"pragma max_page_count = {pages}")
-    with pytest.raises(JournalError, match=r"can't be written \(database or disk is full\).*resume the run"):
+    with pytest.raises(JournalError, match=r"can't be written \(database or disk is full;.*resume the run"):
         journal.append(Kind.NOTE, {"text": "x" * 100_000})
     journal.append(Kind.NOTE, {"text": "after"})  # there is room for little things
     assert [entry.body["text"] for entry in journal.entries()] == ["before", "after"]

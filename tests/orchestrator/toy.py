@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
-from actors.protocols import PourProgress, ProgressCallback, SimulationResult
+from actors.protocols import PourProgress, ProgressCallback
 from actors.spec import LaboratorySpec
 from orchestrator.campaign import CampaignResult, run_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
@@ -42,6 +42,7 @@ from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.simulated import SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
@@ -119,7 +120,7 @@ class ToySimulators:
     most_running: int = 0
     fails: Callable[[PourTask], Exception | str | None] = lambda task: None
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         self.tasks.append(task)
         self.running += 1
         self.most_running = max(self.running, self.most_running)
@@ -149,7 +150,7 @@ class ToySimulators:
             task.seed,
             invalid=problem,
         )
-        return SimulationResult(outcome)
+        return SimulatedPour(outcome)
 
 
 @dataclass

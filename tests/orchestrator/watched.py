@@ -12,7 +12,7 @@ import numpy as np
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem, SurrogateMap
 from actors.optimizer.core.propose import propose
-from actors.protocols import Frames, PourProgress, SimulationResult
+from actors.protocols import PourProgress
 from actors.spec import LaboratorySpec
 from orchestrator.events import (
     CampaignClosed,
@@ -48,6 +48,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
@@ -103,7 +104,7 @@ def outcome(*, spilled: float = 0.05, retained: float = 0.02, seed: int = 1) -> 
     return PourOutcome(received, spilled, retained, 0.0, 0.0, PARTICLES, 0.005, 0.01, 3.0, 900, 0.9, seed)
 
 
-def frames(*, duration: float = 3.0, rate: float = 10.0) -> Frames:
+def frames(*, duration: float = 3.0, rate: float = 10.0) -> RecordedFrames:
     """A pourer that tilts by 90° while its liquid moves into the receiver, every tenth particle beside it."""
     times = np.arange(0.0, duration + 0.5 / rate, 1.0 / rate)
     rng = np.random.default_rng(0)
@@ -120,13 +121,13 @@ def frames(*, duration: float = 3.0, rate: float = 10.0) -> Frames:
         positions.append(place)
         states.append(state)
         poses.append([-0.09, 0.0, 0.13, math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0])
-    return Frames(times, positions, states, np.array(poses))
+    return RecordedFrames(times, positions, states, np.array(poses))
 
 
-def simulation() -> tuple[PourTask, SimulationResult]:
+def simulation() -> tuple[PourTask, SimulatedPour]:
     """One simulated pour with frames."""
     task = PourTask(NARROW, ACTION, SimulationParameters(particles=PARTICLES), seed=1, record_rate=10.0)
-    return task, SimulationResult(outcome(), frames())
+    return task, SimulatedPour(outcome(), frames())
 
 
 def surrogate(size: int = 9) -> SurrogateMap:

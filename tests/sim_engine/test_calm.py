@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import sim_engine.pour as pour_module
 from sim_engine.action import DEG, Action
 from sim_engine.calm import CALM, FREEBOARD, STEP, calm_until, liquid_velocity, wave_height
+from sim_engine.course import SLICE, Course
 from sim_engine.hydrostatics import level
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.motion import plan_motion
@@ -47,6 +48,17 @@ def action(speed: float, max_angle: float = 120.0) -> Action:
 
 def begin(speed: float, max_angle: float = 120.0) -> float:
     return calm_until(plan_motion(SCENE, action(speed, max_angle), POURER, RECEIVER), POURER, VOLUME)
+
+
+def test_a_simulation_begins_between_two_slices() -> None:
+    # A begin within a slice would be rounded to another time than the liquid was laid for.
+    motion = plan_motion(SCENE, action(20.0), POURER, RECEIVER)
+    task = PourTask(SCENE, action(20.0), SimulationParameters(), seed=0)
+    start = calm_until(motion, POURER, VOLUME)
+    assert start > 0.0
+    assert Course(task, motion, start, 0).clock == pytest.approx(start)
+    with pytest.raises(ValueError, match="multiple of"):
+        Course(task, motion, start + 0.5 * SLICE, 0)
 
 
 @settings(max_examples=examples(25), deadline=None)

@@ -11,7 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim_engine.contact import clearance, describe_contact, first_contact, rotations
+from sim_engine.action import DEG, Action
+from sim_engine.contact import (
+    WAY,
+    clearance,
+    contact_during,
+    describe_contact,
+    first_contact,
+    poses_along,
+    rotations,
+    way_of,
+)
+from sim_engine.liquid import Liquid
+from sim_engine.motion import Motion, PourMotion, plan_motion
+from sim_engine.pour import InvalidSceneError, check_motion
+from sim_engine.sampled_motion import SampledMotion
+from sim_engine.task import Pivot, PoseError, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder
 from tests.depth import examples
@@ -131,3 +146,58 @@ def test_a_whole_motion_is_checked_in_a_fraction_of_a_second() -> None:
     start = time.process_time()
     first_contact(A, B, poses)
     assert time.process_time() - start < 0.3
+
+
+def swung(rng: np.random.Generator) -> tuple[Scene, Action, PourMotion]:
+    """A quick pour of A into B about a point of the pourer, held for a minute."""
+    pivot = Pivot("point", x=float(rng.uniform(-0.06, 0.06)), z=float(rng.uniform(-0.02, 0.14)))
+    scene = Scene("a into b", A.spec, B.spec, Liquid(mass=0.2), pivot)
+    action = Action(
+        angular_velocity=rng.uniform(90.0, 360.0) * DEG,
+        x_offset=rng.uniform(0.03, 0.12),
+        height=rng.uniform(0.02, 0.12),
+        max_angle=rng.uniform(90.0, 175.0) * DEG,
+        hold_time=60.0,
+    )
+    return scene, action, plan_motion(scene, action, A, B)
+
+
+def test_no_touch_of_a_pour_is_missed_however_long_it_is_held() -> None:
+    # Poses evenly spaced in time, 121 of them, let six of these 140 touches go unseen, up to 1 mm deep.
+    rng = np.random.default_rng(0)
+    touched = 0
+    for _ in range(189):
+        scene, action, motion = swung(rng)
+        try:
+            check_motion(motion, scene, action, A, B, PoseError())
+        except InvalidSceneError:
+            touched += 1
+            continue
+        fine = motion.sample(np.linspace(0.0, motion.phases[0].end, 500))  # 0.8 mm of way at most from one to the next
+        assert first_contact(A, B, fine) is None, action.display()
+    assert touched == 140
+
+
+@pytest.mark.parametrize("read_back", [False, True])
+def test_no_point_of_the_pourer_moves_far_between_two_poses_that_are_looked_at(read_back: bool) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        _, _, planned = swung(rng)
+        motion: Motion = planned
+        if read_back:
+            times = np.arange(0.0, planned.duration, 0.008)
+            motion = SampledMotion(times, planned.sample(times))
+        times, poses = poses_along(motion, A, motion.duration)
+        assert (times[0], times[-1]) == (0.0, motion.duration)
+        points = np.einsum("tij,pj->tpi", rotations(poses), A.solid_vertices) + poses[:, None, :3]
+        ways = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+        assert ways.max() <= WAY
+        assert len(times) < 1.5 * way_of(poses, A)[-1] / WAY  # and no more poses than that takes
+
+
+def test_a_motion_that_jumps_is_looked_at_on_both_sides_of_the_jump() -> None:
+    # 'step' in recorded data: an arm that was read back may have moved 20 mm from one sample to the next.
+    apart = SampledMotion(np.array([0.0, 1e-10, 1.0]), upright((-0.2, 0.0, 0.0), (-0.09, 0.0, 0.0), (-0.09, 0.0, 0.0)))
+    found = contact_during(apart, A, B)
+    assert found is not None
+    assert found[0].depth > 0.0

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from actors.arm.geometry import Pose
 from actors.arm.path.kinematics import MODELS, forward
-from actors.arm.spec import Pose, UrArmSpec
+from actors.arm.spec import UrArmSpec
 from sim_engine.contact import rotations
 from sim_engine.sampled_motion import SampledMotion
 

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from actors.arm.path.frames import cell_frames
 from actors.arm.path.kinematics import link_points
 from actors.arm.path.stretch import Stretch
-from sim_engine.contact import clearance
+from sim_engine.contact import clearance, thinned, way_of
 from sim_engine.vessel.sdf import MARGIN
 from sim_engine.vessel.vessel import Vessel
 
@@ -63,32 +63,21 @@ def nearest_to_receiver(stretch: Stretch, until: float, pourer: Vessel, receiver
     """
     last = int(np.searchsorted(stretch.times, until + 1e-9))
     poses = stretch.poses[:last]
-    centre, radius = pourer.bounding_sphere
-    farthest = float(np.linalg.norm(centre)) + radius
-    steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=-1)
-    steps += (stretch.turning * stretch.steps)[: last - 1] * farthest
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    coarse = _every(way, COARSE)
+    way = way_of(poses, pourer)
+    coarse = thinned(way, COARSE)
     away = clearance(pourer, receiver, poses[coarse])
     # between two poses that are a way w apart nothing can come nearer than the nearer one less w/2
     least = np.minimum(away[:-1], away[1:]) - 0.5 * np.diff(way[coarse])
     # what is farther off than a vessel's grid reaches is known to be no nearer than that, not how far
     known = least - np.maximum(np.minimum(away[:-1], away[1:]) - MARGIN, 0.0)
     doubtful = (known < stretch.spec.limits.clearance) | (least < float(away.min()))
-    dense = _every(way, FINE)
+    dense = thinned(way, FINE)
     gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
     fine = dense[doubtful[gap]]
     indices = np.concatenate([coarse, fine])
     away = np.concatenate([away, clearance(pourer, receiver, poses[fine])])
     best = int(np.argmin(away))
     return Nearest(float(away[best]), int(indices[best]))
-
-
-def _every(way: FloatArray, step: float) -> NDArray[np.int64]:
-    """Samples at most `step` apart along a way, where the samples are that dense; the first and the last among them."""
-    marks = np.floor(way / step + 1e-9)
-    chosen = np.flatnonzero(np.diff(marks, prepend=-1.0) > 0)
-    return np.unique(np.append(chosen, len(way) - 1)).astype(np.int64)
 
 
 def nearest_links(stretch: Stretch, receiver: Vessel) -> tuple[Nearest, Nearest]:

@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
+from actors.arm.errors import ArmRefusedError
+from actors.arm.geometry import Joints
 from actors.arm.joint_path import FloatArray, JointPath
 from actors.arm.path.frames import cell_frames
 from actors.arm.path.kinematics import MODELS, forward, inverse
 from actors.arm.path.limits import outside
-from actors.arm.spec import Joints, UrArmSpec
-from actors.arm.ur.errors import ArmRefusedError
+from actors.arm.spec import UrArmSpec
 
 FARTHEST_TURN, FARTHEST_WAY = math.radians(10.0), 0.05
 """Of one step [rad], [m]."""

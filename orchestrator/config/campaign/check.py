@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from actors.arm.spec import UrArmSpec
+from actors.arm.spec import ArmSpec
 from actors.protocols import InvalidActionError
 from orchestrator.config.yaml.errors import ConfigError, Problem
 from orchestrator.config.yaml.files import why_not_writable
@@ -16,7 +16,7 @@ from orchestrator.config.yaml.source import Document, Loc
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.calibration.prior import actions_all_over
 from sim_engine.action import Action
-from sim_engine.contact import describe_contact, first_contact
+from sim_engine.contact import contact_during, describe_contact
 from sim_engine.hydrostatics import level
 from sim_engine.motion import plan_motion
 from sim_engine.space import Space
@@ -25,9 +25,6 @@ from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.spec import MeshShape, VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
-
-POSE_SPACING = 3e-3
-"""Largest way of any point of the pourer between two checked poses [m]: less than most walls."""
 
 CORNERS, DRAWN = 64, 16
 """Actions of a space that are tried beside its middle before saying that all of it touches."""
@@ -54,7 +51,7 @@ class _Role:
 
 @dataclass
 class _Checker:
-    arm: UrArmSpec | None = None
+    arm: ArmSpec | None = None
     document: Document | None = None
     problems: list[Problem | str] = field(default_factory=list)
     vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
@@ -125,10 +122,11 @@ class _Checker:
 
     def _payload(self, scene: Scene) -> None:
         """What the arm believes to carry can't weigh less than the liquid alone."""
-        if self.arm is None or self.arm.payload >= scene.liquid.mass:
+        carries = None if self.arm is None else self.arm.payload_limit
+        if carries is None or carries >= scene.liquid.mass:
             return
         text = (
-            f"the arm is set to carry {self.arm.payload * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
+            f"the arm is set to carry {carries * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
             f"alone, {scene.liquid.mass * 1e3:g} g; the payload is gripper and filled pourer, in the laboratory's file "
             "and on the pendant"
         )
@@ -159,10 +157,8 @@ class _Checker:
         """Why the laboratory's arm, if it has one, can't make it; '' if it can."""
         if self.arm is None:
             return ""
-        from actors.arm.path.plan import plan_path
-
         try:
-            plan_path(plan_motion(scene, action, pourer, receiver), self.arm, pourer, receiver)
+            self.arm.plan(scene, action)
         except InvalidActionError as error:
             return f"{action.display(*actions.names)}: {error}"
         return ""
@@ -250,16 +246,10 @@ def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str
         ValueError: the motion can't be made.
     """
     motion = plan_motion(scene, action, pourer, receiver)
-    reach = 2.0 * pourer.bounding_sphere[1]
-    count = max(2, int(np.ceil(action.max_angle * reach / POSE_SPACING)) + 1)
-    # Poses depend on the tilt alone: evenly spaced tilts on the way there are all that there is to see.
-    tilting = motion.phases[0].end
-    fine = np.linspace(0.0, tilting, 20 * count)
-    times = np.interp(np.linspace(0.0, action.max_angle, count), motion.tilt(fine), fine)
-    contact = first_contact(pourer, receiver, motion.sample(times))
-    if contact is None:
+    found = contact_during(motion, pourer, receiver)
+    if found is None:
         return None
-    tilt = float(motion.tilt(times[contact.index : contact.index + 1])[0])
+    contact, tilt = found
     return describe_contact(
         contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
     )

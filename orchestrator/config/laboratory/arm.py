@@ -6,8 +6,9 @@ import ipaddress
 import math
 import re
 
+from actors.arm.geometry import ArmLimits, Cell, Plane, Pose, Vector
 from actors.arm.path.kinematics import MODELS
-from actors.arm.spec import ArmLimits, Cell, Plane, Pose, UrArmSpec, Vector
+from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arm_sections import (
     JOINTS,
     ArmSection,

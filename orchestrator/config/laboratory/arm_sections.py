@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 from typing import Annotated, ClassVar, Literal
 
-from actors.arm.spec import ArmLimits, Cell, UrArmSpec
+from actors.arm.geometry import ArmLimits, Cell
+from actors.arm.spec import UrArmSpec
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Number, Section, Text
 

@@ -29,10 +29,6 @@ PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=T
 USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
 """Speeds that balances can be set to [bits per second]."""
 
-VIRTUAL_DIALECT = "kcp"
-"""Spoken by a virtual balance unless another dialect is named."""
-
-
 DialectName: Any = Literal[(AUTO, *dialects())]  # what is installed, ours as everybody's
 
 
@@ -144,8 +140,7 @@ def resolve_balance(section: BalanceDeviceSection, place: Place, report: Report,
         return None
     return BalanceSpec(
         placement=Placement(section.placement),
-        serial=None if section.placement == "manual" else _serial(section),
-        virtual=None if section.virtual is None else ScaleSettings(**section.virtual.model_dump()),
+        device=None if section.placement == "manual" else _serial(section),
         pourer_elsewhere=section.pourer == "elsewhere",
         load_tolerance=section.load_tolerance,
     )
@@ -192,10 +187,9 @@ def _check_step(step: float, tolerance: float, place: Place, report: Report) -> 
 
 
 def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:
-    named = section.dialect if section.virtual is None or section.dialect != AUTO else VIRTUAL_DIALECT
     return SerialBalanceSpec(
         port=section.port or "",
-        dialect=named,
+        dialect=section.dialect,
         baud=section.baud,
         format=section.format,
         handshake=section.handshake,
@@ -205,4 +199,5 @@ def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:
         interval=section.interval,
         answer_time=section.answer_time,
         reconnect_time=section.reconnect_time,
+        virtual=None if section.virtual is None else ScaleSettings(**section.virtual.model_dump()),
     )

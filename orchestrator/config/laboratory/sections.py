@@ -235,6 +235,6 @@ def _bench(b: BenchSection) -> VirtualBenchSpec:
 
 def _paced(balance: BalanceSpec | None, time_scale: float) -> BalanceSpec | None:
     """A virtual balance in the bench's time."""
-    if balance is None or balance.serial is None:
+    if balance is None or balance.device is None:
         return balance
-    return replace(balance, serial=replace(balance.serial, time_scale=time_scale))
+    return replace(balance, device=balance.device.paced(time_scale))

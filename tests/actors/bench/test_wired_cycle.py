@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from actors.arm.joint_path import unpack
 from actors.arm.path.frames import pourer_motion
 from actors.balance.placement import Placement
-from actors.bench.executed import unpack
 from actors.operator import OperatorSpec
 from actors.protocols import InvalidActionError, NotPouredError
 
@@ -49,7 +49,9 @@ def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_wh
     assert times[moved[0]] - stage.answered_at["start"] >= 0.9 * spec.announcement
     np.testing.assert_allclose(joints[-1], spec.home, atol=1e-3)
     assert stage.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
-    assert any("moves in 3 s" in text for text in stage.operator.told)
+    ((text, seconds),) = stage.operator.announced
+    assert "moves in 3 s" in text
+    assert seconds == pytest.approx(spec.announcement / spec.time_scale)  # of the clock
 
 
 def test_the_record_says_what_was_executed_asked_and_weighed(open_stage):

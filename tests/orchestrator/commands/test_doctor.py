@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from actors.arm.checksum import ChecksumError, require_accepted
+from actors.arm.errors import NotAcceptedError
+from actors.arm.ur.accepted import require_accepted
 from actors.balance.virtual_serial.handle import VirtualSerialBalance
 from actors.virtual_ur.launcher import VirtualController
 from orchestrator.cli import app
@@ -225,9 +226,9 @@ def test_balance_that_is_unplugged_or_silent_is_told_with_what_to_do(
 
 def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_changed() -> None:
     require_accepted("22c99aa2", "22C99AA2", "robot")
-    with pytest.raises(ChecksumError, match="decant doctor"):
+    with pytest.raises(NotAcceptedError, match="decant doctor"):
         require_accepted(None, "22C99AA2", "robot")
-    with pytest.raises(ChecksumError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
+    with pytest.raises(NotAcceptedError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
         require_accepted("22C99AA2", "DEADBEEF", "robot")
-    with pytest.raises(ChecksumError, match="tells no safety checksum"):
+    with pytest.raises(NotAcceptedError, match="tells no safety checksum"):
         require_accepted("22C99AA2", None, "robot")

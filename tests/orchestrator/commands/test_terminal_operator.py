@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from actors.bench.questions import Questions
-from actors.bench.wired_words import stopped_question
+from actors.bench.words import stopped_question
 from actors.operator import OperatorSpec, Question
 from actors.protocols import LaboratoryError, Notice
 from orchestrator.events import LogLine
@@ -149,25 +149,9 @@ def test_nobody_answers_reminders_then_the_question_is_given_up(keyboard: Keyboa
     assert shown.count("\a") == 1 + shown.count("still waiting")
 
 
-def test_what_is_said_while_a_question_is_open_rings_and_counts_as_a_reminder(keyboard: Keyboard) -> None:
+def test_announced_movement_is_counted_down_whatever_the_words(keyboard: Keyboard) -> None:
     async def scene() -> None:
-        operator = keyboard.operator(OperatorSpec(reminder=1.0, deadline=60.0))
-        asking = asyncio.create_task(operator.ask(DONE))
-        for _ in range(4):
-            await asyncio.sleep(0.4)
-            await operator.tell("Still waiting for the pourer.")
-        assert "still waiting" not in keyboard.screen.getvalue()
-        assert keyboard.screen.getvalue().count("\a") == 5
-        assert keyboard.screen.getvalue().endswith("> ")
-        keyboard.type("done\n")
-        assert await asking == "done"
-
-    played(scene)
-
-
-def test_announced_movement_is_counted_down(keyboard: Keyboard) -> None:
-    async def scene() -> None:
-        await keyboard.operator().tell("The arm moves in 3 s. Keep out of its way.")
+        await keyboard.operator().announce("Hände weg, gleich fährt er los.", 3.0)
         assert "…" not in keyboard.screen.getvalue()
         await keyboard.shows("now")
 

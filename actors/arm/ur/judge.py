@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from actors.arm.spec import Pose, UrArmSpec
-from actors.arm.survey import PORTS, SCRIPTS, Exchange
+from actors.arm.geometry import Pose
+from actors.arm.look import ArmLook, SafetyRecord
+from actors.arm.spec import UrArmSpec
+from actors.arm.ur.look import Findings, look_at
 from actors.arm.ur.primary import RobotState
-from orchestrator.commands.doctor_look import Check, Findings, State
-from orchestrator.safety import SafetyRecord
+from actors.arm.ur.survey import PORTS, SCRIPTS, Exchange, SurveyError
+from actors.checks import Check, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
 """How far the controller's TCP may be from the file's [m], [rad]."""
@@ -25,6 +28,46 @@ GOOD_ROUND_TRIP, GOOD_GAP, LONGEST_GAP = 10e-3, 60e-3, 0.2
 
 KNOWN_SOFTWARE: dict[int, tuple[int, int]] = {3: (14, 15), 5: (6, 17)}
 """Minor versions, by major one, that the client library is tested with by its makers."""
+
+
+@dataclass(frozen=True)
+class UrLook(ArmLook):
+    """A UR controller that was looked at.
+
+    Attributes:
+        spec: what the laboratory's file says.
+        found: what the controller says.
+    """
+
+    spec: UrArmSpec | None = None
+    found: Findings | None = None
+
+    @classmethod
+    def at(cls, spec: UrArmSpec) -> UrLook:
+        """Ask the controller everything."""
+        found = look_at(spec.address)
+        return cls(
+            checksum="" if found.state is None else found.state.checksum,
+            serial=found.serial,
+            model=found.model,
+            software=".".join(str(part) for part in found.software[:3]),
+            spec=spec,
+            found=found,
+        )
+
+    def checks(self, record: SafetyRecord | None, *, accept: str, virtual: bool) -> list[Check]:
+        """See `ArmLook.checks`."""
+        assert self.spec is not None
+        assert self.found is not None
+        return judge(self.spec, self.found, record, accept=accept, virtual=virtual)
+
+    def at_home(self) -> Check:
+        """See `ArmLook.at_home`."""
+        assert self.spec is not None
+        assert self.found is not None
+        if self.found.state is None:
+            raise SurveyError("; ".join(self.found.problems) or f"the controller at {self.spec.address} tells nothing")
+        return home_check(self.spec, self.found.state)
 
 
 def judge(
