@@ -18,8 +18,9 @@ from orchestrator.report.units import loss_unit
 from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
 from orchestrator.stages import deployment_stages, prediction_stages
 from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from orchestrator.tally import Tally
@@ -60,7 +61,7 @@ def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> Non
     assert found["spilled"].deviation == pytest.approx(statistics.stdev(spilled))
     assert found["spilled"].count == 5
     assert found["loss"].mean == pytest.approx(200.0 * statistics.mean(spilled))
-    assert strategy.progress() == (5, 5)
+    assert strategy.progress() == Progress(5, 5)
     assert Play(narrow_cup)(repeated()).simulations == Play(narrow_cup)(repeated()).simulations
     assert Play(narrow_cup)(repeated(seed=4)).simulations != played.simulations
 
@@ -87,7 +88,7 @@ def test_without_a_planned_action_nothing_is_simulated() -> None:
 def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path) -> None:
     plan = toy_plan(tmp_path)
     assert plan.deployment is not None
-    planned = replace(plan.deployment, strategy="D1", pours=0, iterations=4)
+    planned = replace(plan.deployment, settings=D1Settings(pours=0, iterations=4))
     plan = replace(plan, deployment=planned)
     stages = [*deployment_stages(plan, planned), *prediction_stages(plan, planned, 3)]
     result = asyncio.run(run_toy(tmp_path / "run", learning_laboratory(), plan=plan, stages=stages))

@@ -17,6 +17,9 @@ from orchestrator.events import Event, RequestFinished
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour, RecordSet
 from orchestrator.requests import Pour, Simulate
 from orchestrator.stages import scenes_of, stages_of
+from orchestrator.strategies.deployment.d2 import D2Settings
+from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.settings import DeploymentSettings
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
 from sim_engine.vessel.spec import cylinder
@@ -153,15 +156,20 @@ def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("strategy", "per_pour", "order"),
-    [("D3", 2, "logical"), ("D3", 0, "logical"), ("D3", None, "completion"), ("D2", None, "logical")],
+    ("settings", "order"),
+    [
+        (D3Settings(pours=2), "logical"),
+        (D3Settings(pours=2, per_pour=0), "logical"),
+        (D3Settings(pours=2, per_pour="free"), "completion"),
+        (D2Settings(pours=2), "logical"),
+    ],
 )
 def test_only_free_simulation_beside_pours_lets_the_clock_decide(
-    tmp_path: Path, strategy: Any, per_pour: int | None, order: str
+    tmp_path: Path, settings: DeploymentSettings, order: str
 ) -> None:
     plan = campaign(tmp_path)
     assert plan.deployment is not None
-    plan = replace(plan, deployment=replace(plan.deployment, strategy=strategy, per_pour=per_pour))
+    plan = replace(plan, deployment=replace(plan.deployment, settings=settings))
     assert {stage.order for stage in stages_of(plan) if stage.name.startswith("deployment")} == {order}
     assert all(stage.order == "logical" for stage in stages_of(plan) if not stage.name.startswith("deployment"))
 
@@ -169,7 +177,9 @@ def test_only_free_simulation_beside_pours_lets_the_clock_decide(
 def test_free_simulations_fill_the_time_of_a_pour(tmp_path: Path) -> None:
     plan = campaign(tmp_path, calibration=None)
     assert plan.deployment is not None
-    plan = replace(plan, deployment=replace(plan.deployment, per_pour="free", scenes=(SCENE,), prior_simulations=3))
+    plan = replace(
+        plan, deployment=replace(plan.deployment.with_settings(per_pour="free", prior_simulations=3), scenes=(SCENE,))
+    )
     room = laboratory()
     assert room.bench is not None
     room.bench.pauses = lambda: 0.3

@@ -15,6 +15,7 @@ from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
 from orchestrator.strategies.deployment.risk import RiskSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
 from orchestrator.strategies.deployment.window import SafeWindow, WindowFound, WindowSettings
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.settings import Complaints, Premises
 from orchestrator.strategies.sound import is_sound
@@ -244,13 +245,13 @@ class OneShotPlanning(Deployment[D1Settings]):
         of_means = super()._scatter(suggestion, noise)
         return None if of_means is None else of_means * math.sqrt(self._settings.simulations_per_iteration)
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations and pours done, and in all."""
         repeats = self._settings.simulations_per_iteration
         pours = 1 if self._plan.pours else 0
         answered = self._trials.answered - repeats * self._unspent
         checks = 0 if self._window is None else sum(len(t.requests) for t in self._trials.all[len(self._searched) :])
-        return answered + self._counted, self._settings.rounds * repeats + checks + pours
+        return Progress(answered, self._settings.rounds * repeats + checks, self._counted, pours)
 
     def _spillage(self, point: Point) -> Spread | None:
         """These seeds took part in choosing the action; `orchestrator.strategies.repeats` has fresh ones."""

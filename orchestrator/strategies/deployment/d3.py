@@ -14,6 +14,7 @@ from orchestrator.strategies.deployment.pours import Foretold, PourTrial
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
 from orchestrator.strategies.deployment.trust import Compared, TrustCheck, TrustOrAlways, TrustSettings
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.settings import Complaints, Premises
 from sim_engine.liquid import SimulationParameters
@@ -248,11 +249,11 @@ class Hybrid(Deployment[D3Settings]):
     def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
         return super()._trusted(weighed) if self._check is None else self._check.result()
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
         simulations = self._settings.prior_simulations + self._plan.pours * self._settings.simulations_beside
         answered = self._trials.answered - self._unspent
         done = min(answered, simulations) if self._settings.beside is None else answered
         if self._followed == "D2":  # those that will not be made any more
             simulations = done
-        return done + min(self._counted, self._plan.pours), simulations + self._plan.pours
+        return Progress(done, simulations, min(self._counted, self._plan.pours), self._plan.pours)

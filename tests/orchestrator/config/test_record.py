@@ -25,9 +25,11 @@ from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Section
 from orchestrator.fingerprint import fingerprint
 from orchestrator.plan import CampaignPlan
+from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import cells_of
 from tests.depth import examples
+from tests.orchestrator import plans
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted((CONFIGS / "campaigns").glob("*.yaml"))
@@ -52,14 +54,14 @@ def test_shipped_campaigns_are_kept_whole(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["quick", "paper"])
 def test_cells_of_a_study_are_kept_in_the_language_of_campaigns(name: str, tmp_path: Path) -> None:
     study = load_study(CONFIGS / "studies" / f"{name}.yaml")
-    theta = {**study.base.parameters.model_dump(), "cohesion": 0.0123456789}
-    learnt = {"calibration": {"theta": theta}, "deployment:narrow": {}}
+    theta = study.base.parameters.model_copy(update={"cohesion": 0.0123456789})
     kinds: set[tuple[str, str]] = set()
     for cell in cells_of(study):
         if cell.kind in ("calibration", "uncalibrated") or (cell.kind, cell.arm) in kinds:
             continue  # those read pours from a journal
         kinds.add((cell.kind, cell.arm))
-        needed = {**learnt, f"deployment:{cell.receiver.removeprefix('deployment-')}": {}}
+        stage = f"deployment:{cell.receiver.removeprefix('deployment-')}"
+        needed = {"calibration": plans.calibrated(theta), stage: Deployed.model_construct(recommended=None)}
         plan, _ = campaign_of(study, cell, lambda other, needed=needed: needed, tmp_path / cell.id)  # type: ignore[misc]
         assert reloaded(plan, tmp_path) == plan, cell.id
     assert len(kinds) > 4

@@ -21,6 +21,7 @@ from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import cells_of
 from sim_engine.vessel.build import build_vessel
+from tests.orchestrator import plans
 from tests.orchestrator.study_files import ROOT, STUDIES, read, small, without, written
 
 
@@ -124,9 +125,7 @@ def test_risk_of_the_campaign_is_that_of_d1_and_leaves_the_others_what_they_are(
     assert planned.risk is not None
     assert planned.window is not None
     assert planned.window.tolerance == pytest.approx(0.02)
-    theta = study.base.parameters.model_dump()
-    rows = [{"cohesion": 0.01 * i} for i in range(3)]
-    known = {"calibration": {"theta": theta, "posterior": {"thetas": rows}}}
+    known = {"calibration": plans.calibrated(study.base.parameters, [{"cohesion": 0.01 * i} for i in range(3)])}
     made = {}
     for cell in cells_of(study):
         if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":

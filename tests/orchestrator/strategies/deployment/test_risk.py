@@ -13,8 +13,6 @@ from orchestrator.errors import RunError
 from orchestrator.requests import Failed, Simulate, Suggest
 from orchestrator.results import decode_result, encode_result
 from orchestrator.stages import with_posterior
-from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.posterior import PosteriorFound, RemainingDiscrepancy
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
@@ -213,28 +211,7 @@ def test_thetas_of_the_calibration_before_are_borne_and_a_campaign_without_says_
         return min(two_valleys(action, theta, rng) + 4.0 * theta.cohesion, 1.0)
 
     plan = deployment_plan(strategy="D1", pours=0, risk=plans.risk(pose_error=ERRORS, theta="posterior"))
-    rows = tuple({"cohesion": 0.001 * i} for i in range(100))
-    posterior = PosteriorFound(
-        level=0.9,
-        mean={},
-        region={},
-        open=(),
-        correlation=(),
-        directions=(),
-        remaining_discrepancy=RemainingDiscrepancy(low=0.0, median=0.0, high=0.0),
-        effective=100.0,
-        thetas=rows,
-    )
-    found = CalibratedTheta(
-        theta=THETA,
-        searched=("cohesion",),
-        predicted_discrepancy=0.0,
-        predicted_deviation=0.0,
-        hyperparameters=None,
-        map=None,
-        posterior=posterior,
-    )
-    calibrated = Calibrated(strategy="C4", simulations=0, lost=0, undefined=0, training_pours=2, trials=(), found=found)
+    calibrated = plans.calibrated(THETA, [{"cohesion": 0.001 * i} for i in range(100)])
     informed = with_posterior(plan, {"calibration": calibrated})
     assert 50 <= len(informed.thetas) <= 100
     strategy = risky(risk=informed.settings.risk, thetas=informed.thetas)  # type: ignore[attr-defined]
