@@ -6,7 +6,7 @@ import ipaddress
 import math
 import re
 
-from actors.arm.geometry import ArmLimits, Cell, Plane, Pose, Vector
+from actors.arm.geometry import ArmLimits, Cell, Mount, Plane, Pose, Vector
 from actors.arm.path.kinematics import MODELS
 from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arm_sections import (
@@ -63,6 +63,7 @@ def resolve_arm(
         cell=Cell(receiver=receiver, direction=cell.direction, table=cell.table),
         home=(home[0], home[1], home[2], home[3], home[4], home[5]),
         address=arm.address or "",
+        mount=Mount(arm.mount.tilt, arm.mount.turn),
         tool=Pose(**arm.tool.model_dump()),
         payload=arm.payload,
         payload_centre=(arm.payload_centre.x, arm.payload_centre.y, arm.payload_centre.z),
