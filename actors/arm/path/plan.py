@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.joint_path import JointPath, PourPath
-from actors.arm.path.checks import check_clearance, check_reach, check_stretch, refusal, report
+from actors.arm.path.checks import check_clearance, check_reach, check_stretch, check_way, refusal, report
 from actors.arm.path.limits import check_limits
 from actors.arm.path.pace import STEEPEST, followable, pour_times
 from actors.arm.path.stretch import Phases, Stretch
-from actors.arm.path.travel import STEP, OutOfReachError, follow, home_pose, routes, travel
+from actors.arm.path.travel import STEP, OutOfReachError, RacingJointError, follow, home_pose, routes, travel
 from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from sim_engine.contact import rotations
@@ -106,6 +106,13 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     )
 
 
+def way_there(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Vessel) -> list[str]:
+    """What forbids to carry the full pourer from home to where a motion begins, whatever it does there."""
+    problems: list[str] = []
+    _approach(motion.sample(np.zeros(1))[0], spec, pourer, receiver, problems)
+    return problems
+
+
 def _approach(
     start: FloatArray, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, problems: list[str]
 ) -> tuple[JointPath | None, float]:
@@ -122,6 +129,8 @@ def _approach(
                 "approach", np.linspace(0.0, STEP * len(error.poses), len(error.poses)), error.poses, spec
             )
             found, distance = [check_reach(stretch)], np.inf
+        except RacingJointError as error:
+            found, distance = [check_way(error, spec)], np.inf
         else:
             nearest, found = check_clearance(stretch, path.duration, pourer, receiver)
             found += check_stretch(stretch, pourer, receiver)
