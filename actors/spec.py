@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from actors.arm.spec import UrArmSpec
+from actors.arm.spec import ArmSpec
 from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
@@ -34,7 +34,7 @@ class LaboratorySpec:
         in_process: everything in threads of one process, without Ray.
         object_store_mb: a private Ray's shared memory for results [MiB]; Ray takes no less than 80.
         ray: the cluster to join; None for a private Ray on this machine.
-        arm: reached over its controller's wires, virtual or not; None for a bench of numbers, or none.
+        arm: of any kind, virtual or not; None for a bench of numbers, or none.
         balance: beside the arm; its time scale is the bench's.
         operator: beside the arm.
         accepted_checksum: of the safety settings of hardware that people have accepted; '' if nobody has. Filled in
@@ -48,7 +48,7 @@ class LaboratorySpec:
     in_process: bool = False
     object_store_mb: int = 160
     ray: RaySpec | None = None
-    arm: UrArmSpec | None = None
+    arm: ArmSpec | None = None
     balance: BalanceSpec | None = None
     operator: OperatorSpec = field(default_factory=lambda: OperatorSpec(answers="virtual"))
     accepted_checksum: str = ""

@@ -37,7 +37,7 @@ from skipping_clock import SkippingLoop, run
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
-from actors.protocols import ProgressCallback, SimulationResult
+from actors.protocols import ProgressCallback
 from actors.spec import LaboratorySpec
 from orchestrator.campaign import run_campaign
 from orchestrator.events import DecisionMade, Event
@@ -48,6 +48,7 @@ from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.simulated import SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
@@ -125,7 +126,7 @@ class Bench:
         if isinstance(event, DecisionMade) and RESTS in event.decision.values:
             self.occupancy.rests(self._clock.time())
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         """One of the pool's members takes its time."""
         rng = np.random.default_rng(task.seed)
         unit = self._space.encode({name: getattr(task.action, name) for name in self._space.names})
@@ -137,7 +138,7 @@ class Bench:
             self.occupancy.simulation_finished(self._clock.time())
         self.simulations += 1
         outcome = PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, seconds, task.seed)
-        return SimulationResult(outcome)
+        return SimulatedPour(outcome)
 
     async def pour(
         self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None

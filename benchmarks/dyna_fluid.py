@@ -25,8 +25,8 @@ from dyna import AFTER, TRUST, Bench, interval
 from machine import describe, pin, say, show
 from skipping_clock import run
 
-from actors.bench.world import World
-from actors.protocols import InvalidActionError, ProgressCallback, SimulationResult
+from actors.bench.hidden import hidden_spill
+from actors.protocols import InvalidActionError, ProgressCallback
 from orchestrator.campaign import run_campaign
 from orchestrator.config.study.sections import load_study
 from orchestrator.occupancy import Occupancy
@@ -38,6 +38,7 @@ from sim_engine.errors import InvalidSceneError
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.pour import PourSimulator
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask, Scene
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,18 +59,18 @@ class Fluid(Bench):
         self.answers: list[float] = []
         self.priced: list[float] = []
         self.apart = 0.0
-        self._real = World(study.level(level).bench, _Apart(self))
+        self._hidden, self._beside = study.level(level).bench, _Apart(self)
 
-    def _run(self, task: PourTask) -> tuple[SimulationResult, float]:
+    def _run(self, task: PourTask) -> tuple[SimulatedPour, float]:
         """A simulation, and the CPU time that this thread spent on it."""
         begun = time.thread_time()
         try:
             found = self._simulator.simulate(task)
         except InvalidSceneError as error:
             raise InvalidActionError(str(error)) from None
-        return SimulationResult(found.outcome), time.thread_time() - begun
+        return SimulatedPour(found.outcome), time.thread_time() - begun
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         """One of the pool's members takes the CPU time that the simulation takes."""
         async with self._free:
             self.occupancy.simulation_started(self._clock.time())
@@ -82,7 +83,7 @@ class Fluid(Bench):
         self.simulations += 1
         return result
 
-    async def simulate_apart(self, task: PourTask) -> SimulationResult:
+    async def simulate_apart(self, task: PourTask) -> SimulatedPour:
         """Of the bench's own liquid: it takes none of the campaign's time."""
         result, used = self._run(task)
         self.apart += result.outcome.cpu_s
@@ -96,7 +97,7 @@ class Fluid(Bench):
         self.before_first = self.before_first if self.poured else self.simulations
         self.occupancy.pour_started(self._clock.time())
         try:
-            spill = await self._real.pour(scene, action, seed)
+            spill = await hidden_spill(self._hidden, self._beside, scene, action, seed)
             await asyncio.sleep(self._asked.pour)
         finally:
             self.occupancy.pour_finished(self._clock.time())
@@ -113,7 +114,7 @@ class _Apart:
     def __init__(self, fluid: Fluid) -> None:
         self._fluid = fluid
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         return await self._fluid.simulate_apart(task)
 
 

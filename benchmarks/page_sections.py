@@ -8,6 +8,7 @@ from typing import Any
 
 import core_limit
 import page_figures
+from standard_pour import LEFT, LEFT_LIMIT
 
 TARGETS = {2_000: (1.5, 0.6), 5_000: (5.0, 2.0), 10_000: (12.0, 5.0)}
 """Required and aimed-at CPU seconds of the standard pour, by particles."""
@@ -75,8 +76,8 @@ def targets(pours: Sequence[Record]) -> str:
 {speed_table}
 {about}
 
-Speed counts only with the physics right. Other solvers have .92, .64 and .29 left in the pourer at these times and
-within .03 of that is right; density inside is that of Voronoi cells in the tilted cup at 1 s.
+Speed counts only with the physics right. Infinitely fine particles have .945, .675 and .31 left in the pourer at these
+times, and within .01 of that is right; density inside is that of Voronoi cells in the tilted cup at 1 s.
 
 {physics_table}
 {settings(pours)}"""
@@ -312,9 +313,10 @@ def verdict(cpu_s: float, required: float | None, aim: float | None) -> str:
 
 
 def _physics(result: Record) -> tuple[str, ...]:
-    left = tuple(f"{value:.3f}" for value in result["left"].values())
-    word = "right" if result["left_is_right"] else "**off**"
-    return (*left, word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
+    left = tuple(result["left"].values())
+    off = max(abs(value - reference) for value, reference in zip(left, LEFT, strict=True))
+    word = "right" if off <= LEFT_LIMIT else "**off**"
+    return (*(f"{value:.3f}" for value in left), word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
 
 
 def _words(key: str) -> str:

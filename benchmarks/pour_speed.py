@@ -23,8 +23,6 @@ from machine import describe, pin, say, show
 from peer import PeerRun
 from standard_pour import (
     END,
-    LEFT,
-    LEFT_LIMIT,
     SCENE,
     TIMES,
     Measured,
@@ -91,10 +89,8 @@ def of_theirs(particles: int, runs: list[PeerRun]) -> dict[str, Any]:
 
 
 def _physics(left: list[float], received: list[float], densities: list[float]) -> dict[str, Any]:
-    off = [abs(value - reference) for value, reference in zip(left, LEFT, strict=True)]
     return {
         "left": {f"{t:g} s": round(value, 3) for t, value in zip(TIMES, left, strict=True)},
-        "left_is_right": all(value <= LEFT_LIMIT for value in off),
         "delivered": round(statistics.mean(received), 4),
         "delivered_of_each": [round(value, 4) for value in received],
         "density_at_rest": round(statistics.mean(densities), 4),

@@ -23,7 +23,7 @@ _TOLD = ("surface_tension", "dynamic_viscosity")
 _MACHINE = ("simulators", "in_process", "object_store_mb", "ray", "operator", "accepted_checksum")
 """Fields of a laboratory that belong to the machine or to who stands beside it, not to the campaign."""
 
-_WIRES = {"arm": ("address",), "balance.serial": ("port", "baud", "format", "handshake", "reconnect_time")}
+_WIRES = {"arm": ("address",), "balance.device": ("port", "baud", "format", "handshake", "reconnect_time")}
 """Of its parts: a controller may get another address, a balance another socket."""
 
 _YOUNGER: dict[str, dict[str, Any]] = {

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-LARGEST_LIP_DROP = 2.0
+LARGEST_LIP_DROP = 1.0
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,10 @@ class SimulationParameters(BaseModel):
     """Distance from a wall at which particles come to rest, in spacings (FleX: collision distance). At 0.5 a vessel
     holds its true volume; more narrows vessels and raises lips, as walls made of particles do."""
 
-    lip_drop: float = Field(default=1.5, ge=0.0, le=LARGEST_LIP_DROP, json_schema_extra={"unit": "1"})
-    """Rims are lower for particles by so many spacings. At 1.5 a lip holds back what hydrostatics says: half a spacing
-    each for the particles' distance from solid, for the surface above them, and for the layer too thin to flow. Less
-    holds back more, as in solvers that don't correct their lips."""
+    lip_drop: float = Field(default=0.5, ge=0.0, le=LARGEST_LIP_DROP, json_schema_extra={"unit": "1"})
+    """Rims are lower by so many spacings for particles at rest, and less the faster they are, down to not at all from
+    √(g d) on. A layer of particles can't be thinner than a spacing: at 0.5 its middle passes a lip with the head that a
+    film's needs. At 0 a lip holds back more, as in solvers that don't correct their lips."""
 
     @classmethod
     def info(cls) -> dict[str, ParameterInfo]:

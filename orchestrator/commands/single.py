@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from sim_engine.backend import Backend
     from sim_engine.outcome import PourOutcome
-    from sim_engine.pour import PourSimulator, SimulationRun
+    from sim_engine.pour import PourSimulator
     from sim_engine.regimes import Regimes
+    from sim_engine.simulated import SimulatedPour
     from sim_engine.space import Space
     from sim_engine.spread import Spread
     from sim_engine.task import PourTask, Scene
@@ -102,7 +103,7 @@ def simulate(
         raise RefusalError("\n".join(bad), FAILED)
 
 
-def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulationRun]:
+def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:
     """One after the other; Taichi ends with them."""
     from rich.console import Console
 
@@ -172,20 +173,15 @@ def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scen
     return scenes[name]
 
 
-def _show(task: Any, run: Any, rrd: Path | None, png: Path | None) -> None:
-    from actors.protocols import Frames, SimulationResult
-
-    assert run.frames is not None
-    frames = Frames(run.frames.times, run.frames.positions, run.frames.states, run.frames.pourer_poses)
-    result = SimulationResult(run.outcome, frames)
+def _show(task: PourTask, pour: SimulatedPour, rrd: Path | None, png: Path | None) -> None:
     if rrd is not None:
         from orchestrator.monitor.simulation import simulation_rrd
 
-        say(f"recording: {simulation_rrd(rrd, task, result)} (open it with: rerun {rrd})")
+        say(f"recording: {simulation_rrd(rrd, task, pour)} (open it with: rerun {rrd})")
     if png is not None:
         from orchestrator.report.scene import simulation_png
 
-        say(f"picture: {simulation_png(png, task, result)}")
+        say(f"picture: {simulation_png(png, task, pour)}")
 
 
 def schema(which: str) -> None:

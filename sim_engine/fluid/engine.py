@@ -122,6 +122,7 @@ class FluidEngine:
             f.density[i] = 1.0
             f.phi[i] = ti.Vector([0.0, 0.0])
             f.push[i] = ti.Vector([0.0, 0.0])
+            f.sag[i] = ti.Vector([0.0, 0.0])
             f.home[i] = 0
             f.name[i] = k
             f.count[i] = 0

@@ -55,6 +55,7 @@ def rebuild(f: ti.template(), s, skin):
         f.dx[i] = f.x0[i]
         f.pressure_copy[i] = f.pressure[i]
         f.home_copy[i] = f.home[i]
+        f.sag_copy[i] = f.sag[i]
         f.name_copy[i] = f.name[i]
     for c in range(table, table + cells + 1):
         f.cell_start[c + 1] = f.cell_start[c + 1] + f.cell_start[c]
@@ -69,6 +70,7 @@ def rebuild(f: ti.template(), s, skin):
         f.x0[k] = f.dx[i]
         f.pressure[k] = f.pressure_copy[i]
         f.home[k] = f.home_copy[i]
+        f.sag[k] = f.sag_copy[i]
         f.name[k] = f.name_copy[i]
     # After the scatter cell_start[c] is where cell c ends, so that it begins at cell_start[c − 1].
     entries = f.list_begin[s]

@@ -46,7 +46,7 @@ class SceneSetup:
         viscosity: XSPH rate [1/s].
         friction: Coulomb coefficient.
         wall_distance: where liquid comes to rest before a wall, in spacings.
-        lip_drop: rims are lower for particles by so many spacings, at most `LARGEST_LIP_DROP`.
+        lip_drop: rims are lower for particles at rest by so many spacings, at most `LARGEST_LIP_DROP`.
         pourer, receiver: the vessels.
         receiver_at: (3,) [m].
         spill_level: below it and in no vessel a particle is spilled [m].

@@ -32,6 +32,7 @@ class FluidState:
         phi, normal: distance of the equivalent plane of each vessel's walls [m] at the last look, linearised in
             between; its gradient. Between steps phi is the signed distance.
         push: normal displacement given by each wall in this step [m].
+        sag: how much lower each vessel's rim is for this particle [m], see `rims.py`.
         home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
         cell, ranked: in which cell a particle is; particles in the order of cells, where they are not sorted.
         gradient, squares: Σ∇W and what the constraint's gradients amount to, Σ|∇C|².
@@ -51,6 +52,7 @@ class FluidState:
         self.x_copy, self.v_copy = vectors(), vectors()
         self.pressure, self.dp, self.density, self.pressure_copy = (scalars() for _ in range(4))
         self.phi = ti.Vector.field(VESSELS, ti.f32, shape=pool)
+        self.sag, self.sag_copy = (ti.Vector.field(VESSELS, ti.f32, shape=pool) for _ in range(2))
         self.push = ti.Vector.field(VESSELS, ti.f32, shape=pool)
         self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=pool)
         self.home, self.home_copy, self.name, self.name_copy = (scalars(ti.i32) for _ in range(4))
@@ -73,7 +75,7 @@ class FluidState:
         self.friction = ti.field(ti.f32, shape=scenes)
         self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
-        self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles by so many spacings
+        self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles at rest by so many spacings
         self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if that much nearer, in supports h
         self.wait = ti.field(ti.f32, shape=scenes)  # viscosity acts at such intervals [s]
         self.pull_wait = ti.field(ti.f32, shape=scenes)  # and cohesion at these at most [s]

@@ -1,7 +1,8 @@
 """One time step, and the loop over steps. Serial within a scene; scenes run side by side.
 
 Step: move the pourer, predict, sweep against the walls, refresh neighbour lists if needed, look up wall distances, warm
-start, iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion, classify.
+start, iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion,
+lower rims, classify.
 
 Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 """
@@ -10,6 +11,7 @@ import taichi as ti
 
 from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
 from sim_engine.fluid.neighbours import rebuild
+from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
 from sim_engine.fluid.viscosity import relax
@@ -110,7 +112,7 @@ class Stepper:
                 if f.phi[i][b] < reach:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
-                    y = swept(f, grids, s, b, y0, y1, clear)
+                    y = swept(f, grids, s, b, y0, y1, clear, f.sag[i][b])
                     if (y - y1).norm_sqr() > 0.0:
                         x = to_world(f, s, b, y)
             f.x[i] = x
@@ -125,7 +127,9 @@ class Stepper:
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             x = f.x[i]
             for b in range(VESSELS):
-                look = distance_and_gradient(f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False))
+                look = distance_and_gradient(
+                    f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False), f.sag[i][b]
+                )
                 f.phi[i][b] = look[3]
                 n = f.turn[s, b] @ ti.Vector([look[0], look[1], look[2]])
                 for c in ti.static(range(3)):
@@ -205,11 +209,11 @@ class Stepper:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
                     y = y1
-                    look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y)
+                    look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, f.sag[i][b])
                     risky = look[3] < STRETCH * (y1 - y0).norm()
                     if risky:
-                        y = swept(f, grids, s, b, y0, y1, 0.5 * clear)
-                        look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y)
+                        y = swept(f, grids, s, b, y0, y1, 0.5 * clear, f.sag[i][b])
+                        look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, f.sag[i][b])
                     n = ti.Vector([look[0], look[1], look[2]])
                     phi = look[3]
                     push = f.push[i][b]
@@ -228,7 +232,7 @@ class Stepper:
                         x = to_world(f, s, b, y)
                     f.phi[i][b] = phi
                     if risky:
-                        if crossed(f, grids, s, b, y0, y) == 1:
+                        if crossed(f, grids, s, b, y0, y, f.sag[i][b]) == 1:
                             f.home[i] = ESCAPED
                             f.stale[s] = 1
             f.x[i] = x
@@ -313,6 +317,7 @@ class Stepper:
         elif f.time[s] - dt < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] + f.drift[s]
+        lower_rims(f, s, dt)
         self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1

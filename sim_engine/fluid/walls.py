@@ -1,9 +1,8 @@
 """Vessels as moving signed distance grids: lookup, swept contact, cavity membership.
 
-Particles' centres stand half a spacing off the solid, the liquid's surface stands half a spacing above the topmost
-centres, and of the layer on top half a spacing, in the mean, is too little to flow: a lip would hold back one and a
-half spacings of liquid too much. So for particles every rim is lowered by as much (θ's `lip_drop`): the grid is looked
-up a little higher, by an offset that grows from nothing to that over the uppermost spacings.
+A film thinner than a spacing can't pass a lip as liquid does, so rims are lower for slow particles (`rims.py` says by
+how much and why): the grid is looked up a little higher, by an offset that grows from nothing over the uppermost
+spacings.
 
 A thin wall can't hold water by its distance alone: a particle that steps over the middle of the wall is pushed out on
 the far side. So every step is also swept: the particle's path in the vessel's own frame (which includes the vessel's
@@ -27,12 +26,12 @@ STRETCH = 1.0 + LARGEST_LIP_DROP / LIP_BLEND
 
 
 @ti.func
-def look_up(f: ti.template(), s, b, y):
-    """Where the grid is read for a point of the vessel frame."""
-    d = f.spacing[s]
-    drop = f.lip_drop[s]
-    part = ti.min(ti.max((y[2] - f.rim[s, b]) / (LIP_BLEND * d) + 1.0 + drop / LIP_BLEND, 0.0), 1.0)
-    return ti.Vector([y[0], y[1], y[2] + drop * d * part])
+def look_up(f: ti.template(), s, b, y, sag):
+    """Where the grid is read for a point of the vessel frame: near the rim `sag` [m] higher in the world."""
+    blend = LIP_BLEND * f.spacing[s]
+    part = ti.min(ti.max((y[2] - f.rim[s, b] + sag) / blend + 1.0, 0.0), 1.0)
+    up = ti.Vector([f.turn[s, b][2, 0], f.turn[s, b][2, 1], f.turn[s, b][2, 2]])
+    return y + (sag * part) * up
 
 
 @ti.func
@@ -53,10 +52,10 @@ def to_world(f: ti.template(), s, b, y):
 
 
 @ti.func
-def distance(f: ti.template(), grids: ti.template(), s, b, y):
+def distance(f: ti.template(), grids: ti.template(), s, b, y, sag):
     """Trilinear signed distance at a point of the vessel frame [m]; `FAR` beyond the grid."""
     size = f.grid_size[s, b]
-    u = (look_up(f, s, b, y) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
+    u = (look_up(f, s, b, y, sag) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
     result = ti.cast(FAR, ti.f32)
     if (
         u[0] >= 0.0
@@ -82,10 +81,10 @@ def distance(f: ti.template(), grids: ti.template(), s, b, y):
 
 
 @ti.func
-def distance_and_gradient(f: ti.template(), grids: ti.template(), offset, s, b, y):
+def distance_and_gradient(f: ti.template(), grids: ti.template(), offset, s, b, y, sag):
     """(∂φ/∂y normalised, φ) as a 4-vector from the values that start at `offset`; 0 and `FAR` beyond the grid."""
     size = f.grid_size[s, b]
-    u = (look_up(f, s, b, y) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
+    u = (look_up(f, s, b, y, sag) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
     result = ti.Vector([0.0, 0.0, 0.0, FAR])
     if (
         u[0] >= 0.0
@@ -133,7 +132,7 @@ def in_cavity(f: ti.template(), cavities: ti.template(), s, b, y):
 
 
 @ti.func
-def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
+def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin, sag):
     """Where a particle ends that wants to go from y0 to y1 (vessel frame): y1, or slid along the wall it meets.
 
     Sphere tracing, first along the way, then along what is left of it in the wall's tangent plane: |∇φ| ≤ 1, so that
@@ -149,7 +148,7 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
     stride = 0
     while leg < 2:
         length = way.norm()
-        phi = distance(f, grids, s, b, y)
+        phi = distance(f, grids, s, b, y, sag)
         if stride == 0:
             clear = ti.min(clear, 0.9 / STRETCH * ti.max(phi, 0.0))
         free = phi / STRETCH - clear
@@ -158,7 +157,7 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
             leg = 2
         elif free < 1e-5 or stride >= TRACE_STEPS:
             if leg == 0:
-                look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y)
+                look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, sag)
                 n = ti.Vector([look[0], look[1], look[2]])
                 way -= ti.min(way.dot(n), 0.0) * n
             clear *= 0.5
@@ -172,13 +171,13 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin):
 
 
 @ti.func
-def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1):
+def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1, sag):
     """1 if a straight step in the vessel frame goes through the middle of a wall. Samples, apart from the sweep."""
     way = y1 - y0
     length = way.norm()
     hit = 0
     samples = ti.min(ti.cast(length / (0.25 * f.wall[s, b]), ti.i32) + 2, 64)
     for k in range(samples + 1):
-        if distance(f, grids, s, b, y0 + way * (k / samples)) < -0.35 * f.wall[s, b]:
+        if distance(f, grids, s, b, y0 + way * (k / samples), sag) < -0.35 * f.wall[s, b]:
             hit = 1
     return hit

@@ -8,12 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.joint_path import JointPath, PathReport
+from actors.arm.joint_path import JointPath
 from actors.arm.path.kinematics import beyond_reach, posture
 from actors.arm.path.limits import JOINT_NAMES, UPRIGHT
 from actors.arm.path.solids import Nearest, hull, nearest_links, nearest_to_receiver
 from actors.arm.path.stretch import Stretch
 from actors.arm.path.travel import RacingJointError
+from actors.arm.protocol import PathReport
 from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from sim_engine.vessel.vessel import Vessel
@@ -64,7 +65,8 @@ def check_clearance(stretch: Stretch, until: float, pourer: Vessel, receiver: Ve
 def check_reach(unreached: Stretch) -> str:
     """What to say about a stretch of which some poses can't be reached in the posture of home."""
     home = posture(np.array(unreached.spec.home), unreached.model)
-    beyond = beyond_reach(unreached.flange.rotation, unreached.flange.position, unreached.model)
+    assert unreached.unreached is not None
+    beyond = beyond_reach(unreached.unreached.rotation, unreached.unreached.position, unreached.model)
     worst = _first_worst(np.abs(beyond[:, home]))
     # a way that can't be made has no pace yet
     when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)

@@ -14,7 +14,7 @@ from actors.arm.path.pace import STEEPEST, followable, pour_times
 from actors.arm.path.stretch import Phases, Stretch
 from actors.arm.path.travel import STEP, OutOfReachError, RacingJointError, follow, home_pose, routes, travel
 from actors.arm.spec import UrArmSpec
-from actors.protocols import InvalidActionError
+from actors.protocols import InvalidActionError, UnreachablePlaceError
 from sim_engine.contact import rotations
 from sim_engine.motion import Phase, PourMotion, turn
 from sim_engine.vessel.vessel import Vessel
@@ -59,6 +59,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
 
     Raises:
         InvalidActionError: it must not or can't be executed; the text lists everything that was found wrong.
+        UnreachablePlaceError: likewise, and no other pour that begins in the same place can.
     """
     problems = check_limits(spec)
     if problems:
@@ -66,6 +67,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     made = followable(motion)
     phases: Phases = tuple((p.name, p.start, p.end) for p in made.phases)
     approach, approached = _approach(made.sample(np.zeros(1))[0], spec, pourer, receiver, problems)
+    barred = bool(problems)
     pour = None
     try:
         pour = _pour(made, np.array(spec.home) if approach is None else approach.joints[-1], spec)
@@ -85,7 +87,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     if pour is not None and len(pour.times) > MOST_WAYPOINTS:
         problems.append(f"the pour needs {len(pour.times)} waypoints, a controller takes {MOST_WAYPOINTS}")
     if problems or pour is None or approach is None:
-        raise InvalidActionError(refusal(problems))
+        raise (UnreachablePlaceError if barred else InvalidActionError)(refusal(problems))
     retreat = _retreat(made, approach, pour, spec)
     back = Stretch.of("retreat", retreat, spec)
     problems = check_stretch(back, pourer, receiver)
@@ -104,13 +106,6 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
             _deviation(motion, made),
         ),
     )
-
-
-def way_there(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Vessel) -> list[str]:
-    """What forbids to carry the full pourer from home to where a motion begins, whatever it does there."""
-    problems: list[str] = []
-    _approach(motion.sample(np.zeros(1))[0], spec, pourer, receiver, problems)
-    return problems
 
 
 def _approach(

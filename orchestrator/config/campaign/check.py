@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.arm.spec import UrArmSpec
-from actors.protocols import InvalidActionError
+from actors.arm.spec import ArmSpec
+from actors.bench.planning import vessel as built
+from actors.protocols import InvalidActionError, UnreachablePlaceError
 from orchestrator.config.campaign.sense import senseless
 from orchestrator.config.yaml.errors import ConfigError, Problem
 from orchestrator.config.yaml.files import why_not_writable
@@ -23,7 +24,6 @@ from sim_engine.hydrostatics import level
 from sim_engine.motion import plan_motion
 from sim_engine.space import Space
 from sim_engine.task import Scene
-from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.spec import MeshShape, VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
@@ -51,6 +51,14 @@ class _Role:
         return (*(self.section + key for key in keys), *keys, self.section)
 
 
+Place = tuple[float, float, float]
+
+
+def _place(action: Action) -> Place:
+    """Where a pour begins: what the way there depends on."""
+    return action.x_offset, action.y_offset, action.height
+
+
 def _nothing(told: object) -> None:
     """Where nobody listens."""
 
@@ -58,7 +66,7 @@ def _nothing(told: object) -> None:
 @dataclass
 class _Checker:
     source: Path
-    arm: UrArmSpec | None = None
+    arm: ArmSpec | None = None
     document: Document | None = None
     warn: Callable[[Problem], None] = _nothing
     doing: Callable[[str], None] = _nothing
@@ -81,7 +89,7 @@ class _Checker:
     def vessel(self, spec: VesselSpec, places: tuple[Loc, ...]) -> Vessel | None:
         if spec not in self.vessels:
             try:
-                self.vessels[spec] = build_vessel(spec)
+                self.vessels[spec] = built(spec)
             except (VesselError, OSError) as error:
                 where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
                 self.add(places, f"vessel '{spec.name}'{where}: {error}")
@@ -114,16 +122,19 @@ class _Checker:
         if vessels is None or self._never_pours(scene, trials, vessels[0], role):
             return
         first = beyond = ""
-        barred: dict[tuple[float, ...], str] = {}
+        barred: set[Place] = set()
         for i, chosen in enumerate(trials, start=1):
             if i > 1:
                 self.doing(f"{role.text}: {len(trials)} actions are tried, none of {i - 1} can be made")
             try:
-                contact = touch(scene, scene.action(chosen), *vessels)
+                action = scene.action(chosen)
+                if _place(action) in barred:
+                    continue
+                contact = touch(scene, action, *vessels)
             except ValueError as error:  # an action out of bounds, or a motion that can't be made
                 contact = str(error)
             if contact is None:
-                problem = self._for_the_arm(scene, scene.action(chosen), actions, *vessels, barred)
+                problem = self._for_the_arm(scene, action, actions, barred)
                 if not problem:
                     for places, text in senseless(plan, scene, *vessels, self.arm, self.landings):
                         self.warn(self.problem(role.places(*places), f"{role.text}: {text}"))
@@ -143,10 +154,11 @@ class _Checker:
 
     def _payload(self, scene: Scene) -> None:
         """What the arm believes to carry can't weigh less than the liquid alone."""
-        if self.arm is None or self.arm.payload >= scene.liquid.mass:
+        carries = None if self.arm is None else self.arm.payload_limit
+        if carries is None or carries >= scene.liquid.mass:
             return
         text = (
-            f"the arm is set to carry {self.arm.payload * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
+            f"the arm is set to carry {carries * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
             f"alone, {scene.liquid.mass * 1e3:g} g; the payload is gripper and filled pourer, in the laboratory's file "
             "and on the pendant"
         )
@@ -173,35 +185,20 @@ class _Checker:
         self.add(role.places(("actions", "max_angle"), ("motion", "max_angle")), text)
         return True
 
-    def _for_the_arm(
-        self,
-        scene: Scene,
-        action: Action,
-        actions: Space,
-        pourer: Vessel,
-        receiver: Vessel,
-        barred: dict[tuple[float, ...], str],
-    ) -> str:
+    def _for_the_arm(self, scene: Scene, action: Action, actions: Space, barred: set[Place]) -> str:
         """Why the laboratory's arm, if it has one, can't make it; '' if it can.
 
         Args:
-            barred: places that the arm can't get to from home, and why, whatever it does there. Filled here.
+            barred: places that the arm can't get to from home, whatever it does there. Filled here.
         """
         if self.arm is None:
             return ""
-        from actors.arm.path.plan import plan_path, way_there
-
-        place = (action.x_offset, action.y_offset, action.height)
-        if place in barred:
-            return barred[place]
-        motion = plan_motion(scene, action, pourer, receiver)
         try:
-            plan_path(motion, self.arm, pourer, receiver)
+            self.arm.plan(scene, action)
         except InvalidActionError as error:
-            text = f"{action.display(*actions.names)}: {error}"
-            if way_there(motion, self.arm, pourer, receiver):
-                barred[place] = text
-            return text
+            if isinstance(error, UnreachablePlaceError):
+                barred.add(_place(action))
+            return f"{action.display(*actions.names)}: {error}"
         return ""
 
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 
-from actors.arm.spec import UrArmSpec
+from actors.arm.spec import ArmSpec
 from orchestrator.config.yaml.source import Loc
 from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from sim_engine.action import ACTION_DIMENSIONS, Action
@@ -37,7 +37,7 @@ def senseless(
     scene: Scene,
     pourer: Vessel,
     receiver: Vessel,
-    arm: UrArmSpec | None,
+    arm: ArmSpec | None,
     known: dict[tuple[object, ...], float | None],
 ) -> list[Senseless]:
     """What makes little sense about the actions of a stage in one of its scenes.
@@ -50,8 +50,11 @@ def senseless(
         known: landings that were worked out before; they don't depend on the receiver. Filled here.
     """
     told = [_misses(plan.actions, scene, pourer, receiver, known)]
-    if arm is not None:
-        told += [_too_fast(plan.actions, scene, name, arm) for name in ("angular_velocity", "return_velocity")]
+    if arm is not None and arm.tilt_speed_limit is not None:
+        told += [
+            _too_fast(plan.actions, scene, name, arm.tilt_speed_limit)
+            for name in ("angular_velocity", "return_velocity")
+        ]
     return [one for one in told if one is not None]
 
 
@@ -114,10 +117,9 @@ def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> 
     return None if course is None else course.landing()
 
 
-def _too_fast(actions: Space, scene: Scene, name: str, arm: UrArmSpec) -> Senseless | None:
+def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless | None:
     """A range of speeds whose fastest part the arm refuses."""
     axis = next((axis for axis in actions.axes if axis.name == name), None)
-    most = arm.limits.tilt_speed
     if axis is None or axis.upper <= most * (1.0 + 1e-9):
         return None
     middle = {other.name: other.decode(0.5) for other in actions.axes}

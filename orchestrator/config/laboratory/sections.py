@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, create_model
 
-from actors.arm.spec import UrArmSpec
+from actors.arm.spec import ArmSpec, UrArmSpec
 from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
@@ -269,9 +269,9 @@ def _bench(b: BenchSection) -> VirtualBenchSpec:
 
 def _paced(balance: BalanceSpec | None, time_scale: float) -> BalanceSpec | None:
     """A virtual balance in the bench's time."""
-    if balance is None or balance.serial is None:
+    if balance is None or balance.device is None:
         return balance
-    return replace(balance, serial=replace(balance.serial, time_scale=time_scale))
+    return replace(balance, device=balance.device.paced(time_scale))
 
 
 def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
@@ -309,9 +309,10 @@ def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
     return table | {"bench": bench}
 
 
-def _wires_as_file(arm: UrArmSpec | None, spec: LaboratorySpec) -> dict[str, object]:
+def _wires_as_file(arm: ArmSpec | None, spec: LaboratorySpec) -> dict[str, object]:
     if arm is None:
         return {}
+    assert isinstance(arm, UrArmSpec)
     return {
         **arm_as_file(arm),
         **({} if spec.balance is None else {"balance": balance_as_file(spec.balance)}),

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from actors.arm.geometry import Plane, Pose
 from actors.arm.joint_path import JointPath
 from actors.arm.path.checks import recheck
 from actors.arm.path.plan import plan_path
-from actors.arm.spec import Plane, Pose, UrArmSpec
+from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from sim_engine.action import DEG, Action
 from sim_engine.task import Pivot

@@ -9,7 +9,8 @@ from textwrap import dedent
 
 import pytest
 
-from actors.arm.spec import Plane, Pose, UrArmSpec
+from actors.arm.geometry import Plane, Pose
+from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arm import ArmSection, CellSection, arm_as_file, resolve_arm
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.sections import Section

@@ -43,7 +43,7 @@ PARAMETERS = (
     Axis("viscosity", 0.5, 10.0, "log"),
     Axis("friction", 0.0, 0.5),
     Axis("wall_distance", 0.4, 1.5),
-    Axis("lip_drop", 0.0, 2.0),
+    Axis("lip_drop", 0.0, 1.0),
 )
 NAMES = ("C1", "C2", "C3", "C4", "D1", "D2", "D3")
 KINDS: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""One pour over wires: the operator's steps, consent, the arm's ways, the weighings, and the way back from a stop.
+"""One pour: the operator's steps, consent, the arm's ways, the weighings, and the way back from a stop.
 
 Two rules hold throughout. While somebody is asked to put hands into the cell, no program runs on the controller, which
 is read back first. And nothing moves unless somebody has just said that it may, and been told how long they have.
@@ -9,27 +9,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from actors.arm.joint_path import ExecutedPath, PourPath
-from actors.arm.path.frames import pourer_motion
-from actors.arm.protocol import ArmState
-from actors.arm.spec import UrArmSpec
-from actors.arm.ur.errors import ArmError, ArmLostError, ArmRefusedError, ArmStoppedError
-from actors.arm.ur.facts import ArmFacts
+from actors.arm.actor import DeviceArm
+from actors.arm.errors import ArmError, ArmLostError, ArmRefusedError, ArmStoppedError
+from actors.arm.protocol import ArmFacts, ArmState, Executed, PlannedPour
+from actors.arm.spec import ArmSpec
 from actors.balance.actor import DeviceBalance
 from actors.balance.errors import BalanceError
 from actors.balance.placement import Weighed
 from actors.balance.spec import BalanceSpec
 from actors.balance.weighing import Weighings
-from actors.bench.executed import pack
 from actors.bench.progress import PourReport
 from actors.bench.questions import Questions
-from actors.bench.reality import PourAsk, Reality
-from actors.bench.wired_arm import WiredArm
-from actors.bench.wired_words import (
+from actors.bench.virtual_bench import Nature, PourAsk
+from actors.bench.words import (
     grams,
     start_question,
     stopped_question,
@@ -45,11 +41,13 @@ from actors.protocols import (
     LaboratoryError,
     Notice,
     NotPouredError,
+    PourFailedError,
     ProgressCallback,
     UnknownPourError,
 )
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
+from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Scene
 
 WEIGHING_TIME = 3.0
@@ -57,6 +55,9 @@ WEIGHING_TIME = 3.0
 
 SETTLING_TIME = 2.0
 """From the arm's return home to the first weighing [s of bench time]: the last drops fall."""
+
+LOOK_INTERVAL = 0.1
+"""Between two looks at the balance's display [s of the clock]."""
 
 _BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
 _STUCK = (ArmError, DeviceLostError)
@@ -67,25 +68,25 @@ class RefusedError(LaboratoryError):
 
 
 @dataclass(frozen=True)
-class Rooms:
-    """What all pours on a bench share; see `wired.WiredBench`."""
+class Setup:
+    """What all pours on a bench share; see `pouring_bench.PouringBench`."""
 
     mode: str
-    spec: UrArmSpec
+    spec: ArmSpec
     balance_spec: BalanceSpec
     operator_time: float
-    arm: WiredArm
+    arm: DeviceArm
     balance: DeviceBalance | None
     questions: Questions
-    reality: Reality | None
+    nature: Nature
     tell: Callable[[Notice], None]
 
 
-class WiredPour:
+class OnePour:
     """One pour, from the first question to the last weight.
 
     Args:
-        rooms: of the bench.
+        setup: of the bench.
         scene, action: what to pour.
         path: checked.
         seed: of a virtual bench's chance.
@@ -95,23 +96,23 @@ class WiredPour:
 
     def __init__(
         self,
-        rooms: Rooms,
+        setup: Setup,
         scene: Scene,
         action: Action,
-        path: PourPath,
+        path: PlannedPour,
         *,
         seed: int,
         known: Mapping[str, Weighed] | None,
         progress: ProgressCallback | None,
     ) -> None:
-        self._rooms, self._scene, self._action, self._path, self._seed = rooms, scene, action, path, seed
+        self._setup, self._scene, self._action, self._path, self._seed = setup, scene, action, path, seed
         self._weighings = Weighings(
-            rooms.balance_spec, rooms.balance, self._ask, known, self._note_weight, nominal=scene.liquid.mass
+            setup.balance_spec, setup.balance, self._ask, known, self._note_weight, nominal=scene.liquid.mass
         )
-        self._report = PourReport(progress, _expected(rooms, path), path.pour.duration)
+        self._report = PourReport(progress, _expected(setup, path), path.pour_time)
         self._begun = False
         self._broken: Exception | None = None
-        self._executed: ExecutedPath | None = None
+        self._executed: Executed | None = None
         self._facts: ArmFacts | None = None
 
     @property
@@ -126,7 +127,7 @@ class WiredPour:
             NotPouredError: nothing was poured.
             UnknownPourError: something may have been.
         """
-        self._rooms.questions.take_log()
+        self._setup.questions.take_log()
         watching = asyncio.create_task(self._watch())
         try:
             await self._before()
@@ -136,10 +137,11 @@ class WiredPour:
             await self._leave_safe()
             if self._begun:
                 weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
-                self._rooms.tell(Notice("warning", weighed))
+                self._setup.tell(Notice("warning", weighed))
                 raise
             raise NotPouredError("the pour was given up before it began; nothing was poured") from error
-        except InvalidActionError:
+        except (InvalidActionError, PourFailedError):
+            await self._leave_safe()
             raise
         except LaboratoryError as error:
             if self._begun and not isinstance(error, BalanceError):
@@ -149,41 +151,42 @@ class WiredPour:
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)
+            await self._setup.nature.end()
 
     # ---- in order
 
     async def _before(self) -> None:
-        rooms = self._rooms
+        setup = self._setup
         self._report.enter("operator")
-        self._facts = await rooms.arm.ready()
+        self._facts = await setup.arm.ready()
         await self._make_safe()
-        if rooms.reality is not None:
-            await rooms.reality.prepare(PourAsk(self._scene, self._action, self._path, self._seed))
-        if rooms.balance is not None:
-            await rooms.balance.device.revive()
-            await rooms.balance.resume()
+        if setup.balance is not None:
+            await setup.balance.device.revive()
+            await setup.balance.resume()
+        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed))
         await self._weighings.before()
 
     async def _move(self) -> None:
         """Out, pour, home: all of it after one consent, unless something stops it."""
-        rooms, path = self._rooms, self._path
-        await self._consent(start_question(rooms.spec, path))
-        async with self._followed():
+        setup, path = self._setup, self._path
+        await self._consent(start_question(setup.spec, path))
+        async with self._setup.nature.followed():
             await self._out_and_home()
 
     async def _out_and_home(self) -> None:
-        rooms, path = self._rooms, self._path
+        setup, path = self._setup, self._path
         self._report.enter("approach")
         try:
-            await rooms.arm.move_to_start(path)
+            await setup.nature.lasting(setup.arm.move_to_start(path), path.approach_time)
         except _STUCK as error:
             await self._bring_home(error)
             raise
-        await self._note()
+        await setup.nature.note()
+        await setup.nature.tilts()
         self._report.enter("tilt")
         self._begun = True
         try:
-            self._executed = await rooms.arm.execute(path, self._follow)
+            self._executed = await setup.nature.lasting(setup.arm.execute(path, self._follow), path.pour_time)
         except ArmRefusedError as error:  # before anything moved
             self._begun = False
             await self._bring_home(error)
@@ -191,11 +194,11 @@ class WiredPour:
         except _BROKEN_OFF as error:
             self._broken, self._executed = error, getattr(error, "executed", None)
             await self._bring_upright(error)
-        await self._note()
+        await setup.nature.note()
         try:
             if self._broken is not None:
-                await rooms.arm.release()  # agreed to with the un-tilting
-            await rooms.arm.retreat(path)
+                await setup.arm.release()  # agreed to with the un-tilting
+            await setup.arm.retreat(path)
         except _STUCK as error:
             await self._bring_home(error)
         await self._let_it_land()
@@ -203,7 +206,7 @@ class WiredPour:
     async def _after(self) -> PourMeasurement:
         await self._make_safe()
         self._report.enter("settle")
-        await self._pass(SETTLING_TIME)
+        await self._setup.nature.settle(SETTLING_TIME)
         self._report.enter("weigh")
         await self._weighings.after()
         measured = self._weighings.measurement(self._scene.liquid.mass)
@@ -218,7 +221,7 @@ class WiredPour:
         """Put a question; one that invites hands into the cell only while nothing can move."""
         if question.hands:
             await self._make_safe()
-        return await self._rooms.questions.ask(question)
+        return await self._setup.questions.ask(question)
 
     async def _make_safe(self) -> None:
         """See that nothing moves and nothing can; where that can't be seen, nobody is invited into the cell.
@@ -230,8 +233,8 @@ class WiredPour:
         while True:
             try:
                 if problem:
-                    await self._rooms.arm.ready()
-                await self._rooms.arm.hands_in()
+                    await self._setup.arm.ready()
+                await self._setup.arm.hands_in()
                 return
             except BenchLostError:
                 raise
@@ -254,11 +257,11 @@ class WiredPour:
         """
         if not await self._agreed(question):
             raise RefusedError("the operator did not let the arm move")
-        spec = self._rooms.spec
+        spec = self._setup.spec
         text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
         # The driver waits for as long from the release to the first movement.
-        await self._rooms.questions.announce(text, spec.announcement / spec.time_scale)
-        await self._rooms.arm.release()
+        await self._setup.questions.announce(text, spec.on_clock(spec.announcement))
+        await self._setup.arm.release()
 
     # ---- the way back from a stop
 
@@ -266,9 +269,9 @@ class WiredPour:
         """After a stop with the pourer tilted: nothing moves before somebody has looked at it and said so, twice."""
         while True:
             await self._recover(error)
-            await self._consent(upright_question(self._rooms.spec))
+            await self._consent(upright_question(self._setup.spec))
             try:
-                await self._rooms.arm.untilt(self._path)
+                await self._setup.arm.untilt(self._path)
                 return
             except _STUCK as again:
                 error = again
@@ -277,9 +280,9 @@ class WiredPour:
         """After a stop on the way to the pour or from it."""
         while True:
             await self._recover(error)
-            await self._consent(way_home_question(self._rooms.spec))
+            await self._consent(way_home_question(self._setup.spec))
             try:
-                await self._rooms.arm.retreat(self._path)
+                await self._setup.arm.retreat(self._path)
                 return
             except _STUCK as again:
                 error = again
@@ -295,26 +298,26 @@ class WiredPour:
         problem = str(error)
         while await self._agreed(stopped_question(error, problem, begun=self._begun)):
             try:
-                done = await self._rooms.arm.recover()
+                done = await self._setup.arm.recover()
             except BenchLostError:
                 raise
             except _STUCK as again:
                 problem = str(again)
                 continue
-            self._rooms.tell(Notice("info", f"the arm is ready again: {done or 'nothing had to be done'}"))
+            self._setup.tell(Notice("info", f"the arm is ready again: {done or 'nothing had to be done'}"))
             return
         raise RefusedError(f"{error}; the operator leaves the arm as it stands")
 
     async def _leave_safe(self) -> None:
         """Stop what moves, whatever has failed: also when this task itself is being cancelled."""
-        rooms = self._rooms
+        setup = self._setup
 
         async def stop() -> None:
             with contextlib.suppress(LaboratoryError):
-                await rooms.arm.stop()
-            if rooms.balance is not None:
+                await setup.arm.stop()
+            if setup.balance is not None:
                 with contextlib.suppress(LaboratoryError):
-                    await rooms.balance.interrupt()
+                    await setup.balance.interrupt()
 
         stopping = asyncio.ensure_future(stop())
         with contextlib.suppress(asyncio.CancelledError):
@@ -322,44 +325,22 @@ class WiredPour:
 
     # ---- the liquid
 
-    @contextlib.asynccontextmanager
-    async def _followed(self) -> AsyncIterator[None]:
-        """On a virtual bench, take down what the arm does for as long as this, however long anybody needs."""
-        reality = self._rooms.reality
-        if reality is None:
-            yield
-            return
-        await reality.begin()
-        following = asyncio.create_task(reality.follow())
-        try:
-            yield
-        finally:
-            following.cancel()
-            await asyncio.gather(following, return_exceptions=True)
-
-    async def _note(self) -> None:
-        """What the virtual bench's arm did so far."""
-        if self._rooms.reality is not None:
-            await self._rooms.reality.note()
-
     async def _let_it_land(self) -> None:
-        """What was executed is over: the virtual bench's liquid does what it does, and lies on the balance."""
-        if self._rooms.reality is not None:
-            await self._rooms.reality.note()
-            await self._rooms.reality.settle()
+        """What was executed is over: the liquid does what it does, and lies on the balance."""
+        await self._setup.nature.lands(self._executed, self._broken)
 
     async def _keep_what_shows(self) -> None:
         """Of a pour that was broken off, whatever can be weighed without touching anything."""
         with contextlib.suppress(LaboratoryError):
             await self._let_it_land()
-            await self._pass(SETTLING_TIME)
+            await self._setup.nature.settle(SETTLING_TIME)
             await self._weighings.at_once()
 
     # ---- what is kept
 
     def _note_weight(self, key: str, weighed: Weighed) -> None:
         """Into the journal at once: no weight is lost, whatever happens next."""
-        self._rooms.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
+        self._setup.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
 
     def _said(self, error: Exception) -> LaboratoryError:
         """The error for those above, with what is known of the liquid."""
@@ -381,33 +362,23 @@ class WiredPour:
         executed = self._executed
         assert executed is not None
         return {
-            "mode": self._rooms.mode,
+            "mode": self._setup.mode,
             **measured.notes,
             "arm": _who(self._facts),
             "executed_s": float(executed.times[-1]),
-            "largest_tilt_deg": math.degrees(self._largest_tilt(executed)),
-            "executed": pack(executed),
-            "operator": self._rooms.questions.take_log(),
+            "largest_tilt_deg": _largest_tilt(executed),
+            "executed": executed.record(),
+            "operator": self._setup.questions.take_log(),
         }
 
-    def _largest_tilt(self, executed: ExecutedPath) -> float:
-        """As read back [rad]."""
-        if len(executed.times) < 2:
-            return 0.0
-        return float(pourer_motion(executed.joints, executed.times, self._rooms.spec).tilt(executed.times).max())
-
-    # ---- time and screens
-
-    async def _pass(self, seconds: float) -> None:
-        """Bench time [s]."""
-        await asyncio.sleep(seconds / self._rooms.spec.time_scale)
+    # ---- screens
 
     def _follow(self, state: ArmState) -> None:
         self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
 
     async def _watch(self) -> None:
         """Give the balance's display to those who watch; it can't hold the pour up."""
-        balance = self._rooms.balance
+        balance = self._setup.balance
         if balance is None:
             return
         while True:
@@ -415,23 +386,31 @@ class WiredPour:
                 weight = await balance.read()
                 if math.isfinite(weight.mass):
                     self._report.show(weight.mass)
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(LOOK_INTERVAL)
 
 
-def _expected(rooms: Rooms, path: PourPath) -> dict[str, float]:
+def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
     """Time of each checkpoint [s of bench time]."""
     return {
-        "operator": rooms.operator_time + 4.0 * WEIGHING_TIME,
-        "approach": rooms.spec.announcement + path.approach.duration,
+        "operator": setup.operator_time + 4.0 * WEIGHING_TIME,
+        "approach": setup.spec.announcement + path.approach_time,
         **{name: end - start for name, start, end in path.phases},
-        "settle": path.retreat.duration + SETTLING_TIME,
+        "settle": path.retreat_time + SETTLING_TIME,
         "weigh": WEIGHING_TIME,
         "record": 2.0 * WEIGHING_TIME,
     }
+
+
+def _largest_tilt(executed: Executed) -> float:
+    """As read back [deg]."""
+    if len(executed.times) < 2:
+        return 0.0
+    return math.degrees(float(SampledMotion(executed.times, executed.poses).tilt(executed.times).max()))
 
 
 def _who(facts: ArmFacts | None) -> dict[str, Any]:
     """Of the robot, what a later reader will ask for."""
     if facts is None:
         return {}
-    return {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
+    told = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
+    return {name: text for name, text in told.items() if text}

@@ -1,38 +1,49 @@
-"""A virtual site from the event loop: the same calls, awaited."""
+"""The stand-ins of a virtual bench from the event loop: the same calls, awaited."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from actors.bench.site import Addresses, History
+from actors.balance.actor import DeviceBalance
+from actors.balance.virtual_balance import Load
+from actors.bench.stand_ins import Found, History
 from actors.device import Device
 
 DEADLINE = 30.0
 """Longest wait for any answer [s]; its process may still be starting."""
 
 
-class Site:
-    """`actors.bench.site.VirtualSite` over a `Device`.
+class DeviceStandIns:
+    """`actors.bench.stand_ins.StandIns` over a `Device`.
 
     Args:
         device: that holds it.
+
+    Attributes:
+        told: a balance whose driver is itself told what stands on it; None where something stands in for it.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
+        self.told: DeviceBalance | None = None
 
-    async def addresses(self) -> Addresses:
-        """Where controller and balance are."""
-        addresses: Addresses = await self.device.call("addresses", deadline=4.0 * DEADLINE)
-        return addresses
+    async def found(self) -> Found:
+        """Where they are."""
+        found: Found = await self.device.call("found", deadline=4.0 * DEADLINE)
+        return found
 
     async def prepare(self, seed: tuple[int, ...]) -> None:
         """A new pour."""
         await self.device.call("prepare", seed, deadline=DEADLINE)
+        if self.told is not None:
+            await self.told.prepare(seed)
 
     async def put(self, mass: float) -> None:
         """What stands on the balance from now on [kg]."""
-        await self.device.call("put", mass, deadline=DEADLINE)
+        if self.told is not None:
+            await self.told.put(Load((0.0,), (mass,)))
+        else:
+            await self.device.call("put", mass, deadline=DEADLINE)
 
     async def history(self, since: float) -> History:
         """What the joints did since a controller time [s]; nothing, for a time to come."""

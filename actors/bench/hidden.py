@@ -6,13 +6,13 @@ shows, nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from actors.bench.spec import VirtualBenchSpec
-from actors.protocols import LaboratoryError, SimulatorPool
+from actors.protocols import InvalidActionError, LaboratoryError, SimulatorPool
 from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome
 from sim_engine.task import PoseError, PourTask, Scene
@@ -53,6 +53,10 @@ def draw_pose_error(spec: VirtualBenchSpec, seed: int) -> PoseError:
     )
 
 
+class TouchingError(LaboratoryError):
+    """With the hidden errors of grip and placement the vessels would touch."""
+
+
 @dataclass(frozen=True)
 class Spill:
     """What truly became of the liquid.
@@ -70,39 +74,45 @@ class Spill:
     retained: float
 
 
-class World:
-    """Pours the 'real' liquid.
+async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: PourTask, seed: int) -> PourOutcome:
+    """What becomes of the 'real' liquid in one pour; same seed, same answer.
 
     Args:
-        spec: of the bench.
+        spec: of the bench: the hidden θ.
         simulators: a pool of its own.
+        task: what is poured and how; θ and seed are filled in here.
+        seed: of the pour.
+
+    Raises:
+        TouchingError: with these errors of placement the vessels would touch.
+        LaboratoryError: the liquid could not be simulated.
     """
+    reason = None
+    for liquid_seed in np.random.default_rng(stream(seed, "liquid")).integers(0, 2**31, ATTEMPTS):
+        try:
+            outcome = (await simulators.simulate(replace(task, parameters=spec.liquid, seed=int(liquid_seed)))).outcome
+        except InvalidActionError as touching:
+            raise TouchingError(f"the vessels as they truly stand: {touching}") from touching
+        if outcome.invalid is None:
+            return outcome
+        reason = outcome.invalid
+    raise LaboratoryError(f"the virtual bench's liquid could not be simulated: {reason}")
 
-    def __init__(self, spec: VirtualBenchSpec, simulators: SimulatorPool) -> None:
-        self._spec = spec
-        self._simulators = simulators
 
-    async def pour(self, scene: Scene, action: Action, seed: int) -> Spill:
-        """What becomes of the liquid in one pour; same seed, same answer.
+async def hidden_spill(
+    spec: VirtualBenchSpec, simulators: SimulatorPool, scene: Scene, action: Action, seed: int
+) -> Spill:
+    """What becomes of the liquid if the arm does what it is told, with this pour's errors; raises as `hidden_pour`.
 
-        Args:
-            scene: as intended; the errors come on top.
-            action: as commanded.
-            seed: of the pour.
-
-        Raises:
-            InvalidActionError: with these errors of placement the vessels would touch.
-            LaboratoryError: the liquid could not be simulated.
-        """
-        error = draw_pose_error(self._spec, seed)
-        reason = None
-        for liquid_seed in np.random.default_rng(stream(seed, "liquid")).integers(0, 2**31, ATTEMPTS):
-            task = PourTask(scene, action, self._spec.liquid, int(liquid_seed), pose_error=error)
-            outcome = (await self._simulators.simulate(task)).outcome
-            if outcome.invalid is None:
-                return spill_of(outcome, scene.liquid.mass)
-            reason = outcome.invalid
-        raise LaboratoryError(f"the virtual bench's liquid could not be simulated: {reason}")
+    Args:
+        spec: of the bench: the hidden θ and errors.
+        simulators: a pool of its own.
+        scene: as intended.
+        action: as commanded.
+        seed: of the pour.
+    """
+    task = PourTask(scene, action, spec.liquid, 0, pose_error=draw_pose_error(spec, seed))
+    return spill_of(await hidden_pour(spec, simulators, task, seed), scene.liquid.mass)
 
 
 def spill_of(outcome: PourOutcome, mass: float) -> Spill:

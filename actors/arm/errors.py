@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Any
 
-from actors.arm.joint_path import ExecutedPath
+from actors.arm.protocol import Executed
 from actors.protocols import LaboratoryError
 
 
@@ -21,6 +20,10 @@ class ArmNotReleasedError(ArmRefusedError):
     """Nobody has said since the last stop, start or recovery that the arm may move."""
 
 
+class NotAcceptedError(LaboratoryError):
+    """The arm's safety settings aren't those that people have accepted; it moves nothing."""
+
+
 class ArmLostError(ArmError):
     """The controller, the line to it or the driver's worker is gone; the arm stops by its watchdog.
 
@@ -29,7 +32,7 @@ class ArmLostError(ArmError):
         executed: what is known of the motion that was under way.
     """
 
-    def __init__(self, text: str, executed: ExecutedPath | None = None) -> None:
+    def __init__(self, text: str, executed: Executed | None = None) -> None:
         super().__init__(text)
         self.text, self.executed = text, executed
 
@@ -50,7 +53,7 @@ class ArmStoppedError(ArmError):
     """
 
     def __init__(
-        self, text: str, kind: str, phase: str, time: float, tilt: float, executed: ExecutedPath | None = None
+        self, text: str, kind: str, phase: str, time: float, tilt: float, executed: Executed | None = None
     ) -> None:
         super().__init__(text)
         self.text, self.kind, self.phase = text, kind, phase
@@ -58,10 +61,3 @@ class ArmStoppedError(ArmError):
 
     def __reduce__(self) -> Any:
         return type(self), (self.text, self.kind, self.phase, self.time, self.tilt, self.executed)
-
-
-def client_missing() -> str | None:
-    """Why no arm can be reached from here at all: the client library isn't installed; None if it is."""
-    if importlib.util.find_spec("rtde_receive") is not None:
-        return None
-    return "the arm needs the package ur-rtde, which is not installed; it has no wheel for Python 3.13 yet"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from actors.arm.joint_path import PourPath
-from actors.arm.spec import UrArmSpec
+from actors.arm.protocol import PlannedPour
+from actors.arm.spec import ArmSpec
 from actors.operator import Question
 
 
@@ -14,7 +14,7 @@ def grams(mass: float) -> str:
     return f"{1e3 * mass:.2f} g"
 
 
-def start_question(spec: UrArmSpec, path: PourPath) -> Question:
+def start_question(spec: ArmSpec, path: PlannedPour) -> Question:
     """Whether a whole pour may begin."""
     report = path.report
     return Question(
@@ -73,7 +73,7 @@ def unsafe_question(problem: str) -> Question:
     )
 
 
-def upright_question(spec: UrArmSpec) -> Question:
+def upright_question(spec: ArmSpec) -> Question:
     """Whether a stopped arm may bring the pourer upright."""
     return Question(
         f"Hands out of the cell. The arm will bring the pourer upright at {math.degrees(spec.untilt_speed):.0f}°/s, "
@@ -84,7 +84,7 @@ def upright_question(spec: UrArmSpec) -> Question:
     )
 
 
-def way_home_question(spec: UrArmSpec) -> Question:
+def way_home_question(spec: ArmSpec) -> Question:
     """Whether a stopped arm may go home."""
     return Question(
         f"Hands out of the cell. The arm will go home, the pourer upright. It moves {spec.announcement:g} s after you "

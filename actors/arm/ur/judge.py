@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from actors.arm.spec import Pose, UrArmSpec
-from actors.arm.survey import PORTS, SCRIPTS, Exchange
+from actors.arm.geometry import Pose
+from actors.arm.look import ArmLook, SafetyRecord
+from actors.arm.spec import UrArmSpec
+from actors.arm.ur.look import Findings, look_at
 from actors.arm.ur.primary import RobotState
-from orchestrator.commands.doctor_look import Check, Findings, State
-from orchestrator.safety import SafetyRecord
+from actors.arm.ur.survey import PORTS, SCRIPTS, Exchange, SurveyError
+from actors.checks import Check, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
 """How far the controller's TCP may be from the file's [m], [rad]."""
 
 PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
 """Likewise of the payload [kg] and its centre [m]."""
+
+MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
+"""How far up may be from where the file says [rad]: the tool's accelerometer is no level. [m/s²]"""
 
 HOME_TOLERANCE = math.radians(1.0)
 
@@ -25,6 +31,46 @@ GOOD_ROUND_TRIP, GOOD_GAP, LONGEST_GAP = 10e-3, 60e-3, 0.2
 
 KNOWN_SOFTWARE: dict[int, tuple[int, int]] = {3: (14, 15), 5: (6, 17)}
 """Minor versions, by major one, that the client library is tested with by its makers."""
+
+
+@dataclass(frozen=True)
+class UrLook(ArmLook):
+    """A UR controller that was looked at.
+
+    Attributes:
+        spec: what the laboratory's file says.
+        found: what the controller says.
+    """
+
+    spec: UrArmSpec | None = None
+    found: Findings | None = None
+
+    @classmethod
+    def at(cls, spec: UrArmSpec) -> UrLook:
+        """Ask the controller everything."""
+        found = look_at(spec.address)
+        return cls(
+            checksum="" if found.state is None else found.state.checksum,
+            serial=found.serial,
+            model=found.model,
+            software=".".join(str(part) for part in found.software[:3]),
+            spec=spec,
+            found=found,
+        )
+
+    def checks(self, record: SafetyRecord | None, *, accept: str, virtual: bool) -> list[Check]:
+        """See `ArmLook.checks`."""
+        assert self.spec is not None
+        assert self.found is not None
+        return judge(self.spec, self.found, record, accept=accept, virtual=virtual)
+
+    def at_home(self) -> Check:
+        """See `ArmLook.at_home`."""
+        assert self.spec is not None
+        assert self.found is not None
+        if self.found.state is None:
+            raise SurveyError("; ".join(self.found.problems) or f"the controller at {self.spec.address} tells nothing")
+        return home_check(self.spec, self.found.state)
 
 
 def judge(
@@ -61,6 +107,8 @@ def judge(
             home_check(spec, found.state),
         ]
         checks += _limits(spec, found.state)
+    if found.state is not None and found.exchange is not None:
+        checks.append(_mount(spec, found.state, found.exchange))
     if found.exchange is not None:
         checks += [_payload(spec, found.exchange), _network(found.exchange)]
     return checks
@@ -223,6 +271,31 @@ def _tool(spec: UrArmSpec, state: RobotState) -> Check:
         f"TCP on the controller {_point(there)}, in the file {_point(spec.tool)}: {1e3 * away:.1f} mm and "
         f"{math.degrees(turned):.1f} deg apart",
         "set the TCP in the installation on the teach pendant, or correct 'tool' in the file: they have to agree",
+    )
+
+
+def _mount(spec: UrArmSpec, state: RobotState, exchange: Exchange) -> Check:
+    """Whether up is where the file says: the tool feels it."""
+    from scipy.spatial.transform import Rotation
+
+    felt = exchange.acceleration
+    strength = math.hypot(*felt) if felt is not None else 0.0
+    if felt is None or not state.pose or not 0.5 * GRAVITY < strength < 1.5 * GRAVITY:
+        return Check(
+            "mount", "warn", "where up is, the tool doesn't tell", "compare 'mount' with the teach pendant yourself"
+        )
+    up = Rotation.from_rotvec(state.pose[3:]).apply([a / strength for a in felt])
+    away = math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(up, spec.mount.up, strict=True)))))
+    tilt = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
+    if away <= MOUNT_TOLERANCE:
+        return Check("mount", "ok", f"tilted by {tilt:.0f} deg, as the file says")
+    turn = math.degrees(math.atan2(float(up[0]), float(up[1])))
+    return Check(
+        "mount",
+        "fail",
+        f"the tool feels up {math.degrees(away):.0f} deg away from where the file has it: tilt {tilt:.0f} deg, turn "
+        f"{turn:.0f} deg would agree with it",
+        "correct 'mount' in the file and the mounting in the installation on the teach pendant: pours would go astray",
     )
 
 

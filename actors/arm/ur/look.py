@@ -1,4 +1,4 @@
-"""What `decant doctor` reads from a controller, and the lines that it writes. Nothing moves, nothing is set."""
+"""What `decant doctor` reads from a UR controller. Nothing moves, nothing is set."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import re
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
-from actors.arm.survey import (
+from actors.arm.ur import dashboard as dashboard_port
+from actors.arm.ur import primary
+from actors.arm.ur.primary import RobotState
+from actors.arm.ur.survey import (
     PORTS,
     RTDE,
     Exchange,
@@ -19,31 +21,9 @@ from actors.arm.survey import (
     read_exchange,
     read_state,
 )
-from actors.arm.ur import dashboard as dashboard_port
-from actors.arm.ur import primary
-from actors.arm.ur.primary import RobotState
 
 PATIENT_GAP = 0.1
 """Between two packages over RTDE [s]; beyond it they are looked at once more."""
-
-State = Literal["ok", "warn", "fail"]
-
-
-@dataclass(frozen=True)
-class Check:
-    """One line of the table.
-
-    Attributes:
-        name: what was looked at.
-        state: 'warn' lets pours be made, 'fail' doesn't.
-        found: what was found.
-        advice: what to do about it; '' where nothing is to be done.
-    """
-
-    name: str
-    state: State
-    found: str
-    advice: str = ""
 
 
 @dataclass(frozen=True)
