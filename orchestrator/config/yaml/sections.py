@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+
+from sim_engine.marks import Mark
 
 Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
@@ -42,13 +43,6 @@ Name = Annotated[str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", m
 """A name that is also good as a part of a file's name."""
 
 Text = Annotated[str, Strict(), Field(min_length=1)]
-
-
-@dataclass(frozen=True)
-class Mark:
-    """Says something of a field where it is declared."""
-
-    meaning: str
 
 
 IN_FILE = Mark("a path, relative to the file that it is written in")
@@ -111,6 +105,8 @@ def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
         variants: by the word that the key has; two or more.
         default: the variant that is meant where the key is missing; with none the key must be given.
     """
+    if not variants:
+        raise RuntimeError("Decant's own entry points are not registered; install it again (pip install -e .)")
     key = next(iter(variants.values())).tag
 
     def word(value: Any) -> str | None:
