@@ -195,7 +195,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         if self._plan.pours < 1 or suggestion.best_point is None:
             self._finish()
         else:
-            self._pour(suggestion, suggestion.best_point, self._prediction(suggestion))
+            self._pour(suggestion.best_point, self._prediction(suggestion))
 
     def _prediction(self, suggestion: Suggestion) -> Prediction | None:
         """Of the pour of what is recommended."""
