@@ -1,7 +1,7 @@
 """A balance with a spring: settings, and a driver that takes its time to come to rest.
 
-It has no line: on a virtual bench the driver is told what stands on it. A driver of a real balance would open its port in
-`connect`, and be told nothing.
+It has no line: on a virtual bench the driver is told what stands on it. A driver of a real balance would open its port
+in `connect`, and be told nothing.
 """
 
 from __future__ import annotations
