@@ -51,6 +51,10 @@ class Liquid(BaseModel):
         """Loaded volume [m³]."""
         return self.mass / self.density
 
+    def millilitres(self, mass: float) -> float:
+        """Volume of some of it, as people read it [mL]; mass in [kg]."""
+        return 1e6 * mass / self.density
+
 
 class SimulationParameters(BaseModel):
     """What calibration may turn (θ_s). Names follow FleX where it has one; meanings are ours."""

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from sim_engine.liquid import SimulationParameters
 
 
+_TOLD = {"prediction", "predicted_delivered_g", "predicted_delivered_ml", "risk", "window", "not_covered"}
+"""Of a receiver's summary: what a plan for it tells beside the action."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """What `run` and `calibrate` are told on the command line beside their campaign."""
@@ -186,7 +190,7 @@ def plan_pour(
                 "predicted_spillage_deviation": None if spillage is None else spillage.deviation,
                 "predicted_deviation": recommended.predicted_deviation,
                 "loss": plan.deployment.loss_name,
-                **told.model_dump(mode="json", include={"prediction", "risk", "window", "not_covered"}),
+                **told.model_dump(mode="json", include=_TOLD),
             }
         )
     theta = plan.parameters.model_dump()

@@ -279,4 +279,4 @@ def told(weighed: WeighedPour) -> str:
     )
     parts = {"loaded": weighed.loaded, "spilled": weighed.spilled, "retained": weighed.retained}
     masses = ", ".join(f"{name} {1e3 * mass:.1f} g" for name, mass in parts.items())
-    return f"{masses}; {r}"
+    return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"

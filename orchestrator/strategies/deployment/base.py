@@ -337,7 +337,7 @@ class Deployment(ABC, Generic[S]):
             simulations=self._trials.answered,
             simulations_lost=self._trials.lost,
             simulations_refused=sum(trial.refused for trial in self._trials.all),
-            pours=tuple(p.row(names) for p in self._pours if p.status != "pouring"),
+            pours=tuple(p.row(names, self._scene.liquid) for p in self._pours if p.status != "pouring"),
             simulated=tuple(
                 SimulatedAction(action_si=self._plan.actions.decode(trial.point), loss=trial.cost)
                 for trial in self._trials.all

@@ -219,7 +219,7 @@ def test_thetas_of_the_calibration_before_are_borne_and_a_campaign_without_says_
     assert len({request.parameters.cohesion for request in played.simulations}) > 10
     result: Any = strategy.result()
     assert result.risk.expected > true_losses(result.recommended.action_si).mean() + 0.1  # mean cohesion costs 0.2
-    pointless = calibrated.model_copy(update={"found": calibrated.found.model_copy(update={"posterior": None})})
+    pointless = plans.calibrated(THETA)
     with pytest.raises(RunError, match="C4"):
         with_posterior(plan, {"calibration": pointless})
 
