@@ -12,7 +12,7 @@ from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
 from actors.spec import LaboratorySpec
 from orchestrator.config.laboratory.arm import ArmSection, CellSection, resolve_arm
-from orchestrator.config.laboratory.balance import BalanceDeviceSection, resolve_balance
+from orchestrator.config.laboratory.balance import any_balance, resolve_balance
 from orchestrator.config.laboratory.cluster import RaySection, resolve_ray
 from orchestrator.config.laboratory.operator import OperatorSection, resolve_operator
 from orchestrator.config.motion import parameter_quantity
@@ -94,6 +94,9 @@ class BenchSection(Section):
     """Refilling, placing, wiping between two pours, in bench time; with an arm see 'operator'."""
 
 
+AnyBalance: Any = any_balance()
+
+
 class LaboratoryFile(Section):
     """Where a campaign runs."""
 
@@ -125,7 +128,7 @@ class LaboratoryFile(Section):
     cell: CellSection | None = None
     """What stands where around the arm."""
 
-    balance: BalanceDeviceSection | None = None
+    balance: AnyBalance | None = None
     """The balance beside the arm."""
 
     operator: OperatorSection = OperatorSection()
