@@ -12,13 +12,13 @@ from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
 from actors.spec import LaboratorySpec
 from orchestrator.config.laboratory.arm import ArmSection, CellSection, resolve_arm
-from orchestrator.config.laboratory.balance import BalanceDeviceSection, resolve_balance
+from orchestrator.config.laboratory.balance import any_balance, resolve_balance
 from orchestrator.config.laboratory.cluster import RaySection, resolve_ray
 from orchestrator.config.laboratory.operator import OperatorSection, resolve_operator
 from orchestrator.config.motion import parameter_quantity
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Count, Name, Section, Switch
+from orchestrator.config.yaml.sections import MADE, Count, Name, Section, Switch
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import PoseError
@@ -62,7 +62,7 @@ def hidden_liquid_model() -> type[HiddenLiquidBase]:
         for name, info in SimulationParameters.info().items()
     }
     model: type[HiddenLiquidBase] = create_model(
-        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, **fields
+        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, __cls_kwargs__=MADE, **fields
     )
     return model
 
@@ -92,6 +92,9 @@ class BenchSection(Section):
 
     operator_time: Duration = _DEFAULT.operator_time
     """Refilling, placing, wiping between two pours, in bench time; with an arm see 'operator'."""
+
+
+AnyBalance: Any = any_balance()
 
 
 class LaboratoryFile(Section):
@@ -125,7 +128,7 @@ class LaboratoryFile(Section):
     cell: CellSection | None = None
     """What stands where around the arm."""
 
-    balance: BalanceDeviceSection | None = None
+    balance: AnyBalance | None = None
     """The balance beside the arm."""
 
     operator: OperatorSection = OperatorSection()
