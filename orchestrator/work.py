@@ -61,14 +61,9 @@ def particles_of(plan: CampaignPlan) -> float:
 
 
 def _deployed(plan: DeploymentPlan, pour: float) -> Work:
-    match plan.strategy:
-        case "D1":
-            simulations = max(plan.iterations, 1) * max(plan.simulations_per_iteration, 1)
-            return Work(simulations, min(plan.pours, 1), pour_time=pour)
-        case "D2":
-            return Work(0, plan.pours, pour_time=pour)
-    beside = plan.per_pour or 0
-    return Work(plan.prior_simulations + beside * plan.pours, plan.pours, beside, pour_time=pour)
+    settings = plan.settings
+    pours = plan.pours if settings.learns_on_pours else min(plan.pours, 1)
+    return Work(settings.simulations, pours, settings.simulations_beside, pour_time=pour)
 
 
 def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float:

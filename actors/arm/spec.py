@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from actors.arm.geometry import ArmLimits, Cell, Joints, Mount, Pose, Vector
 from actors.arm.look import ArmLook
 from sim_engine.action import Action
+from sim_engine.marks import FREE
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ class UrArmSpec(ArmSpec):
     limits: ArmLimits
     cell: Cell
     home: Joints
-    address: str = ""
+    address: Annotated[str, FREE] = ""
     mount: Mount = field(default_factory=Mount)
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0

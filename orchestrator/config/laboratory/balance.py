@@ -11,7 +11,7 @@ from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
 from actors.balance.spec import AUTO, BalanceSpec, SerialBalanceSpec, parse_format
 from actors.balance.virtual_serial.scale import ScaleSettings
-from orchestrator.config.yaml.quantities import Quantity, format_quantity
+from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import PositiveCount, Section, Text
 from orchestrator.config.yaml.source import Place, Report
 
@@ -201,36 +201,3 @@ def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:
         reconnect_time=section.reconnect_time,
         virtual=None if section.virtual is None else ScaleSettings(**section.virtual.model_dump()),
     )
-
-
-def balance_as_file(spec: BalanceSpec) -> dict[str, Any]:
-    """The balance as a file would have it, JSON-ready."""
-    table: dict[str, Any] = {"placement": str(spec.placement)}
-    if isinstance(spec.device, SerialBalanceSpec):
-        s, rule = spec.device, spec.device.settling
-        table |= {} if s.virtual is not None else {"port": s.port}
-        table |= {"dialect": s.dialect, "handshake": s.handshake}
-        table |= {key: value for key, value in (("baud", s.baud), ("format", s.format)) if value is not None}
-        table |= {} if s.step is None else {"step": format_quantity(s.step, "kg", "g")}
-        table |= {
-            "repeatability": format_quantity(s.repeatability, "kg", "g"),
-            "settling": {
-                "readings": rule.readings,
-                "span": format_quantity(rule.span, "s", "s"),
-                "steps": rule.steps,
-                "deadline": format_quantity(rule.deadline, "s", "s"),
-            },
-            "interval": format_quantity(s.interval, "s", "s"),
-            "answer_time": format_quantity(s.answer_time, "s", "s"),
-            "reconnect_time": format_quantity(s.reconnect_time, "s", "s"),
-            "pourer": "elsewhere" if spec.pourer_elsewhere else "here",
-        }
-        if (v := s.virtual) is not None:
-            table["virtual"] = {
-                "resolution": format_quantity(v.resolution, "kg", "g"),
-                "capacity": format_quantity(v.capacity, "kg", "kg"),
-                "noise": format_quantity(v.noise, "kg", "g"),
-                "drift": format_quantity(v.drift, "kg/s", "g/s"),
-                "settling_time": format_quantity(v.settling_time, "s", "s"),
-            }
-    return table | {"load_tolerance": format_quantity(spec.load_tolerance, "kg", "g")}

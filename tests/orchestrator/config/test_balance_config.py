@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from textwrap import dedent
 
@@ -16,12 +15,12 @@ from orchestrator.config.laboratory.balance import (
     BalanceDeviceSection,
     SettlingSection,
     VirtualScaleSection,
-    balance_as_file,
     resolve_balance,
 )
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
+from tests.orchestrator.good_files import written_out
 
 
 def load(text: str, mode: str = "hardware") -> BalanceSpec:
@@ -93,7 +92,7 @@ def test_where_the_operator_types_there_is_no_line():
                                             ("placement: manual", "hardware")])  # fmt: skip
 def test_the_resolved_balance_loads_to_the_same(text, mode):
     spec = load(text, mode)
-    assert load(json.dumps(balance_as_file(spec)), mode) == spec
+    assert load(written_out(BalanceDeviceSection, text), mode) == spec
 
 
 def test_the_page_on_balances_names_every_key():
