@@ -6,11 +6,11 @@ from typing import ClassVar, Literal
 
 from actors.arm.numbers import NumbersSpec
 from orchestrator.config.laboratory.arm_sections import CellSection
-from orchestrator.config.laboratory.arms import ArmSection
+from orchestrator.config.laboratory.arms import ArmSettings
 from orchestrator.config.yaml.source import Place, Report
 
 
-class NumbersArmSection(ArmSection):
+class NumbersArmSection(ArmSettings):
     """An arm of numbers: it makes every motion, and stands nowhere."""
 
     required: ClassVar[dict[str, str]] = {"kind": "numbers"}
@@ -19,7 +19,7 @@ class NumbersArmSection(ArmSection):
     """An arm of numbers."""
 
     def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> NumbersSpec | None:
-        """See `ArmSection.resolve`."""
+        """See `ArmSettings.resolve`."""
         before = len(report.problems)
         if mode == "hardware":
             report.add(place.at("arm"), "an arm of numbers moves nothing; write 'mode: virtual'")

@@ -1,4 +1,4 @@
-"""What an arm of any kind is in a laboratory's file: one section, derived from `ArmSection`, found at the door."""
+"""What an arm of any kind is in a laboratory's file: one section, derived from `ArmSettings`, found at the door."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from orchestrator.config.laboratory.arm_sections import CellSection
 
 
-class ArmSection(Section):
+class ArmSettings(Section):
     """What may be written under `arm` for one kind; its field `kind` has the name that it is registered under."""
 
     tag: ClassVar[str] = "kind"
@@ -35,14 +35,14 @@ class ArmSection(Section):
         raise NotImplementedError
 
 
-def _arm(loaded: object, name: str) -> type[ArmSection]:
-    if not (isinstance(loaded, type) and issubclass(loaded, ArmSection)):
-        raise TypeError("should be a class derived from orchestrator.config.laboratory.arms.ArmSection")
+def _arm(loaded: object, name: str) -> type[ArmSettings]:
+    if not (isinstance(loaded, type) and issubclass(loaded, ArmSettings)):
+        raise TypeError("should be a class derived from orchestrator.config.laboratory.arms.ArmSettings")
     kind = loaded.model_fields.get("kind")
     if kind is None or kind.default != name:
         raise TypeError(f"its field 'kind' should be Literal['{name}'] = '{name}', as it is registered")
     return loaded
 
 
-ARMS: Door[type[ArmSection]] = Door("decant.arms", "arm", _arm)
+ARMS: Door[type[ArmSettings]] = Door("decant.arms", "arm", _arm)
 """Sections of all kinds of arms that are installed."""

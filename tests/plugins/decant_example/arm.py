@@ -23,7 +23,7 @@ from actors.arm.protocol import ArmFacts, ArmState, Whereabouts
 from actors.arm.spec import ArmSpec
 from actors.bench.planning import plan_pour
 from actors.protocols import InvalidActionError
-from orchestrator.config.laboratory.arms import ArmSection
+from orchestrator.config.laboratory.arms import ArmSettings
 from orchestrator.config.yaml.quantities import Quantity
 from sim_engine.action import Action
 from sim_engine.task import Scene
@@ -61,7 +61,7 @@ class StandSpec(ArmSpec):
         return path
 
 
-class StandSection(ArmSection):
+class StandSection(ArmSettings):
     """A stand whose motor turns the pourer."""
 
     required: ClassVar[dict[str, str]] = {"kind": "stand"}
@@ -73,7 +73,7 @@ class StandSection(ArmSection):
     """That its motor turns."""
 
     def resolve(self, cell: Any, place: Any, report: Any, *, mode: str) -> StandSpec | None:
-        """See `ArmSection.resolve`."""
+        """See `ArmSettings.resolve`."""
         if mode == "hardware":
             report.add(place.at("arm"), "this example has no motor; write 'mode: virtual'")
             return None
