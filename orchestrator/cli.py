@@ -251,9 +251,9 @@ def validate(
     ],
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and that some action can be poured."""
-    from orchestrator.commands import single
+    from orchestrator.commands import validate as verb
 
-    call(single.validate, files)
+    call(verb.validate, files)
 
 
 @app.command(

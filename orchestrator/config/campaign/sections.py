@@ -14,6 +14,7 @@ from orchestrator.config.motion import Parameters as ParametersModel
 from orchestrator.config.vessel import LiquidFile, VesselFile
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import (
+    MADE,
     Count,
     FilePath,
     Name,
@@ -216,7 +217,7 @@ def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Section
     for name, own in settings.items():
         learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
         bases = (own, LearningSection if learns else base)
-        found[name] = create_model(f"{name}Section", __base__=bases, __doc__=own.__doc__)
+        found[name] = create_model(f"{name}Section", __base__=bases, __doc__=own.__doc__, __cls_kwargs__=MADE)
         found[name].required = own.required | base.required
     return found
 

@@ -19,7 +19,7 @@ from orchestrator.config.laboratory.operator import OperatorSection, resolve_ope
 from orchestrator.config.motion import parameter_quantity
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Count, Name, Section, Switch, tagged
+from orchestrator.config.yaml.sections import MADE, Count, Name, Section, Switch, tagged
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import PoseError
@@ -63,7 +63,7 @@ def hidden_liquid_model() -> type[HiddenLiquidBase]:
         for name, info in SimulationParameters.info().items()
     }
     model: type[HiddenLiquidBase] = create_model(
-        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, **fields
+        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, __cls_kwargs__=MADE, **fields
     )
     return model
 

@@ -97,6 +97,9 @@ class Section(BaseModel):
         return getattr(self, self.written_keys()[key])
 
 
+MADE: dict[str, Any] = {"use_attribute_docstrings": False}
+"""For sections that are made from tables: no source is searched for their keys' meanings, which takes a second."""
+
 S = TypeVar("S", bound=Section)
 
 
