@@ -27,7 +27,7 @@ from orchestrator.config.laboratory import sections as laboratory
 from orchestrator.config.laboratory.arms import ARMS
 from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.sections import Choice, Section
 from orchestrator.config.yaml.validate import sections_in
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
@@ -89,7 +89,8 @@ OF_SECTIONS = {
     "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
     "MountSection": "`{tilt, turn}`, angles",
     "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
-    "BalanceDeviceSection": "[balance](balances.md#settings)",
+    "SerialSection": "[balance](balances.md#settings)",
+    "NumbersSection": "[balance](balances.md#settings)",
     "OperatorSection": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
     "PoseErrorSection": "[pose error](#bench)",
@@ -281,6 +282,9 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         parts = [_value(part) for part in typing.get_args(annotation) if part is not type(None)]
         sections = [part for part in parts if "or the path of its file" in part]
         return " or ".join(dict.fromkeys(sections or parts))
+    choice = next((m for m in metadata if isinstance(m, Choice)), None)
+    if choice is not None:
+        return ", ".join(f"`{word}`" for word in choice.words())
     if origin is Literal:
         return ", ".join(f"`{word}`" for word in typing.get_args(annotation))
     if origin is list:

@@ -13,7 +13,7 @@ from actors.operator import OperatorSpec
 from actors.spec import LaboratorySpec
 from orchestrator.config.laboratory.arm_sections import CellSection
 from orchestrator.config.laboratory.arms import ARMS, ArmSettings
-from orchestrator.config.laboratory.balance import BalanceDeviceSection, resolve_balance
+from orchestrator.config.laboratory.balance import any_balance, resolve_balance
 from orchestrator.config.laboratory.cluster import RaySection, resolve_ray
 from orchestrator.config.laboratory.operator import OperatorSection, resolve_operator
 from orchestrator.config.motion import parameter_quantity
@@ -98,6 +98,8 @@ class BenchSection(Section):
 AnyArm: Any = tagged(ARMS.all, default="ur")
 """Arms of all kinds that are installed."""
 
+AnyBalance: Any = any_balance()
+
 
 class LaboratoryFile(Section):
     """Where a campaign runs."""
@@ -130,7 +132,7 @@ class LaboratoryFile(Section):
     cell: CellSection | None = None
     """What stands where around the arm."""
 
-    balance: BalanceDeviceSection | None = None
+    balance: AnyBalance | None = None
     """The balance beside the arm."""
 
     operator: OperatorSection = OperatorSection()
