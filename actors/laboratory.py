@@ -6,12 +6,7 @@ import asyncio
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
-from actors.arm.ur.errors import client_missing
-from actors.arm.virtual_arm import VirtualArm
-from actors.balance.virtual_balance import BalanceSettings, VirtualBalance
-from actors.bench.bench import VirtualBench
-from actors.bench.open_wired import WiredRooms, needs_person, open_wired
-from actors.bench.spec import VirtualBenchSpec
+from actors.bench.opening import OpenBench, needs_person, open_bench
 from actors.device import Device, LocalDevice
 from actors.operator import Operator
 from actors.optimizer.actor import DeviceOptimizer, Proposer
@@ -43,7 +38,7 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
     Raises:
         LaboratoryError: with what is wrong and what would be right.
     """
-    if spec.arm is not None and need_bench and (missing := client_missing()) is not None:
+    if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
             "(--laboratory configs/laboratories/twin.yaml)"
@@ -91,25 +86,15 @@ class _ClosablePool(SimulatorPool, Protocol):
     async def close(self) -> None: ...
 
 
-def _balance_settings(bench: VirtualBenchSpec) -> BalanceSettings:
-    return BalanceSettings(
-        resolution=bench.balance_resolution,
-        noise=bench.balance_noise,
-        drift=bench.balance_drift,
-        settling_time=bench.settling_time,
-        time_scale=bench.time_scale,
-    )
-
-
-class _Rooms:
+class _OpenLaboratory:
     """What both kinds of laboratory have in common once they are open."""
 
     def __init__(self) -> None:
         self._pool: _ClosablePool | None = None
         self._kept: _ClosablePool | None = None
-        self._world: _ClosablePool | None = None
+        self._apart: _ClosablePool | None = None
         self._devices: list[Device] = []
-        self._wired: WiredRooms | None = None
+        self._opened: OpenBench | None = None
         self._optimizer: Optimizer | None = None
         self._bench: Bench | None = None
         self._bench_problem: str | None = None
@@ -151,23 +136,23 @@ class _Rooms:
         return self._optimizer
 
     @property
-    def wired(self) -> WiredRooms | None:
-        """What is behind a bench with wires; None where there is none."""
-        return self._wired
+    def opened(self) -> OpenBench | None:
+        """What is behind the bench; None where there is none."""
+        return self._opened
 
-    async def _close_rooms(self) -> None:
-        wired, self._wired = self._wired, None
-        if wired is not None:
-            await wired.close()
-        pools = [pool for pool in (self._pool, self._world) if pool is not None and pool is not self._kept]
+    async def _close_all(self) -> None:
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            await opened.close()
+        pools = [pool for pool in (self._pool, self._apart) if pool is not None and pool is not self._kept]
         await asyncio.gather(
             *(pool.close() for pool in pools), *(device.close() for device in self._devices), return_exceptions=True
         )
-        self._pool = self._world = self._optimizer = self._bench = None
+        self._pool = self._apart = self._optimizer = self._bench = None
         self._devices = []
 
 
-class InProcessLaboratory(_Rooms):
+class InProcessLaboratory(_OpenLaboratory):
     """Everything in threads of this process: for fast tests and single commands.
 
     The hidden liquid shares the one simulator with the pool (a process has one Taichi), so that nothing is simulated
@@ -198,33 +183,26 @@ class InProcessLaboratory(_Rooms):
         try:
             await self._open_bench(self._pool)
         except BaseException:
-            await self._close_rooms()
+            await self._close_all()
             raise
         return self
 
     async def _open_bench(self, pool: SimulatorPool) -> None:
-        if self._spec is None:
+        if self._spec is None or not self._spec.pours:
             return
-        if self._spec.arm is not None:
 
-            def device(name: str, cls: type[Any], *args: Any) -> Device:
-                return LocalDevice(name, lambda: cls(*args))
+        def device(name: str, cls: type[Any], *args: Any) -> Device:
+            return LocalDevice(name, lambda: cls(*args))
 
-            self._wired = await open_wired(self._spec, device, pool, self._operator, self._tell)
-            self._devices += self._wired.devices
-            self._bench = self._wired.bench
-        elif self._spec.bench is not None:
-            spec = self._spec.bench
-            arm = LocalDevice("arm", lambda: VirtualArm(spec.time_scale))
-            balance = LocalDevice("balance", lambda: VirtualBalance(_balance_settings(spec)))
-            self._devices += [arm, balance]
-            self._bench = VirtualBench(spec, pool, arm, balance)
+        self._opened = await open_bench(self._spec, device, pool, self._operator, self._tell)
+        self._devices += self._opened.devices
+        self._bench = self._opened.bench
 
     async def __aexit__(self, *exc: object) -> None:
-        await self._close_rooms()
+        await self._close_all()
 
 
-class RayLaboratory(_Rooms):
+class RayLaboratory(_OpenLaboratory):
     """Everything in processes of its own: on this machine, or on the machines of a cluster.
 
     Args:
@@ -267,13 +245,13 @@ class RayLaboratory(_Rooms):
 
                 self._site = Site(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
                 await self._site.open(need_bench=self._needs_bench)
-            await self._open_rooms()
+            await self._open_all()
         except BaseException:
             await self.__aexit__()
             raise
         return self
 
-    async def _open_rooms(self) -> None:
+    async def _open_all(self) -> None:
         from actors.device import RayDevice
 
         here = None if self._site is None else self._site.here
@@ -283,22 +261,16 @@ class RayLaboratory(_Rooms):
         self._optimizer = DeviceOptimizer(proposer)
         if not self._needs_bench:
             return
-        place, spec = None if self._site is None else self._site.bench, self._spec.bench
-        if spec is not None:
-            self._world = self._liquid = self._open_world()
-        if self._spec.arm is not None:
+        place = None if self._site is None else self._site.bench
+        if self._spec.bench is not None:
+            self._apart = self._liquid = self._open_liquid()
 
-            def device(name: str, cls: type[Any], *args: Any) -> Device:
-                return RayDevice(name, cls, *args, place=place)
+        def device(name: str, cls: type[Any], *args: Any) -> Device:
+            return RayDevice(name, cls, *args, place=place)
 
-            self._wired = await open_wired(self._spec, device, self._liquid, self._operator, self._tell)
-            self._devices += self._wired.devices
-            self._bench = self._wired.bench
-        elif spec is not None and self._liquid is not None:
-            arm = RayDevice("arm", VirtualArm, spec.time_scale, place=place)
-            balance = RayDevice("balance", VirtualBalance, _balance_settings(spec), place=place)
-            self._devices += [arm, balance]
-            self._bench = VirtualBench(spec, self._liquid, arm, balance)
+        self._opened = await open_bench(self._spec, device, self._liquid, self._operator, self._tell)
+        self._devices += self._opened.devices
+        self._bench = self._opened.bench
 
     def _open_pool(self) -> RaySimulatorPool:
         from actors.cluster.versions import versions
@@ -320,7 +292,7 @@ class RayLaboratory(_Rooms):
             self._site.grown = pool.grow
         return pool
 
-    def _open_world(self) -> RaySimulatorPool:
+    def _open_liquid(self) -> RaySimulatorPool:
         """The hidden liquid's simulator, beside the arm. No core is counted for it: the pool's size is the campaign's
         choice, and a pour must never wait for it."""
         place = None if self._site is None else self._site.bench
@@ -339,7 +311,7 @@ class RayLaboratory(_Rooms):
             self._pool.abandon(LaboratoryError(reason))
 
     async def __aexit__(self, *exc: object) -> None:
-        await self._close_rooms()
+        await self._close_all()
         if self._site is not None:
             await self._site.close()
         await self._stop_ray()

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
-from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.outcome import PourMeasurement
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask, Scene
 
 
@@ -33,37 +34,20 @@ class UnknownPourError(LaboratoryError):
     """
 
 
+class PourFailedError(LaboratoryError):
+    """A pour came to nothing that could be weighed, and everybody knows why: it counts as failed."""
+
+
 class InvalidActionError(LaboratoryError):
     """The vessels would touch, or the motion can't be made: refused before anything moved or was simulated."""
 
 
+class UnreachablePlaceError(InvalidActionError):
+    """The arm can't get to where a pour begins, whatever would be poured there."""
+
+
 class SimulationError(LaboratoryError):
     """A simulation gave no result (diverged, or its worker died more often than it may)."""
-
-
-@dataclass(frozen=True)
-class Frames:
-    """Recorded particles of one simulated pour, for the monitor.
-
-    Attributes:
-        times: (F,) [s].
-        positions: F arrays of shape (N, 3), world frame [m], float32.
-        states: F arrays of shape (N,), uint8: see `sim_engine.outcome.ParticleState`.
-        pourer_poses: (F, 7) float: x y z qw qx qy qz of the pourer's frame.
-    """
-
-    times: Any
-    positions: Any
-    states: Any
-    pourer_poses: Any
-
-
-@dataclass(frozen=True)
-class SimulationResult:
-    """A simulated pour: its outcome, and its frames if the task asked for any."""
-
-    outcome: PourOutcome
-    frames: Frames | None = None
 
 
 class SimulatorPool(Protocol):
@@ -74,7 +58,7 @@ class SimulatorPool(Protocol):
         """Number of simulators."""
         ...
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         """Run one pour on the next free simulator.
 
         Cancelling the awaiting task cancels the simulation.

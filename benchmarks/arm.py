@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 from machine import describe, say, show
 
+from actors.arm.errors import ArmStoppedError
+from actors.arm.geometry import ArmLimits, Cell, Pose
 from actors.arm.joint_path import PourPath
 from actors.arm.path.plan import plan_path
-from actors.arm.spec import ArmLimits, Cell, Pose, UrArmSpec
+from actors.arm.spec import UrArmSpec
 from actors.arm.ur.driver import UrArm
-from actors.arm.ur.errors import ArmStoppedError
 from actors.arm.ur.script import STOP_DECELERATION
 from actors.virtual_ur import VirtualController
 from sim_engine.action import DEG, Action

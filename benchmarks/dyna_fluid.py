@@ -21,23 +21,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dyna import AFTER, TRUST, Bench, interval
+from dyna import AFTER, Bench, interval
 from machine import describe, pin, say, show
 from skipping_clock import run
 
-from actors.bench.world import World
-from actors.protocols import InvalidActionError, ProgressCallback, SimulationResult
+from actors.bench.hidden import hidden_spill
+from actors.protocols import InvalidActionError, ProgressCallback
 from orchestrator.campaign import run_campaign
 from orchestrator.config.study.sections import load_study
 from orchestrator.occupancy import Occupancy
-from orchestrator.plan import DeploymentPlan, OutputPlan, PricesPlan
+from orchestrator.plan import DeploymentPlan, OutputPlan
+from orchestrator.strategies.deployment.d2 import D2Settings
+from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.study.plan import StudyPlan
 from sim_engine.errors import InvalidSceneError
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.pour import PourSimulator
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask, Scene
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,18 +62,18 @@ class Fluid(Bench):
         self.answers: list[float] = []
         self.priced: list[float] = []
         self.apart = 0.0
-        self._real = World(study.level(level).bench, _Apart(self))
+        self._hidden, self._beside = study.level(level).bench, _Apart(self)
 
-    def _run(self, task: PourTask) -> tuple[SimulationResult, float]:
+    def _run(self, task: PourTask) -> tuple[SimulatedPour, float]:
         """A simulation, and the CPU time that this thread spent on it."""
         begun = time.thread_time()
         try:
             found = self._simulator.simulate(task)
         except InvalidSceneError as error:
             raise InvalidActionError(str(error)) from None
-        return SimulationResult(found.outcome), time.thread_time() - begun
+        return SimulatedPour(found.outcome), time.thread_time() - begun
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         """One of the pool's members takes the CPU time that the simulation takes."""
         async with self._free:
             self.occupancy.simulation_started(self._clock.time())
@@ -82,7 +86,7 @@ class Fluid(Bench):
         self.simulations += 1
         return result
 
-    async def simulate_apart(self, task: PourTask) -> SimulationResult:
+    async def simulate_apart(self, task: PourTask) -> SimulatedPour:
         """Of the bench's own liquid: it takes none of the campaign's time."""
         result, used = self._run(task)
         self.apart += result.outcome.cpu_s
@@ -96,7 +100,7 @@ class Fluid(Bench):
         self.before_first = self.before_first if self.poured else self.simulations
         self.occupancy.pour_started(self._clock.time())
         try:
-            spill = await self._real.pour(scene, action, seed)
+            spill = await hidden_spill(self._hidden, self._beside, scene, action, seed)
             await asyncio.sleep(self._asked.pour)
         finally:
             self.occupancy.pour_finished(self._clock.time())
@@ -113,19 +117,19 @@ class _Apart:
     def __init__(self, fluid: Fluid) -> None:
         self._fluid = fluid
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         return await self._fluid.simulate_apart(task)
 
 
 def arms(asked: argparse.Namespace, base: DeploymentPlan) -> dict[str, DeploymentPlan]:
     """What is compared; see `dyna.py`."""
-    free = replace(base, pours=asked.pours, per_pour=None, model="scaled", refusals="avoid", trust=TRUST)
-    prices = PricesPlan(pour=asked.pour)
+    free = replace(base, settings=D3Settings.like(base.settings, pours=asked.pours, per_pour="free"))
+    prices = PricesSettings(pour=asked.pour)
     return {
-        "D2": replace(free, strategy="D2", per_pour=0, model="residual", trust=None),
-        "fixed": replace(free, per_pour=2),
-        "priced": replace(free, prices=prices),
-        "tireless": replace(free, prices=replace(prices, worth=0.0)),
+        "D2": replace(free, settings=D2Settings.like(free.settings)),
+        "fixed": free.with_settings(per_pour=2),
+        "priced": free.with_settings(prices=prices),
+        "tireless": free.with_settings(prices=PricesSettings(pour=asked.pour, worth=0.0)),
     }
 
 

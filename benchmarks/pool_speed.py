@@ -22,7 +22,6 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, cast
 
 import psutil
@@ -33,6 +32,7 @@ from actors.laboratory import RayLaboratory
 from actors.simulation.pool import RaySimulatorPool
 from actors.spec import LaboratorySpec
 from sim_engine.outcome import PourOutcome
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 TINY = 200
@@ -64,14 +64,14 @@ class Block:
 class Nothing:
     """A simulator that answers at once."""
 
-    def simulate(self, task: PourTask, *, cancelled: Any = None) -> SimpleNamespace:
+    def simulate(self, task: PourTask, *, cancelled: Any = None) -> SimulatedPour:
         """An outcome of the usual size."""
         curve = tuple(0.02 * k for k in range(200))
         outcome = PourOutcome(
             1.0, 0.0, 0.0, 0.0, 0.0, 1, 0.01, 0.0, 4.0, 1, 0.0, task.seed, curve_times=curve, curve_poured=curve,
             curve_spilled=curve,
         )  # fmt: skip
-        return SimpleNamespace(outcome=outcome, frames=None)
+        return SimulatedPour(outcome)
 
     def close(self) -> None:
         """Nothing to end."""

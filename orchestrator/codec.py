@@ -118,6 +118,8 @@ def to_json(value: Any, hint: Any = Any) -> Any:
         return typing.cast(BaseModel, value).model_dump(mode="json")
     if dataclasses.is_dataclass(hint):
         return {name: to_json(getattr(value, name), h) for name, h in _fields(hint).items()}
+    if dataclasses.is_dataclass(value):  # of which only a base class is annotated
+        return {_TYPE: type(value).__name__, **to_json(value, type(value))}
     raise CodecError(f"no rule to write a {hint.__name__}")
 
 

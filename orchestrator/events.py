@@ -13,10 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from actors.protocols import Frames, PourProgress
+from actors.protocols import PourProgress
 from orchestrator.requests import Decision, Outcome, Request
 from orchestrator.results import Results
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
+from sim_engine.simulated import RecordedFrames
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +115,7 @@ class RequestFinished(Event):
     request: Request
     outcome: Outcome
     seconds: float = 0.0
-    frames: Frames | None = None
+    frames: RecordedFrames | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,10 +129,9 @@ class PourProgressed(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StrategyProgressed(Event):
-    """The strategy was told something: steps done, steps in all, and what it has learnt so far."""
+    """The strategy was told something: what of its work is done, and what it has learnt so far."""
 
-    done: int
-    total: int
+    progress: Progress
     result: Learnt
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from actors.protocols import (
     Bench,
     BenchLostError,
-    Frames,
     InvalidActionError,
     Laboratory,
     LaboratoryError,
@@ -24,6 +23,7 @@ from actors.protocols import (
 )
 from orchestrator.errors import RunError
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
+from sim_engine.simulated import RecordedFrames
 from sim_engine.task import PourTask, Scene
 
 
@@ -92,7 +92,7 @@ class Lanes:
 
     async def simulate(
         self, request: Simulate, *, record: bool, started: Callable[[], None]
-    ) -> tuple[Outcome, Frames | None]:
+    ) -> tuple[Outcome, RecordedFrames | None]:
         """Run a simulation.
 
         Args:

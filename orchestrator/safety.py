@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 
+from actors.arm.look import SafetyRecord
 from orchestrator.errors import RunError
 
 SUFFIX = ".safety.json"
@@ -20,27 +21,6 @@ class SafetyRecordError(RunError):
     """The record can't be read; the text says why."""
 
     exit_code = 2
-
-
-@dataclass(frozen=True)
-class SafetyRecord:
-    """Safety settings that somebody has accepted.
-
-    Attributes:
-        checksum: of the controller's safety configuration, eight hexadecimal digits, as on the teach pendant.
-        serial: of the robot.
-        model: of the robot.
-        software: version on the controller.
-        date: day and time, ISO 8601.
-        accepted_by: who.
-    """
-
-    checksum: str
-    serial: str
-    model: str
-    software: str
-    date: str
-    accepted_by: str
 
 
 def record_path(laboratory: Path) -> Path:

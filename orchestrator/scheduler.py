@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
-from actors.protocols import Frames, PourProgress
+from actors.protocols import PourProgress
 from orchestrator.codec import decode_outcome, encode_outcome, encode_request, to_json
 from orchestrator.errors import RunError
 from orchestrator.events import (
@@ -38,6 +38,7 @@ from orchestrator.results import encode_result
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.unknown import needs_answer, weighed_by_hand
+from sim_engine.simulated import RecordedFrames
 
 _REPORT_INTERVAL = 0.3
 """Least time between two reports of a strategy's progress to watchers, unless one matters [s]."""
@@ -230,7 +231,7 @@ class StageScheduler:
                 raise needs_answer(request)
         self._finish(flight, outcome, time.monotonic() - begin, frames)
 
-    def _finish(self, flight: Flight, outcome: Outcome, seconds: float, frames: Frames | None) -> None:
+    def _finish(self, flight: Flight, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:
         written = encode_outcome(outcome)
         kind = Kind.POUR_FINISHED if isinstance(flight.request, Pour) else Kind.FINISHED
         try:
@@ -297,9 +298,8 @@ class StageScheduler:
         if not urgent and time.monotonic() - self._reported < _REPORT_INTERVAL:
             return
         self._reported = time.monotonic()
-        done, total = self._strategy.progress()
         result = self._strategy.result()
-        self._watchers.emit(StrategyProgressed(stage=self._stage, done=done, total=total, result=result))
+        self._watchers.emit(StrategyProgressed(stage=self._stage, progress=self._strategy.progress(), result=result))
 
     def _append(self, kind: Kind, body: dict[str, Any]) -> None:
         self._journal.append(kind, body, stage=self._stage)
@@ -309,7 +309,10 @@ class StageScheduler:
 
         Cancelled again, it gives the pour up as well.
         """
-        reason = "asked to pause" if isinstance(error, asyncio.CancelledError) else f"{type(error).__name__}: {error}"
+        if isinstance(error, asyncio.CancelledError):
+            reason = "asked to pause"
+        else:  # the text of an error of ours says all; another one's is a defect, whose kind matters
+            reason = str(error) if isinstance(error, RunError) else f"{type(error).__name__}: {error}"
         pours: list[asyncio.Task[None]] = []
         others: list[asyncio.Task[None]] = []
         for flight in self._flights.values():

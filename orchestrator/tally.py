@@ -17,11 +17,15 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.forecast import Forecast
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_name
 from orchestrator.report.units import LossUnit, is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
+from orchestrator.strategies.deployment.confirm import PURPOSE as CONFIRM
+from orchestrator.strategies.progress import Progress
+from orchestrator.work import particles_of, work_of
 
 CHECKPOINT_WORDS = {
     "operator": "waiting for the operator",
@@ -41,24 +45,14 @@ class StageTally:
     """Progress of one stage.
 
     Attributes:
-        done, total: steps.
+        progress: as the strategy told it last.
         opened_at, closed_at: times of these events; a replayed opening has none.
-        replayed: steps that an earlier run had done.
     """
 
     name: str
-    done: int = 0
-    total: int = 0
+    progress: Progress = field(default_factory=Progress)
     opened_at: float | None = None
     closed_at: float | None = None
-    replayed: int = 0
-
-    def remaining(self, now: float) -> float | None:
-        """Estimated seconds to its end at the pace so far; None before there is a pace."""
-        fresh = self.done - self.replayed
-        if self.opened_at is None or self.closed_at is not None or fresh <= 0 or self.total <= 0:
-            return None
-        return (now - self.opened_at) / fresh * max(self.total - self.done, 0)
 
 
 @dataclass
@@ -72,6 +66,7 @@ class PourTally:
     predicted: str
     started_at: float
     calibrating: bool
+    confirming: bool = False
     progress: PourProgress | None = None
     result: str = ""
 
@@ -97,6 +92,7 @@ class Tally:
         simulation_seconds: wall seconds that finished simulations took, all together (replayed ones not counted).
         timed_simulations: how many these were.
         best: by scene.
+        forecast: of the time that is left.
     """
 
     plan: CampaignPlan
@@ -112,18 +108,25 @@ class Tally:
     pour: PourTally | None = None
     best: dict[str, Best] = field(default_factory=dict)
 
+    forecast: Forecast = field(init=False)
+
     _busy_seconds: float = 0.0
     _load_from: float | None = None
     _load_to: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.forecast = Forecast(self.plan.parallel_simulations, particles_of(self.plan))
 
     def __call__(self, event: Event) -> None:
         """Count an event."""
         if not event.replayed:
             self._pass_time(event.time)
+        self.forecast(event)
         match event:
             case CampaignOpened():
                 self.mode, self.simulators = event.mode, event.simulators
                 self.stages = {name: StageTally(name) for name in event.stages}
+                self.forecast.begin(event.simulators, work_of(self.plan, event.stages))
             case CampaignStateChanged():
                 self.state = event.after
             case CampaignClosed():
@@ -136,12 +139,9 @@ class Tally:
                 self._stage(event.stage).closed_at = event.time
             case StrategyProgressed():
                 stage = self._stage(event.stage)
-                stage.done, stage.total = event.done, event.total
-                if event.replayed:
-                    stage.replayed = event.done
-                elif stage.opened_at is None:
+                stage.progress = event.progress
+                if not event.replayed and stage.opened_at is None:
                     stage.opened_at = event.time
-                    stage.replayed = event.done
             case RequestStarted():
                 self._started(event)
             case RequestFinished():
@@ -171,6 +171,7 @@ class Tally:
                     predicted,
                     event.time,
                     is_calibration(self.plan, pour),
+                    pour.purpose == CONFIRM,
                 )
 
     def _finished(self, event: RequestFinished) -> None:
@@ -189,7 +190,7 @@ class Tally:
                 loss = loss_of_pour(self.plan, pour, outcome.measurement)
                 if self.pour is not None:
                     self.pour.result = "too little was poured" if loss is None else unit.text(loss)
-                if loss is not None and not is_calibration(self.plan, pour):
+                if loss is not None and pour.purpose != CONFIRM and not is_calibration(self.plan, pour):
                     best = self.best.get(pour.scene)
                     if best is None or loss < best.loss:
                         self.best[pour.scene] = Best(loss, pour.number, unit)
@@ -239,9 +240,10 @@ class Tally:
         if pour.calibrating:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
-            total = self.plan.deployment.pours
+            total = self.plan.deployment.confirm if pour.confirming else self.plan.deployment.pours
         of = f"/{total}" if total else ""
-        line = f"pour {pour.number}{of} into {receiver_name(self.plan, pour.scene)}  {pour.action}"
+        kind = "confirming pour" if pour.confirming else "pour"
+        line = f"{kind} {pour.number}{of} into {receiver_name(self.plan, pour.scene)}  {pour.action}"
         if pour.predicted:
             line += f"  predicted {pour.predicted}"
         if pour.result:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +21,8 @@ from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fill import fill, spacing
 from sim_engine.fluid.setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.motion import Motion, plan_motion
-from sim_engine.outcome import ParticleState, PourOutcome
+from sim_engine.outcome import ParticleState
+from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.corners import equivalent_distance
@@ -37,9 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "InvalidSceneError",
     "PourSimulator",
-    "RecordedFrames",
     "SimulationCancelled",
-    "SimulationRun",
     "check_motion",
 ]
 
@@ -47,31 +45,6 @@ SETTLING = 0.15
 """The lattice may settle so long before the motion begins [s]."""
 
 PLANES_KEPT = 16
-
-
-@dataclass(frozen=True)
-class RecordedFrames:
-    """Particles at some times.
-
-    Attributes:
-        times: (F,) [s].
-        positions: F arrays (N, 3) float32, world [m].
-        states: F arrays (N,) uint8, `sim_engine.outcome.ParticleState`.
-        pourer_poses: (F, 7): x y z qw qx qy qz.
-    """
-
-    times: NDArray[np.float64]
-    positions: list[NDArray[np.float32]]
-    states: list[NDArray[np.uint8]]
-    pourer_poses: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class SimulationRun:
-    """A simulated pour."""
-
-    outcome: PourOutcome
-    frames: RecordedFrames | None = None
 
 
 def check_motion(
@@ -141,7 +114,7 @@ class PourSimulator:
         check_motion(motion, scene, task.action, pourer, receiver, error)
         return motion
 
-    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulationRun:
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """Run one pour.
 
         Args:
@@ -161,7 +134,7 @@ class PourSimulator:
 
     def simulate_many(
         self, tasks: Sequence[PourTask], *, cancelled: Callable[[], bool] | None = None
-    ) -> list[SimulationRun]:
+    ) -> list[SimulatedPour]:
         """Run many pours, of any actions, θ, vessels and seeds, in one set of kernels.
 
         On a CPU the pours follow each other; on a GPU they run side by side, as many as there is memory for. Every
@@ -183,7 +156,7 @@ class PourSimulator:
 
         motions = [self.prepare(task) for task in tasks]
         fluid = engine(self.backend)
-        runs: list[SimulationRun] = []
+        runs: list[SimulatedPour] = []
         while len(runs) < len(tasks):
             first = len(runs)
             end = first + fluid.room_for([task.parameters.particles for task in tasks[first:]])
@@ -196,7 +169,7 @@ class PourSimulator:
         tasks: Sequence[PourTask],
         motions: Sequence[Motion],
         cancelled: Callable[[], bool] | None,
-    ) -> list[SimulationRun]:
+    ) -> list[SimulatedPour]:
         """Pours that fit into one load."""
         begun = time.process_time()
         starts = [
@@ -219,7 +192,7 @@ class PourSimulator:
             if task.record_rate > 0.0:
                 course.frames[:0] = self._level_frames(task, motion, course.start)
         return [
-            SimulationRun(outcome(fluid, course, loading), recorded_frames(course, motion))
+            SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
             for course, motion in zip(courses, motions, strict=True)
         ]
 

@@ -1,72 +1,111 @@
-"""The arm behind its protocol: a blocking driver in a process (or thread) of its own, reached from the event loop."""
+"""An arm's driver from the event loop: its calls, awaited, with their deadlines."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+from collections.abc import Callable
 
-from actors.arm.protocol import ArmProgress, ArmState, ExecutedMotion
-from actors.arm.virtual_arm import APPROACH_TIME, Grip
+from actors.arm.errors import ArmError
+from actors.arm.protocol import ArmFacts, ArmState, Executed, PlannedPour
+from actors.arm.spec import ArmSpec
 from actors.device import Device
-from sim_engine.motion import PourMotion
+from actors.protocols import LaboratoryError
 
-ANSWER_DEADLINE = 30.0
-"""Wall time an idle arm may take to answer [s]; its process may still be starting."""
+PATIENCE = 60.0
+"""Longest wait for what moves nothing [s]: a process starts, a controller is asked some questions."""
 
-PROGRESS_INTERVAL = 0.1
-"""Wall time between two looks at a moving arm [s]."""
+POWER_TIME = 180.0
+"""Longest wait for power and brakes after an emergency stop [s of controller time]."""
+
+LOOK_INTERVAL = 0.1
+"""Between two looks at a moving arm [s]."""
+
+Follow = Callable[[ArmState], None]
 
 
 class DeviceArm:
-    """`actors.arm.protocol.Arm` over a `Device` that holds a driver such as `VirtualArm`.
+    """An `actors.arm.protocol.Arm` over a `Device`.
 
     Args:
-        device: of the driver.
-        time_scale: bench seconds per wall second, for deadlines; 0 waits for nothing.
+        device: that holds the driver.
+        spec: of the arm.
     """
 
-    def __init__(self, device: Device, time_scale: float) -> None:
-        self.device = device
-        self._scale = time_scale
+    def __init__(self, device: Device, spec: ArmSpec) -> None:
+        self.device, self._spec = device, spec
 
-    def _deadline(self, bench_time: float) -> float:
-        # Twice the time it should take: a busy machine may lag, a lost arm must be noticed.
-        return ANSWER_DEADLINE + (2.0 * bench_time / self._scale if self._scale > 0.0 else 0.0)
-
-    async def grip(self, grip: Grip) -> None:
-        """Virtual arms only: errors of the next pour."""
-        await self.device.call("grip", grip, deadline=ANSWER_DEADLINE)
-
-    async def move_to_start(self, motion: PourMotion) -> None:
-        """See `Arm.move_to_start`."""
-        await self.device.call("move_to_start", motion, deadline=self._deadline(APPROACH_TIME))
-
-    async def execute(self, motion: PourMotion, progress: ArmProgress | None = None) -> ExecutedMotion:
-        """See `Arm.execute`."""
-        watcher = None if progress is None else asyncio.create_task(self._watch(progress))
+    async def ready(self) -> ArmFacts:
+        """Connected, and who is there; nothing moves."""
+        await self.device.revive()
         try:
-            deadline = self._deadline(motion.duration)
-            executed: ExecutedMotion = await self.device.call("execute", motion, deadline=deadline)
-            return executed
-        finally:
-            if watcher is not None:
-                watcher.cancel()
-                # What went wrong with watching is of no consequence for the motion.
-                await asyncio.gather(watcher, return_exceptions=True)
+            facts: ArmFacts = await self.device.call("facts", deadline=PATIENCE)
+        except ArmError:
+            facts = await self.device.call("connect", deadline=PATIENCE)
+        return facts
 
-    async def _watch(self, progress: ArmProgress) -> None:
-        while True:
-            await asyncio.sleep(PROGRESS_INTERVAL)
-            progress(await self.state())
-
-    async def stop(self) -> None:
-        """See `Arm.stop`."""
-        await self.device.call("stop", deadline=ANSWER_DEADLINE, urgent=True)
+    async def hands_in(self) -> None:
+        """See to it that no program runs on the controller and the arm stands, and read both back."""
+        await self.device.call("hands_in", deadline=PATIENCE)
 
     async def release(self) -> None:
-        """See `Arm.release`."""
-        await self.device.call("release", deadline=ANSWER_DEADLINE, urgent=True)
+        """A person has said that it may move."""
+        await self.device.call("release", deadline=PATIENCE, urgent=True)
+
+    async def move_to_start(self, path: PlannedPour) -> None:
+        """From home to the pour's start."""
+        await self.device.call("move_to_start", path, deadline=self._deadline(path.approach_time))
+
+    async def execute(self, path: PlannedPour, follow: Follow) -> Executed:
+        """Tilt, hold, return.
+
+        Args:
+            path: whose start it stands at.
+            follow: told now and then where it is.
+        """
+        watching = asyncio.create_task(self._watch(follow))
+        try:
+            deadline = self._deadline(path.pour_time)
+            executed: Executed = await self.device.call("execute", path, deadline=deadline)
+            return executed
+        finally:
+            watching.cancel()
+            await asyncio.gather(watching, return_exceptions=True)
+
+    async def retreat(self, path: PlannedPour) -> None:
+        """Home, from wherever on the ways to and from the pour it stands upright."""
+        await self.device.call("retreat", path, deadline=self._deadline(3.0 * path.retreat_time))
+
+    async def untilt(self, path: PlannedPour) -> None:
+        """Slowly upright again, after that pour was stopped."""
+        await self.device.call("untilt", path, deadline=self._deadline(self._spec.untilt_time))
+
+    async def recover(self) -> str:
+        """After a stop whose cause a person has seen to: connected and ready, not released; says what was done."""
+        await self.device.revive()
+        await self.release()
+        done: str = await self.device.call("recover", deadline=self._deadline(POWER_TIME))
+        return done
+
+    async def stop(self) -> None:
+        """Stop what moves; it stays locked."""
+        await self.device.call("stop", deadline=PATIENCE, urgent=True)
 
     async def state(self) -> ArmState:
-        """See `Arm.state`."""
-        state: ArmState = await self.device.call("state", deadline=ANSWER_DEADLINE, urgent=True)
+        """Where it is."""
+        state: ArmState = await self.device.call("state", deadline=PATIENCE, urgent=True)
         return state
+
+    async def close(self) -> None:
+        """Let go of the controller."""
+        await self.device.call("close", deadline=PATIENCE)
+
+    def _deadline(self, seconds: float) -> float:
+        """For something that takes so long on the controller [s]: twice that, for a lost arm must be noticed."""
+        return PATIENCE + 2.0 * self._spec.on_clock(seconds)
+
+    async def _watch(self, follow: Follow) -> None:
+        while True:
+            await asyncio.sleep(LOOK_INTERVAL)
+            with contextlib.suppress(LaboratoryError):
+                follow(await self.state())

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import base64
+import zlib
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.protocol import PathReport
+
 FloatArray = NDArray[np.float64]
+
+JOINT_UNIT = 1e-6
+"""Joints are kept to this [rad]: a thousandth of what an arm repeats."""
+
+TIME_UNIT = 1e-5
+"""Times likewise [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,35 +43,6 @@ class JointPath:
         return np.stack([np.interp(times, self.times, self.joints[:, k]) for k in range(6)], axis=-1)
 
 
-@dataclass(frozen=True)
-class PathReport:
-    """What was found out about a whole path before the first movement.
-
-    Attributes:
-        joint_speed: fastest joint [rad/s], and `fastest_joint` which one, 0 … 5.
-        tool_speed: fastest point of tool or pourer [m/s].
-        tilt: largest [rad]; tilt_speed: largest [rad/s].
-        singularity: smallest distance from one, as `ArmLimits.singularity`.
-        clearance: smallest distance of the pourer from the receiver [m].
-        low, high: corners of the box that tool and pourer pass through, base frame [m].
-        duration: of approach, pour and retreat together [s].
-        deviation: largest difference between the tilt that was asked for and the path's at the same time [rad]; more
-            than rounding only where a step in speed was asked for, which joints can't make.
-    """
-
-    joint_speed: float
-    fastest_joint: int
-    tool_speed: float
-    tilt: float
-    tilt_speed: float
-    singularity: float
-    clearance: float
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    duration: float
-    deviation: float = 0.0
-
-
 @dataclass(frozen=True, eq=False)
 class PourPath:
     """A whole pour for the arm: checked, ready to be executed.
@@ -81,6 +63,44 @@ class PourPath:
     phases: tuple[tuple[str, float, float], ...]
     report: PathReport
 
+    @property
+    def approach_time(self) -> float:
+        """[s]."""
+        return self.approach.duration
+
+    @property
+    def pour_time(self) -> float:
+        """[s]."""
+        return self.pour.duration
+
+    @property
+    def retreat_time(self) -> float:
+        """[s]."""
+        return self.retreat.duration
+
+    def slowed(self, factor: float) -> PourPath:
+        """The same way, with all its times divided by a factor in (0, 1]."""
+        if factor == 1.0:
+            return self
+        approach, pour, retreat = (
+            JointPath(part.times / factor, part.joints) for part in (self.approach, self.pour, self.retreat)
+        )
+        r = self.report
+        return PourPath(
+            approach,
+            pour,
+            retreat,
+            self.tilts,
+            tuple((name, start / factor, end / factor) for name, start, end in self.phases),
+            replace(
+                r,
+                joint_speed=factor * r.joint_speed,
+                tool_speed=factor * r.tool_speed,
+                tilt_speed=factor * r.tilt_speed,
+                duration=r.duration / factor,
+            ),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class ExecutedPath:
@@ -92,9 +112,48 @@ class ExecutedPath:
         completed: False if it was stopped on the way.
         tracking: what the path was followed with: 'rms_angle', 'max_angle' [rad] of the joints, 'rms_tool',
             'max_tool' [m], 'lag' [s] taken out of them, 'longest_gap' between two readings [s].
+        poses: of the pourer in the world, (T, 7); empty where nobody knows the cell, as after `unpack`.
     """
 
     times: FloatArray
     joints: FloatArray
     completed: bool
     tracking: dict[str, float] = field(default_factory=dict)
+    poses: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
+
+    def record(self) -> dict[str, Any]:
+        """See `actors.arm.protocol.Executed`."""
+        return pack(self)
+
+
+def pack(executed: ExecutedPath) -> dict[str, Any]:
+    """JSON-ready; a ten-second pour at 125 Hz takes some ten kilobytes.
+
+    Args:
+        executed: as read back.
+    """
+    columns = np.column_stack([executed.times / TIME_UNIT, executed.joints / JOINT_UNIT])
+    whole = np.round(columns).astype("<i4")
+    data = np.diff(whole, axis=0, prepend=np.zeros((1, 7), "<i4")).astype("<i4").T.tobytes()
+    return {
+        "samples": len(whole),
+        "completed": executed.completed,
+        "tracking": dict(executed.tracking),
+        "packed": base64.b85encode(zlib.compress(data, 9)).decode("ascii"),
+    }
+
+
+def unpack(data: dict[str, Any]) -> ExecutedPath:
+    """Inverse of `pack`.
+
+    Raises:
+        ValueError: it is not what `pack` made.
+    """
+    try:
+        raw = zlib.decompress(base64.b85decode(data["packed"]))
+        steps = np.frombuffer(raw, "<i4").reshape(7, int(data["samples"])).T
+        whole = np.cumsum(steps, axis=0)
+        times, joints = whole[:, 0].astype(float) * TIME_UNIT, whole[:, 1:].astype(float) * JOINT_UNIT
+        return ExecutedPath(times, joints, bool(data["completed"]), dict(data["tracking"]))
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
+        raise ValueError(f"not an executed path: {error!r}") from error

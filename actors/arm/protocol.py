@@ -1,16 +1,19 @@
-"""What a pouring arm can be asked, and what it tells about what it did. Values and a protocol; no driver."""
+"""What a pouring arm can be asked, and what it tells: one small protocol for every arm, and its values. No driver.
+
+A driver is a plain, blocking class; `actors.device` puts it into a thread or a process, `actors.arm.actor` awaits it.
+What it must do is written down once more as tests: `actors.contracts.arm`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.motion import PourMotion
-from sim_engine.sampled_motion import SampledMotion
+from actors.arm.geometry import Pose
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +27,7 @@ class ArmState:
         stopped: `stop` is in force; nothing moves until `release`.
         time: bench time since the motion began [s].
         fraction: of the motion, 0 … 1.
-        phase: 'approach', or the pour's 'tilt', 'hold', 'return'; 'idle'.
+        phase: 'announced', 'approach', the pour's 'tilt', 'hold', 'return', then 'retreat'; 'untilt', 'jog'; 'idle'.
         tilt: of the pourer [rad].
     """
 
@@ -36,61 +39,231 @@ class ArmState:
     tilt: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class ExecutedMotion:
-    """What the arm did, as it read it from its own joints.
+@dataclass(frozen=True)
+class ArmFacts:
+    """Which arm this is, and whether it could move.
 
     Attributes:
-        times: (T,) since the motion's begin [s].
-        poses: (T, 7) of the pourer's frame: x y z [m] qw qx qy qz. An arm knows where its flange is, not how the
-            vessel sits in the fingers: errors of grip are not in it.
-        completed: False if it was stopped on the way.
+        model, serial, version: for people and records; '' where there is no such thing.
+        checksum: of the settings that keep people safe, as the arm tells it; '' if it has none.
+        problem: why it can't move now, in words; '' if it could.
     """
 
-    times: FloatArray
-    poses: FloatArray
-    completed: bool
+    model: str
+    serial: str = ""
+    version: str = ""
+    checksum: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """Where an arm stands, for setting up.
+
+    Attributes:
+        tool: in the base's frame.
+        joints: measured [rad]; empty for an arm that doesn't tell.
+        home: joints where it waits [rad]; empty likewise.
+    """
+
+    tool: Pose
+    joints: tuple[float, ...] = ()
+    home: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class PathReport:
+    """What was found out about a whole pour before the first movement.
+
+    Attributes:
+        joint_speed: fastest joint [rad/s], and `fastest_joint` which one, 0 …; 0 where joints aren't known.
+        tool_speed: fastest point of tool or pourer [m/s].
+        tilt: largest [rad]; tilt_speed: largest [rad/s].
+        singularity: smallest distance from one, as `ArmLimits.singularity`; 1 for an arm that has none.
+        clearance: smallest distance of the pourer from the receiver [m]; 0 where it is only known not to touch.
+        low, high: corners of the box that tool and pourer pass through [m].
+        duration: of approach, pour and retreat together [s].
+        deviation: largest difference between the tilt that was asked for and the path's at the same time [rad]; more
+            than rounding only where a step in speed was asked for, which joints can't make.
+    """
+
+    joint_speed: float
+    fastest_joint: int
+    tool_speed: float
+    tilt: float
+    tilt_speed: float
+    singularity: float
+    clearance: float
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    duration: float
+    deviation: float = 0.0
+
+
+class PlannedPour(Protocol):
+    """A whole pour, planned and checked for one arm: way there, pour, way back."""
 
     @property
-    def motion(self) -> SampledMotion:
-        """As a motion that can be simulated again."""
-        return SampledMotion(self.times, self.poses)
+    def approach_time(self) -> float:
+        """From home to the pour's first pose [s]."""
+        ...
+
+    @property
+    def pour_time(self) -> float:
+        """Tilt, hold, return [s]."""
+        ...
+
+    @property
+    def retreat_time(self) -> float:
+        """Back home [s]."""
+        ...
+
+    @property
+    def phases(self) -> tuple[tuple[str, float, float], ...]:
+        """The pour's parts, 'tilt', 'hold', 'return': name, start, end [s]."""
+        ...
+
+    @property
+    def report(self) -> PathReport:
+        """What was found out about it, for whoever lets it happen."""
+        ...
+
+    def slowed(self, factor: float) -> PlannedPour:
+        """The same way, with all its times divided by a factor in (0, 1]."""
+        ...
 
 
-ArmProgress = Callable[[ArmState], None]
+class Executed(Protocol):
+    """What an arm did, as it read it from its own joints."""
+
+    @property
+    def times(self) -> FloatArray:
+        """Of the readings, shape (T,), increasing from 0 at the pour's begin [s]."""
+        ...
+
+    @property
+    def poses(self) -> FloatArray:
+        """Of the pourer in the world, shape (T, 7): x y z [m] qw qx qy qz.
+
+        An arm knows where its flange is, not how the vessel sits in the fingers: errors of grip are not in it.
+        """
+        ...
+
+    @property
+    def completed(self) -> bool:
+        """False if it was stopped on the way."""
+        ...
+
+    @property
+    def tracking(self) -> Mapping[str, float]:
+        """How well the plan was followed, as far as the arm knows."""
+        ...
+
+    def record(self) -> dict[str, Any]:
+        """For the pour's record, JSON-ready and small: enough to simulate the motion again."""
+        ...
 
 
 class Arm(Protocol):
-    """A robot arm that pours. Motions are never repeated by software: a lost one is lost."""
+    """A robot arm that pours. Motions are never repeated by software: a lost one is lost.
 
-    async def move_to_start(self, motion: PourMotion) -> None:
-        """Bring the upright pourer to the motion's first pose.
+    All methods block, and may be called from several threads: `stop` and `state` at any time, also during a motion.
+    Every method raises `actors.arm.errors.ArmLostError` when the arm can't be reached.
+    """
+
+    def connect(self) -> ArmFacts:
+        """Find the arm, anew if it was found before. Nothing moves, and nothing may until `release`.
 
         Raises:
-            LaboratoryError: the arm is stopped, was stopped on the way, or is lost.
+            ArmRefusedError: it is another arm than the settings say.
+            NotAcceptedError: nobody has accepted the settings that keep people safe.
         """
         ...
 
-    async def execute(self, motion: PourMotion, progress: ArmProgress | None = None) -> ExecutedMotion:
-        """Make a pour's motion, from its first pose on.
+    def facts(self) -> ArmFacts:
+        """The arm as it is now; not during a motion. Raises as `connect`, and ArmLostError before it."""
+        ...
+
+    def hands_in(self) -> None:
+        """Before hands are invited into the cell: see that nothing moves, and that nothing will without `release`.
+
+        Raises:
+            ArmError: that can't be verified. Keep hands out.
+        """
+        ...
+
+    def release(self) -> None:
+        """A person consents to the next cycle: way there, pour, way back; or to one recovery, un-tilting or jog.
+
+        Consent ends with that, with any stop, refusal or loss, and with `hands_in`.
+        """
+        ...
+
+    def move_to_start(self, path: Any) -> None:
+        """From home to where the pour begins, the pourer upright.
 
         Args:
-            motion: as planned.
-            progress: told some ten times a second where the arm is; it can't hold the motion up.
+            path: a `PlannedPour` that this arm's settings have planned; so are all paths below.
 
         Raises:
-            LaboratoryError: the arm is stopped, or was lost on the way.
+            ArmNotReleasedError: nobody has consented.
+            ArmRefusedError: before anything moved; ArmStoppedError: on the way.
         """
         ...
 
-    async def stop(self) -> None:
-        """End any motion now; does not wait for it. Nothing moves until `release`."""
+    def execute(self, path: Any) -> Executed:
+        """Tilt, hold, return; raises as `move_to_start`. A motion that was broken off is an error, not an answer."""
         ...
 
-    async def release(self) -> None:
-        """An operator has seen to the arm: it may move again."""
+    def retreat(self, path: Any) -> None:
+        """Home from the pour's end, or from wherever an upright pourer was stopped; raises as `move_to_start`."""
         ...
 
-    async def state(self) -> ArmState:
+    def untilt(self, path: Any = None) -> None:
+        """Bring a stopped pourer upright, slowly, the way it came; raises as `move_to_start`.
+
+        Args:
+            path: of the pour that was stopped; the last one by default.
+        """
+        ...
+
+    def recover(self) -> str:
+        """After a stop that a person has looked into: make the arm ready, moving nothing. Needs and ends consent.
+
+        Returns:
+            What was done, for people; '' if nothing had to be.
+
+        Raises:
+            ArmRefusedError: something has to be done by hand first.
+        """
+        ...
+
+    def stop(self) -> float:
+        """Stop, now, whatever is going on, and see the arm stand. Nothing moves until `release`.
+
+        Returns:
+            Time from the call to standstill [s]; 0 if nothing was moving.
+        """
+        ...
+
+    def state(self) -> ArmState:
         """Where the arm is now; answered at once, also during a motion."""
+        ...
+
+    def where(self) -> Whereabouts:
+        """Where it stands, for setting up; not during a motion."""
+        ...
+
+    def jog(self, axis: str, amount: float, speed: float) -> None:
+        """One small step, for setting up; raises as `move_to_start`.
+
+        Args:
+            axis: 'joint 1' …, or of the tool in the base's axes: 'x', 'y', 'z', 'rx', 'ry', 'rz'.
+            amount: [rad] or [m].
+            speed: [rad/s] or [m/s].
+        """
+        ...
+
+    def close(self) -> None:
+        """Stop, and let the arm go. May be called again."""
         ...

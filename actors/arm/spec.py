@@ -1,99 +1,110 @@
-"""Settings of a UR arm, of where things stand around it, and what it may do. Plain values.
+"""Settings of arms: plain values that know which driver they are for, and what plans pours for it.
 
-Frames. *Base*: of the robot, as its controller has it. *Flange*: where tools are screwed on. *TCP*: tool centre point,
-as set on the controller. *Pourer*: of the vessel that pours, underside at z = 0, axis along z. *World*: of pours
-(`sim_engine.motion`): origin below the receiver's middle, z up, the liquid goes towards +x.
+Nothing heavy is imported before it is used: settings are read where nothing is started.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-Vector = tuple[float, float, float]
-Joints = tuple[float, float, float, float, float, float]
+from actors.arm.geometry import ArmLimits, Cell, Joints, Mount, Pose, Vector
+from actors.arm.look import ArmLook
+from sim_engine.action import Action
+from sim_engine.marks import FREE
+from sim_engine.task import Scene
+
+if TYPE_CHECKING:
+    from actors.arm.joint_path import PourPath
+    from actors.arm.protocol import PlannedPour
+
 ArmModel = Literal["ur10", "ur10e"]
 
 
-@dataclass(frozen=True)
-class Pose:
-    """Where a frame stands in another.
+class ArmSpec(ABC):
+    """Settings of one arm: frozen values that travel to where the bench is.
 
     Attributes:
-        x, y, z: [m].
-        rx, ry, rz: rotation vector [rad], as the teach pendant shows it.
+        kind: as registered in `decant.arms`, and as written in files.
+        stand_in: 'module:callable' that makes of these settings what stands in for the arm on a virtual bench, see
+            `actors.bench.stand_ins.StandIn`; '' for a driver that moves nothing but numbers itself.
+        time_scale: bench seconds per second of the clock; 1 for anything real, 0 waits for nothing.
+        announcement: from a person's consent to the first movement [s].
+        untilt_speed: at which a stopped, tilted pourer is brought upright [rad/s].
     """
 
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-    rx: float = 0.0
-    ry: float = 0.0
-    rz: float = 0.0
+    kind: ClassVar[str]
+    stand_in: ClassVar[str] = ""
+    time_scale: float
+    announcement: float
+    untilt_speed: float = math.radians(10.0)
+
+    @abstractmethod
+    def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
+        """The class of the driver (an `actors.arm.protocol.Arm`), importable by name, and its arguments.
+
+        Args:
+            accepted: checksum of the safety settings of hardware that people have accepted, '' if nobody has; None
+                where nothing is hardware.
+        """
+
+    @abstractmethod
+    def plan(self, scene: Scene, action: Action) -> PlannedPour:
+        """Check a whole pour and plan it.
+
+        Raises:
+            InvalidActionError: it can't be made; with everything that is wrong with it.
+        """
+
+    def paced(self, time_scale: float) -> ArmSpec:
+        """The same arm in a virtual bench's time."""
+        from dataclasses import replace
+
+        return replace(self, time_scale=time_scale)  # type: ignore[type-var]
+
+    def announced(self, announcement: float) -> ArmSpec:
+        """The same arm, which waits for so long between consent and movement [s]."""
+        from dataclasses import replace
+
+        return replace(self, announcement=announcement)  # type: ignore[type-var]
 
     @property
-    def as_list(self) -> list[float]:
-        """x y z rx ry rz, as the controller takes it."""
-        return [self.x, self.y, self.z, self.rx, self.ry, self.rz]
+    def untilt_time(self) -> float:
+        """Longest time that bringing a stopped pourer upright may take [s]."""
+        return 4.0 * math.radians(140.0) / self.untilt_speed
+
+    def on_clock(self, seconds: float) -> float:
+        """Bench time on the clock [s]; none where nothing is waited for."""
+        return seconds / self.time_scale if self.time_scale > 0.0 else 0.0
+
+    def missing(self) -> str | None:
+        """What its driver needs that isn't installed, in words; None if nothing is missing."""
+        return None
+
+    @property
+    def title(self) -> str:
+        """Who it is, for people."""
+        return self.kind
+
+    @property
+    def payload_limit(self) -> float | None:
+        """What it is set up to carry [kg]; None where nobody said."""
+        return None
+
+    @property
+    def tilt_speed_limit(self) -> float | None:
+        """How fast it may turn the pourer [rad/s]; None where nobody said."""
+        return None
+
+    def look(self) -> ArmLook:
+        """Ask the arm everything that `decant doctor` tells of; nothing moves, nothing is set."""
+        return ArmLook()
 
 
 @dataclass(frozen=True)
-class Plane:
-    """A half-space that the arm has to stay in: normal · point ≥ offset, in the base's frame.
-
-    Attributes:
-        normal: towards the allowed side, of length 1.
-        offset: [m].
-    """
-
-    normal: Vector
-    offset: float
-
-
-@dataclass(frozen=True)
-class ArmLimits:
-    """What the arm may do here. Hard: checked before a pour is planned, and again by what moves the arm.
-
-    Attributes:
-        box_low, box_high: corners of the box, in the base's frame, that tool and pourer stay in [m].
-        planes: half-spaces for the same.
-        joint_speed: of any joint [rad/s].
-        tool_speed: of the TCP, and of any point of the pourer [m/s].
-        tilt: largest tilt of the pourer [rad].
-        tilt_speed: largest angular velocity of the pourer [rad/s].
-        singularity: smallest |sin| of wrist and elbow, and shoulder's distance from its axis over its reach.
-        clearance: between the pourer and whatever it must not touch [m].
-    """
-
-    box_low: Vector
-    box_high: Vector
-    planes: tuple[Plane, ...] = ()
-    joint_speed: float = math.radians(150.0)
-    tool_speed: float = 1.0
-    tilt: float = math.radians(140.0)
-    tilt_speed: float = math.radians(130.0)
-    singularity: float = 0.1
-    clearance: float = 5e-3
-
-
-@dataclass(frozen=True)
-class Cell:
-    """What stands where around the arm.
-
-    Attributes:
-        receiver: where the receiver's underside stands, middle, in the base's frame [m].
-        direction: that the liquid is poured in, seen from above: 0 along the base's x, turning towards y [rad].
-        table: height of the surface that nothing may go below, in the base's frame [m].
-    """
-
-    receiver: Vector
-    direction: float = 0.0
-    table: float = 0.0
-
-
-@dataclass(frozen=True)
-class UrArmSpec:
+class UrArmSpec(ArmSpec):
     """A UR arm that holds the pourer.
 
     Attributes:
@@ -102,6 +113,7 @@ class UrArmSpec:
         cell: what stands where.
         home: joints where it waits, out of people's way, the pourer upright [rad].
         address: of the controller; '' for a virtual one, which is started and has its address filled in.
+        mount: how the robot is screwed down.
         tool: TCP in the flange's frame.
         payload: of gripper and filled pourer [kg].
         payload_centre: in the flange's frame [m].
@@ -118,7 +130,8 @@ class UrArmSpec:
     limits: ArmLimits
     cell: Cell
     home: Joints
-    address: str = ""
+    address: Annotated[str, FREE] = ""
+    mount: Mount = field(default_factory=Mount)
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0
     payload_centre: Vector = (0.0, 0.0, 0.0)
@@ -129,3 +142,52 @@ class UrArmSpec:
     announcement: float = 3.0
     rate: float = 125.0
     time_scale: float = 1.0
+
+    kind: ClassVar[str] = "ur"
+    stand_in: ClassVar[str] = "actors.virtual_ur.stand_in:UrStandIn"
+
+    def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `ArmSpec.driver`."""
+        from actors.arm.ur.accepted import AcceptedArm
+        from actors.arm.ur.driver import UrArm
+
+        return (UrArm, (self,)) if accepted is None else (AcceptedArm, (self, accepted))
+
+    def plan(self, scene: Scene, action: Action) -> PourPath:
+        """See `ArmSpec.plan`."""
+        from actors.arm.path.plan import plan_path
+        from actors.bench.planning import plan_pour, vessel
+
+        return plan_path(plan_pour(scene, action), self, vessel(scene.pourer), vessel(scene.receiver))
+
+    def missing(self) -> str | None:
+        """See `ArmSpec.missing`."""
+        from actors.arm.ur.client import client_missing
+
+        return client_missing()
+
+    @property
+    def title(self) -> str:
+        """See `ArmSpec.title`."""
+        return f"{self.model.upper()} at {self.address}"
+
+    @property
+    def payload_limit(self) -> float | None:
+        """See `ArmSpec.payload_limit`."""
+        return self.payload
+
+    @property
+    def tilt_speed_limit(self) -> float:
+        """See `ArmSpec.tilt_speed_limit`."""
+        return self.limits.tilt_speed
+
+    @property
+    def untilt_time(self) -> float:
+        """See `ArmSpec`."""
+        return 4.0 * self.limits.tilt / self.untilt_speed
+
+    def look(self) -> ArmLook:
+        """See `ArmSpec.look`."""
+        from actors.arm.ur.judge import UrLook
+
+        return UrLook.at(self)

@@ -36,6 +36,9 @@ class Placement(StrEnum):
     EVERYTHING = "everything"
     """Under tray and receiver together: it reads what was poured."""
 
+    TARED = "tared"
+    """Of the bench of numbers: vessels are tared away, so that each weighing is liquid alone."""
+
     MANUAL = "manual"
     """Anywhere, and not connected: the operator weighs and types."""
 
@@ -159,6 +162,18 @@ _PLANS: dict[Placement, _Plan] = {
             "retained": {"pourer_full": 1.0, "pourer_empty": -1.0, "poured": -1.0},
         },
     ),
+    Placement.TARED: _Plan(
+        (
+            _tare("dry_pourer", "Put a dry pourer on the balance, alone; it counts as nothing.", "before"),
+            Step("weigh", "Put the filled pourer on the balance in its place.", "before", "pourer_full"),
+            _tare("set_up", _GRIP + "Put the wiped tray on the balance, the receiver on its stand.", "before"),
+            _POUR,
+            Step("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled", hands=False),
+            _tare("dry_pourer_after", "Put a dry pourer on the balance, alone; it counts as nothing.", "after"),
+            Step("weigh", "Put the pourer on the balance in its place.", "after", "pourer_after"),
+        ),
+        {"loaded": {"pourer_full": 1.0}, "spilled": {"spilled": 1.0}, "retained": {"pourer_after": 1.0}},
+    ),
     Placement.MANUAL: _Plan(
         (
             Step("weigh", "Weigh the empty, dry pourer.", "once", "pourer_empty", "operator"),
@@ -193,6 +208,11 @@ def weighings(
 def needed(placement: Placement) -> tuple[str, ...]:
     """Keys of all weighings that a measurement is made of."""
     return tuple(step.key for step in _PLANS[placement].steps if step.key)
+
+
+def loaded_mass(placement: Placement, weighed: Mapping[str, Weighed]) -> float:
+    """What was filled in [kg], by the weighings before the pour."""
+    return sum(c * weighed[key].mass for key, c in _PLANS[placement].masses["loaded"].items())
 
 
 def measurement(

@@ -101,8 +101,22 @@ class VirtualBalance:
             self._advance(seconds / steps)
 
     def interrupt(self) -> None:
-        """End the wait that is under way, until the next `prepare`."""
+        """End the wait that is under way, until the next `prepare` or `resume`."""
         self._pace.interrupt()
+
+    def resume(self) -> None:
+        """Let waits last again after `interrupt`."""
+        self._pace.resume()
+
+    def close(self) -> None:
+        """Nothing has to be let go of."""
+
+    def connect(self) -> str:
+        """See `BalanceDriver.connect`."""
+        return f"{self._name}: a balance of numbers, step {1e3 * self._settings.resolution:g} g"
+
+    def keep_reference(self) -> None:
+        """Its connection can't be lost."""
 
     def tare(self) -> None:
         """See `Balance.tare`."""
@@ -113,7 +127,7 @@ class VirtualBalance:
     def weigh(self) -> Weight:
         """See `Balance.weigh`."""
         mass = self._stable()
-        return Weight(mass, True, self._time)
+        return Weight(mass, True, self._time, step=self._settings.resolution)
 
     def read(self) -> Weight:
         """See `Balance.read`. Draws its noise from a stream of its own, so that watching changes no measurement."""

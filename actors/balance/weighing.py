@@ -13,7 +13,7 @@ from actors.balance.errors import (
     ReferenceLostError,
     UnitError,
 )
-from actors.balance.placement import Step, Weighed, measurement, weighing_uncertainty, weighings
+from actors.balance.placement import Step, Weighed, loaded_mass, measurement, weighing_uncertainty, weighings
 from actors.balance.spec import BalanceSpec
 from actors.balance.typed import typed_weight
 from actors.operator import Question
@@ -144,7 +144,7 @@ class Weighings:
         """What is wrong with the load that was just weighed; '' if nothing is."""
         if step.key != "pourer_full" or self._nominal is None:
             return ""
-        loaded = self.weighed["pourer_full"].mass - self.weighed["pourer_empty"].mass
+        loaded = loaded_mass(self._spec.placement, self.weighed)
         if abs(loaded - self._nominal) <= self._spec.load_tolerance:
             return ""
         allowed = f"{1e3 * self._nominal:g} ± {1e3 * self._spec.load_tolerance:g} g"
@@ -183,7 +183,7 @@ class Weighings:
 
     @property
     def _repeatability(self) -> float:
-        return 0.0 if self._spec.serial is None else self._spec.serial.repeatability
+        return self._spec.repeatability
 
 
 def _is_yes(answer: str) -> bool:

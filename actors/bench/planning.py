@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 
-from actors.arm.joint_path import PourPath
-from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from sim_engine.action import Action
 from sim_engine.motion import PourMotion, plan_motion
@@ -18,7 +15,7 @@ from sim_engine.vessel.vessel import Vessel, check_holds
 
 
 @functools.lru_cache(maxsize=16)
-def _vessel(spec: VesselSpec) -> Vessel:
+def vessel(spec: VesselSpec) -> Vessel:
     """Built once: a mesh's distance grid takes seconds."""
     return build_vessel(spec)
 
@@ -34,29 +31,10 @@ def plan_pour(scene: Scene, action: Action) -> PourMotion:
         InvalidActionError: the vessels would touch, the pourer can't hold the load, or the motion can't be made.
     """
     try:
-        pourer, receiver = _vessel(scene.pourer), _vessel(scene.receiver)
+        pourer, receiver = vessel(scene.pourer), vessel(scene.receiver)
         check_holds(pourer, scene.liquid.volume)
         motion = plan_motion(scene, action, pourer, receiver)
         check_motion(motion, scene, action, pourer, receiver, PoseError())
     except (ValueError, OSError) as error:
         raise InvalidActionError(str(error)) from error
     return motion
-
-
-def planner(spec: UrArmSpec) -> Callable[[Scene, Action], PourPath]:
-    """What plans whole pours for an arm.
-
-    Args:
-        spec: of the arm and its cell.
-
-    Returns:
-        A function of scene and action; it raises `InvalidActionError` with everything that is wrong with the pour.
-    """
-
-    def plan(scene: Scene, action: Action) -> PourPath:
-        from actors.arm.path.plan import plan_path
-
-        motion = plan_pour(scene, action)
-        return plan_path(motion, spec, _vessel(scene.pourer), _vessel(scene.receiver))
-
-    return plan

@@ -28,8 +28,8 @@ class Things:
 
     def mass(self, name: str) -> float:
         """Of a thing with what is in it [kg]."""
-        dry = {"pourer": POURER, "receiver": RECEIVER, "tray": TRAY}[name]
-        return dry + {"pourer": self.in_pourer, "receiver": self.in_receiver, "tray": self.on_tray}[name]
+        dry = {"dry pourer": POURER, "pourer": POURER, "receiver": RECEIVER, "tray": TRAY}[name]
+        return dry + {"pourer": self.in_pourer, "receiver": self.in_receiver, "tray": self.on_tray}.get(name, 0.0)
 
     @property
     def carried(self) -> float:
@@ -55,9 +55,12 @@ class Things:
             fill: what the pourer is filled with, if it is to be filled [kg].
         """
         under = {"tray"} if self.placement in (Placement.TRAY, Placement.EVERYTHING) else set()
+        alone = self.placement in (Placement.TRAY, Placement.TARED)
         match about:
             case "tray_wiped":
                 self.on_tray, self.on_balance = 0.0, under
+            case "dry_pourer" | "dry_pourer_after":
+                self.on_balance = {"dry pourer"}
             case "cleared" | "cleared_after":
                 self.on_balance = set()
             case "pourer_empty":
@@ -68,7 +71,7 @@ class Things:
                 self.in_receiver, self.on_balance = 0.0, under | {"receiver"}
             case "set_up":
                 self.in_receiver, self.on_tray = 0.0, 0.0
-                self.on_balance = under if self.placement is Placement.TRAY else under | {"receiver"}
+                self.on_balance = {"tray"} if alone else under | {"receiver"}
             case "tray_before":
                 self.in_receiver, self.on_tray = 0.0, 0.0
             case "receiver_gone":

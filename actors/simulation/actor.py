@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.cluster.versions import Versions, versions
-from actors.protocols import SimulationResult
 from actors.simulation.parcel import MeshParcel, unpack
 from actors.simulation.worker import SimulationWorker, Simulator
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 NICENESS = 15
@@ -41,7 +41,7 @@ class Greeting:
 class Answer:
     """A result, and how long the process worked for it [s]."""
 
-    result: SimulationResult
+    result: SimulatedPour
     seconds: float
 
 

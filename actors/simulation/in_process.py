@@ -7,9 +7,10 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-from actors.protocols import SimulationError, SimulationResult
+from actors.protocols import SimulationError
 from actors.simulation.statistics import Account, PoolStatistics
 from actors.simulation.worker import SimulationWorker, Simulator, pour_simulator
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 
@@ -38,7 +39,7 @@ class InProcessSimulatorPool:
         """What the pool has done so far."""
         return self._account.statistics()
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         """See `SimulatorPool.simulate`."""
         if self._closed:
             raise SimulationError("the pool of simulators is closed")
@@ -56,7 +57,7 @@ class InProcessSimulatorPool:
         self._account.jobs += 1
         return result
 
-    def _run(self, task: PourTask, given_up: threading.Event) -> SimulationResult:
+    def _run(self, task: PourTask, given_up: threading.Event) -> SimulatedPour:
         self._account.begin(0)
         try:
             return self._worker.simulate(task, given_up.is_set)

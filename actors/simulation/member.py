@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from actors.protocols import SimulationResult
 from actors.simulation.actor import Greeting
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 
@@ -26,7 +26,7 @@ class Job:
 
     task: PourTask
     meshes: Sequence[Any]
-    future: asyncio.Future[SimulationResult]
+    future: asyncio.Future[SimulatedPour]
     deaths: int = 0
 
     def fail(self, error: Exception) -> None:

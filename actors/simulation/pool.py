@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from actors.cluster.versions import Versions
-from actors.protocols import InvalidActionError, LaboratoryError, SimulationError, SimulationResult
+from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.actor import CONTROL, Answer, simulator_actor
 from actors.simulation.crew import Crew
 from actors.simulation.member import Job, Member, Sent
 from actors.simulation.parcel import Packer
-from actors.simulation.results import own
 from actors.simulation.statistics import Account, PoolStatistics
 from actors.simulation.worker import Simulator, pour_simulator
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 RETRIES = 2
@@ -101,7 +101,7 @@ class RaySimulatorPool:
         """Process ids of the members; waits for those that are starting."""
         return [greeting.pid for greeting in await self._crew.greeted()]
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         """See `SimulatorPool.simulate`.
 
         Raises:
@@ -298,7 +298,7 @@ def _settle(job: Job, answer: asyncio.Future[Answer]) -> None:
     error = answer.exception()
     if error is None:
         if not job.future.done():
-            job.future.set_result(own(answer.result().result))
+            job.future.set_result(answer.result().result.copied())
     elif isinstance(error, ray.exceptions.RayTaskError):
         known = isinstance(error.cause, InvalidActionError | SimulationError)
         job.fail(error.cause if known else SimulationError(f"the simulator failed: {error.cause!r}"))

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
-import numpy as np
-
-from actors.protocols import Frames, InvalidActionError, SimulationError, SimulationResult
+from actors.protocols import InvalidActionError, SimulationError
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 LONG_FIRST_JOB = 5.0
@@ -24,8 +23,8 @@ class JobCancelledError(Exception):
 class Simulator(Protocol):
     """What a worker needs of the engine; `sim_engine.pour.PourSimulator` is one."""
 
-    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> Any:
-        """Run one pour; the answer has an `outcome` and `frames` (or None)."""
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
+        """Run one pour."""
         ...
 
     def close(self) -> None:
@@ -60,7 +59,7 @@ class SimulationWorker:
         self._long_first_job = long_first_job
         self._is_first = True
 
-    def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulationResult:
+    def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulatedPour:
         """Run one pour.
 
         Args:
@@ -85,25 +84,13 @@ class SimulationWorker:
             raise JobCancelledError from None
         except Exception as error:
             raise SimulationError(f"the simulator failed: {type(error).__name__}: {error}") from error
-        result = SimulationResult(run.outcome, _frames(run.frames))
         if self._is_first and time.process_time() - begun > self._long_first_job:
             self.close()
         self._is_first = False
-        return result
+        return run
 
     def close(self) -> None:
         """End the simulator, if there is one."""
         simulator, self._simulator = self._simulator, None
         if simulator is not None:
             simulator.close()
-
-
-def _frames(recorded: Any) -> Frames | None:
-    if recorded is None:
-        return None
-    return Frames(
-        times=np.asarray(recorded.times),
-        positions=[np.asarray(p, dtype=np.float32) for p in recorded.positions],
-        states=[np.asarray(s, dtype=np.uint8) for s in recorded.states],
-        pourer_poses=np.asarray(recorded.pourer_poses),
-    )

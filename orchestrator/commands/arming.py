@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from actors.arm.joint_path import PathReport
-from actors.arm.spec import UrArmSpec
+from actors.arm.protocol import PathReport
+from actors.arm.spec import ArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
 from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
@@ -73,15 +73,12 @@ class Envelope:
         )
 
 
-def envelope(arm: UrArmSpec, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
+def envelope(arm: ArmSpec, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
     """Plan paths, and see what they keep within."""
-    from actors.bench.planning import planner
-
-    plan = planner(arm)
     reports, refused = [], []
     for scene, action in pours:
         try:
-            reports.append(plan(scene, action).report)
+            reports.append(arm.plan(scene, action).report)
         except (InvalidActionError, ValueError) as error:
             refused.append(f"{action.display()}: {error}")
     return Envelope(tuple(reports), tuple(refused))
@@ -111,16 +108,21 @@ def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) 
 
 def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
     """How many pours the stages may ask for."""
+    from orchestrator.stages import CONFIRMATION
+
     calibrating, deploying = _pouring(stages)
     count = plan.calibration.pour_count if plan.calibration is not None and calibrating else 0
-    return count + (plan.deployment.pours * deploying if plan.deployment is not None else 0)
+    if plan.deployment is None:
+        return count
+    confirming = sum(stage.name.startswith(CONFIRMATION) for stage in stages)
+    return count + plan.deployment.pours * deploying + plan.deployment.confirm * confirming
 
 
 def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
     """Whether the calibration's pours are among the stages, and how many deployments that pour."""
-    from orchestrator.stages import DEPLOYMENT
+    from orchestrator.stages import CONFIRMATION, DEPLOYMENT
 
-    names = [stage.name for stage in stages if stage.pours]
+    names = [stage.name for stage in stages if stage.pours and not stage.name.startswith(CONFIRMATION)]
     deploying = sum(name.startswith(DEPLOYMENT) for name in names)
     return deploying < len(names), deploying
 
@@ -214,9 +216,15 @@ def report_lines(report: PathReport) -> list[str]:
     return [
         "box            " + ", ".join(f"{n} {a} … {b} mm" for n, a, b in zip("xyz", low, high, strict=True)),
         f"tool, pourer   up to {1e3 * report.tool_speed:.0f} mm/s",
-        f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s ({JOINT_NAMES[report.fastest_joint]})",
+        *(
+            [f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s ({JOINT_NAMES[report.fastest_joint]})"]
+            if report.joint_speed > 0.0
+            else []
+        ),
         f"tilt           up to {turned:.0f} deg, at up to {turning:.0f} deg/s",
-        f"clearance      at least {1e3 * report.clearance:.0f} mm between pourer and receiver",
+        f"clearance      at least {1e3 * report.clearance:.0f} mm between pourer and receiver"
+        if report.clearance > 0.0
+        else "clearance      pourer and receiver don't touch",
         f"one pour       up to {report.duration:.1f} s in motion",
     ]
 
@@ -228,14 +236,13 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
         RefusalError: nobody is at the terminal, or something else was typed (exit code 2).
     """
     assert laboratory.arm is not None
-    arm = laboratory.arm
     if not sys.stdin.isatty():
         raise RefusalError(
             f"laboratory {laboratory.name} is hardware, and is armed by somebody who reads what it will do and types "
             "its name: that needs a terminal, with nothing piped into it",
             BAD_INPUT,
         )
-    say(f"\nHARDWARE: laboratory {laboratory.name}, {arm.model.upper()} at {arm.address}. This will move:\n")
+    say(f"\nHARDWARE: laboratory {laboratory.name}, {laboratory.arm.title}. This will move:\n")
     for line in lines:
         say(f"  {line}")
     say(

@@ -8,12 +8,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.commands.doctor_arm import judge
+from actors.arm.look import ArmLook, SafetyRecord
+from actors.checks import Check
 from orchestrator.commands.doctor_balance import look_at_balance
-from orchestrator.commands.doctor_look import Check, Findings, look_at
 from orchestrator.commands.hands_on import reached
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
-from orchestrator.safety import SafetyRecord, SafetyRecordError, read_record, record_path, write_record
+from orchestrator.plugins import broken
+from orchestrator.safety import SafetyRecordError, read_record, record_path, write_record
 
 if TYPE_CHECKING:
     from actors.spec import LaboratorySpec
@@ -55,11 +56,12 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
         record = None
     with reached(spec) as ready:
         assert ready.arm is not None
-        found = look_at(ready.arm.address)
+        look = ready.arm.look()
         if accept_safety and not virtual:
-            record = _accept(path, found)
-        checks = judge(ready.arm, found, record, accept=f"decant doctor {path} --accept-safety", virtual=virtual)
+            record = _accept(path, look)
+        checks = look.checks(record, accept=f"decant doctor {path} --accept-safety", virtual=virtual)
         checks += look_at_balance(ready.balance, tare=tare)
+    checks += [Check("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
     failed = [check for check in checks if check.state == "fail"]
     if as_json:
         table = [dataclasses.asdict(check) for check in checks]
@@ -103,23 +105,23 @@ def print_table(checks: list[Check]) -> None:
     (console if console.is_terminal else Console(highlight=False, width=1000)).print(table)
 
 
-def _accept(path: Path, found: Findings) -> SafetyRecord:
+def _accept(path: Path, look: ArmLook) -> SafetyRecord:
     """Write down the safety settings as they are now.
 
     Raises:
         RefusalError: the controller doesn't tell them, or the record can't be written.
     """
-    if found.state is None or not found.state.checksum or not found.serial:
+    if not look.checksum or not look.serial:
         raise RefusalError(
             "the controller doesn't tell its safety checksum and serial number, so nothing can be accepted; run "
             f"'decant doctor {path}' without --accept-safety to see why",
             FAILED,
         )
     record = SafetyRecord(
-        checksum=found.state.checksum,
-        serial=found.serial,
-        model=found.model,
-        software=".".join(str(part) for part in found.software[:3]),
+        checksum=look.checksum,
+        serial=look.serial,
+        model=look.model,
+        software=look.software,
         date=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         accepted_by=getpass.getuser(),
     )

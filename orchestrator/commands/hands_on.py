@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import socket
 import sys
 import termios
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from actors.arm.checksum import ChecksumError
+from actors.arm.errors import NotAcceptedError
 from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
 from orchestrator.safety import SafetyRecordError, read_record
 
 if TYPE_CHECKING:
-    from actors.arm.spec import UrArmSpec
-    from actors.arm.ur.driver import UrArm
-    from actors.arm.ur.facts import ArmFacts
+    from actors.arm.protocol import Arm, ArmFacts
     from actors.spec import LaboratorySpec
 
 T = TypeVar("T")
@@ -32,37 +28,23 @@ def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
     if spec.mode == "hardware":
         yield spec
         return
-    from actors.bench.site import VirtualSite
+    from actors.bench.stand_ins import StandIns
 
     assert spec.arm is not None
-    site = VirtualSite(spec.arm, spec.balance)
+    stand_ins = StandIns(spec.arm, None if spec.balance is None else spec.balance.device)
     try:
-        where = site.addresses()
-        arm = dataclasses.replace(spec.arm, address=where.controller)
-        _install(arm)
+        where = stand_ins.found()
+        stand_ins.install()
         balance = spec.balance
-        if balance is not None and balance.serial is not None:
-            serial = dataclasses.replace(balance.serial, port=where.port)
-            balance = dataclasses.replace(balance, serial=serial)
-        yield dataclasses.replace(spec, arm=arm, balance=balance)
+        if balance is not None:
+            balance = dataclasses.replace(balance, device=where.balance)
+        yield dataclasses.replace(spec, arm=where.arm, balance=balance)
     finally:
-        site.close()
-
-
-def _install(arm: UrArmSpec) -> None:
-    """On a real controller somebody has set TCP and payload in the installation; on a fresh virtual one nobody has."""
-    from actors.arm.survey import SCRIPTS
-
-    tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
-    centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
-    program = f"def install():\n  set_tcp(p[{tool}])\n  set_payload({arm.payload!r}, [{centre}])\nend\n"
-    with socket.create_connection((arm.address, SCRIPTS), timeout=5.0) as connection:
-        connection.sendall(program.encode("ascii"))
-        time.sleep(0.3)
+        stand_ins.close()
 
 
 @contextlib.contextmanager
-def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[UrArm, ArmFacts]]:
+def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
     """The arm's driver, connected and locked; it is stopped and let go of in any case.
 
     Args:
@@ -73,21 +55,16 @@ def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[UrAr
         RefusalError: the arm isn't ready, or its safety settings are others.
         LaboratoryError: it can't be reached.
     """
-    from actors.arm.accepted import AcceptedArm
-    from actors.arm.ur.driver import UrArm
-
     assert spec.arm is not None
-    arm = AcceptedArm(spec.arm, accepted or "") if spec.mode == "hardware" else UrArm(spec.arm)
+    cls, arguments = spec.arm.driver((accepted or "") if spec.mode == "hardware" else None)
+    arm: Arm = cls(*arguments)
     try:
         try:
             facts = arm.connect()
-        except ChecksumError as error:
+        except NotAcceptedError as error:
             raise RefusalError(str(error), BAD_INPUT) from None
-        if facts.robot_mode != "running" or facts.safety_mode not in ("normal", "reduced"):
-            raise RefusalError(
-                f"arm at {spec.arm.address}: {facts.robot_mode}, safety {facts.safety_mode}; 'decant doctor' says what "
-                "to do about it"
-            )
+        if facts.problem:
+            raise RefusalError(f"{spec.arm.title}: {facts.problem}; 'decant doctor' says what to do about it")
         yield arm, facts
     finally:
         arm.close()
@@ -106,7 +83,7 @@ def accepted_for(path: Path) -> str | None:
     return None if record is None else record.checksum
 
 
-def stoppable(arm: UrArm, motion: Callable[[], T]) -> T:
+def stoppable(arm: Arm, motion: Callable[[], T]) -> T:
     """Do something that moves the arm; Ctrl-C stops it, and the error that the stop causes is raised.
 
     The motion runs in a thread: an interrupt must reach the arm as an order to stop, not tear the driver apart.

@@ -10,9 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from actors.arm.spec import UrArmSpec
 from actors.protocols import LaboratoryError
 from orchestrator.commands.arming import confirm, require_flag
 from orchestrator.commands.doctor import read_laboratory
@@ -20,7 +17,7 @@ from orchestrator.commands.hands_on import accepted_for, connected, reached, sto
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, say
 
 if TYPE_CHECKING:
-    from actors.arm.ur.driver import UrArm
+    from actors.arm.protocol import Arm
 
 FARTHEST = {"deg": 10.0, "mm": 50.0}
 SPEEDS = {"deg": 5.0, "mm": 20.0}
@@ -101,15 +98,12 @@ class Jogging:
 
     Args:
         arm: connected.
-        spec: of the arm.
         read: the next line typed, after a prompt; raises EOFError.
         tell: a line for people.
     """
 
-    def __init__(
-        self, arm: UrArm, spec: UrArmSpec, read: Callable[[str], str], tell: Callable[[str], None] = say
-    ) -> None:
-        self._arm, self._spec, self._read, self._tell = arm, spec, read, tell
+    def __init__(self, arm: Arm, read: Callable[[str], str], tell: Callable[[str], None] = say) -> None:
+        self._arm, self._read, self._tell = arm, read, tell
         self._known: set[tuple[str, bool]] = set()
 
     def run(self) -> None:
@@ -146,13 +140,13 @@ class Jogging:
 
     def where(self) -> None:
         """Joints and tool."""
-        joints = self._arm.joints()
-        tool, turned = tool_pose(joints, self._spec)
-        self._tell(
-            "joints  " + "  ".join(f"{i}: {math.degrees(q):7.2f}" for i, q in enumerate(joints, start=1)) + " deg"
-        )
-        place = "  ".join(f"{name} {1e3 * value:7.1f}" for name, value in zip("xyz", tool, strict=True))
-        turn = "  ".join(f"r{name} {value:6.3f}" for name, value in zip("xyz", turned, strict=True))
+        here = self._arm.where()
+        if here.joints:
+            joints = "  ".join(f"{i}: {math.degrees(q):7.2f}" for i, q in enumerate(here.joints, start=1))
+            self._tell(f"joints  {joints} deg")
+        numbers = here.tool.as_list
+        place = "  ".join(f"{name} {1e3 * value:7.1f}" for name, value in zip("xyz", numbers[:3], strict=True))
+        turn = "  ".join(f"r{name} {value:6.3f}" for name, value in zip("xyz", numbers[3:], strict=True))
         self._tell(f"tool    {place} mm   {turn} rad")
 
     def step(self, step: Step) -> None:
@@ -172,7 +166,10 @@ class Jogging:
         Raises:
             JogError: too far for that.
         """
-        steps = steps_home(self._arm.joints(), self._spec.home)
+        here = self._arm.where()
+        if len(here.home) != len(here.joints) or not here.home:
+            raise JogError("this arm doesn't tell its joints, or where home is; bring it home by steps")
+        steps = steps_home(here.joints, here.home)
         if not steps:
             self._tell("at home")
             return
@@ -192,20 +189,6 @@ class Jogging:
         amount, speed = step.si
         self._arm.release()
         stoppable(self._arm, lambda: self._arm.jog(step.axis, amount, speed))
-
-
-def tool_pose(joints: tuple[float, ...], spec: UrArmSpec) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Where the TCP is in the base's frame: position [m] and rotation vector [rad]."""
-    from scipy.spatial.transform import Rotation
-
-    from actors.arm.path.frames import cell_frames
-    from actors.arm.path.kinematics import MODELS, forward
-
-    rotation, position = forward(np.array([joints]), MODELS[spec.model])
-    tool = cell_frames(spec).tool
-    place = position[0] + rotation[0] @ tool.position
-    turned = Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec()
-    return tuple(map(float, place)), tuple(map(float, turned))
 
 
 def jog(path: Path, *, armed: bool) -> None:
@@ -232,9 +215,8 @@ def jog(path: Path, *, armed: bool) -> None:
     try:
         with reached(spec) as ready:
             assert ready.arm is not None
-            arm_spec = replace(ready.arm, announcement=ANNOUNCEMENT)
-            with connected(replace(ready, arm=arm_spec), accepted) as (arm, facts):
+            with connected(replace(ready, arm=ready.arm.announced(ANNOUNCEMENT)), accepted) as (arm, facts):
                 say(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed")
-                Jogging(arm, arm_spec, typed_line).run()
+                Jogging(arm, typed_line).run()
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None

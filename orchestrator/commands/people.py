@@ -26,7 +26,7 @@ def person_at_the_terminal(
         spec: of the laboratory.
         paused: entered while a question is open.
     """
-    from actors.bench.open_wired import needs_person
+    from actors.bench.opening import needs_person
     from orchestrator.terminal_operator import TerminalOperator
 
     if not needs_person(spec) or spec.arm is None:
@@ -40,7 +40,7 @@ def check_somebody_is_there(spec: LaboratorySpec) -> None:
     Raises:
         RefusalError: there is none (exit code 2).
     """
-    from actors.bench.open_wired import needs_person
+    from actors.bench.opening import needs_person
     from orchestrator.terminal_operator import somebody_at_the_terminal
 
     if needs_person(spec) and not somebody_at_the_terminal():

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from actors.arm.joint_path import JointPath, PathReport, PourPath
+from actors.arm.protocol import PathReport, PlannedPour
 from orchestrator.commands.arming import accepted, confirm, report_lines, require_flag
 from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.single import scene_to_simulate
@@ -36,7 +36,7 @@ class Chosen:
     plan: CampaignPlan
     scene: Scene
     action: Action
-    path: PourPath | None
+    path: PlannedPour | None
 
 
 def pour(
@@ -91,7 +91,7 @@ def pour(
         from orchestrator.commands.pour_empty import pour_empty
 
         assert chosen.path is not None
-        pour_empty(chosen.plan, chosen.action, slowed(chosen.path, slow), slow=slow, as_json=as_json)
+        pour_empty(chosen.plan, chosen.action, chosen.path.slowed(slow), slow=slow, as_json=as_json)
         return
     _pour(chosen, in_process=in_process, again=f"Another pour: decant pour {path} …", as_json=as_json)
 
@@ -117,7 +117,6 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
     from actors.protocols import InvalidActionError
     from orchestrator.config.campaign.assignments import assigned_action
     from orchestrator.config.campaign.check import check_vessels
-    from orchestrator.config.yaml.errors import shown_path
 
     plan = read_campaign(path)
     scene, space = scene_to_simulate(plan, scene_name)
@@ -125,45 +124,18 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
     except ValueError as error:
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
-    problems = check_vessels(scene)
+    problems = check_vessels(scene, plan.source)
     if problems:
-        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
     planned = None
     if plan.laboratory.arm is not None:
-        from actors.bench.planning import planner
-
         try:
-            planned = planner(plan.laboratory.arm)(scene, action)
+            planned = plan.laboratory.arm.plan(scene, action)
         except (InvalidActionError, ValueError) as error:
             raise RefusalError(f"{action.display()}: {error}", BAD_INPUT) from None
     return Chosen(plan, scene, action, planned)
-
-
-def slowed(path: PourPath, factor: float) -> PourPath:
-    """The same way, with all its times divided by a factor in (0, 1]."""
-    if factor == 1.0:
-        return path
-
-    def slow(part: JointPath) -> JointPath:
-        return JointPath(part.times / factor, part.joints)
-
-    r = path.report
-    return PourPath(
-        slow(path.approach),
-        slow(path.pour),
-        slow(path.retreat),
-        path.tilts,
-        tuple((name, start / factor, end / factor) for name, start, end in path.phases),
-        dataclasses.replace(
-            r,
-            joint_speed=factor * r.joint_speed,
-            tool_speed=factor * r.tool_speed,
-            tilt_speed=factor * r.tilt_speed,
-            duration=r.duration / factor,
-        ),
-    )
 
 
 def report_json(report: PathReport) -> dict[str, Any]:
@@ -172,16 +144,19 @@ def report_json(report: PathReport) -> dict[str, Any]:
 
 
 def _draw(chosen: Chosen, png: Path) -> None:
+    from actors.arm.joint_path import PourPath
+    from actors.arm.spec import UrArmSpec
     from orchestrator.report.arm_path import path_png
     from sim_engine.vessel.build import build_vessel
 
-    assert chosen.path is not None
-    assert chosen.plan.laboratory.arm is not None
+    arm = chosen.plan.laboratory.arm
+    if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSpec):
+        raise RefusalError("--png: draws the joints of an arm, and this arm's path has none", BAD_INPUT)
     pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
     drawn = path_png(
         png,
         chosen.path,
-        chosen.plan.laboratory.arm,
+        arm,
         pourer,
         receiver,
         title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
@@ -212,12 +187,12 @@ def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
     say("nothing was moved")
 
 
-def _way_lines(planned: PourPath) -> list[str]:
+def _way_lines(planned: PlannedPour) -> list[str]:
     tilts = "  ".join(f"{name} {end - start:.2f} s" for name, start, end in planned.phases)
     return [
-        f"approach       {planned.approach.duration:.1f} s",
-        f"pour           {planned.pour.duration:.1f} s: {tilts}",
-        f"retreat        {planned.retreat.duration:.1f} s",
+        f"approach       {planned.approach_time:.1f} s",
+        f"pour           {planned.pour_time:.1f} s: {tilts}",
+        f"retreat        {planned.retreat_time:.1f} s",
     ]
 
 
@@ -227,15 +202,13 @@ def _stands_at_home(chosen: Chosen) -> bool:
     Raises:
         RefusalError: it can't be read.
     """
-    from actors.arm.survey import read_state
     from actors.protocols import LaboratoryError
-    from orchestrator.commands.doctor_arm import home_check
     from orchestrator.commands.hands_on import reached
 
     try:
         with reached(chosen.plan.laboratory) as ready:
             assert ready.arm is not None
-            check = home_check(ready.arm, read_state(ready.arm.address))
+            check = ready.arm.look().at_home()
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None
     say(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
@@ -290,7 +263,7 @@ def _only(chosen: Chosen) -> CampaignPlan:
     """The campaign without everything that this pour isn't of."""
     plan = chosen.plan
     if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
-        deployment = dataclasses.replace(plan.deployment, scenes=(chosen.scene,), pours=1)
+        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(chosen.scene,))
         return dataclasses.replace(plan, calibration=None, deployment=deployment)
     return dataclasses.replace(plan, deployment=None)
 
@@ -305,4 +278,4 @@ def told(weighed: WeighedPour) -> str:
     )
     parts = {"loaded": weighed.loaded, "spilled": weighed.spilled, "retained": weighed.retained}
     masses = ", ".join(f"{name} {1e3 * mass:.1f} g" for name, mass in parts.items())
-    return f"{masses}; {r}"
+    return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"

@@ -11,21 +11,20 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from actors.arm.joint_path import ExecutedPath, PourPath
 from actors.protocols import LaboratoryError
 from orchestrator.commands.arming import accepted, confirm, report_lines
 from orchestrator.commands.hands_on import connected, reached, stoppable, typed_line
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
 
 if TYPE_CHECKING:
-    from actors.arm.ur.driver import UrArm
+    from actors.arm.protocol import Arm, Executed, PlannedPour
     from orchestrator.plan import CampaignPlan
     from sim_engine.action import Action
 
 RECORD = "pour.json"
 
 
-def pour_empty(plan: CampaignPlan, action: Action, path: PourPath, *, slow: float, as_json: bool) -> None:
+def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: float, as_json: bool) -> None:
     """Approach, tilt, return, retreat.
 
     Args:
@@ -56,9 +55,9 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PourPath, *, slow: floa
         with reached(laboratory) as ready:
             assert ready.arm is not None
             # this command announces each movement itself, by counting down before it lets the arm move
-            driver = dataclasses.replace(ready, arm=dataclasses.replace(ready.arm, announcement=0.0))
+            driver = dataclasses.replace(ready, arm=ready.arm.announced(0.0))
             with connected(driver, checksum) as (arm, facts):
-                cycle = _Cycle(arm, path, laboratory.arm.announcement / ready.arm.time_scale, ask=hardware)
+                cycle = _Cycle(arm, path, ready.arm.on_clock(laboratory.arm.announcement), ask=hardware)
                 executed = cycle.run()
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None
@@ -86,10 +85,10 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PourPath, *, slow: floa
 class _Cycle:
     """One cycle, with a person's consent to each movement where there is hardware."""
 
-    def __init__(self, arm: UrArm, path: PourPath, announcement: float, *, ask: bool) -> None:
+    def __init__(self, arm: Arm, path: PlannedPour, announcement: float, *, ask: bool) -> None:
         self._arm, self._path, self._announcement, self._ask = arm, path, announcement, ask
 
-    def run(self) -> ExecutedPath:
+    def run(self) -> Executed:
         """Raises LaboratoryError where it is refused, or stopped."""
         self._arm.hands_in()
         self._consent(
@@ -97,7 +96,7 @@ class _Cycle:
         )
         self._moving("approach", lambda: self._arm.move_to_start(self._path))
         try:
-            executed: ExecutedPath = self._moving("pour", lambda: self._arm.execute(self._path))
+            executed: Executed = self._moving("pour", lambda: self._arm.execute(self._path))
         except LaboratoryError as error:
             self._upright(error)
             raise
@@ -142,7 +141,7 @@ def _yes(text: str) -> bool:
     return typed_line("type 'yes' to go on > ").strip().lower() == "yes"
 
 
-def _told(executed: ExecutedPath) -> str:
+def _told(executed: Executed) -> str:
     tracking = executed.tracking
     parts = [f"the cycle was completed; the pour took {executed.times[-1]:.1f} s"]
     if "rms_angle" in tracking:

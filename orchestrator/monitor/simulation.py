@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from actors.protocols import SimulationResult
 from orchestrator.monitor.monitor import solid
 from orchestrator.monitor.streams import Streams
 from orchestrator.report import style
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 
-def simulation_rrd(path: Path, task: PourTask, result: SimulationResult) -> Path:
+def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour) -> Path:
     """Write a recording of one simulated pour.
 
     Args:

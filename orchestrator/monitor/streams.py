@@ -25,8 +25,8 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 if TYPE_CHECKING:
     from actors.optimizer.core.problem import SurrogateMap
-    from actors.protocols import Frames
     from orchestrator.report.section import Solid
+    from sim_engine.simulated import RecordedFrames
 
 APPLICATION = "decant"
 MAXIMUM_RATE = 10.0
@@ -98,7 +98,12 @@ class Streams:
         self._recording.set_time("sim_time", duration=self._film_end)
 
     def film(
-        self, frames: Frames, pourer: tuple[VesselSpec, Solid], receiver: tuple[VesselSpec, Solid], *, radius: float
+        self,
+        frames: RecordedFrames,
+        pourer: tuple[VesselSpec, Solid],
+        receiver: tuple[VesselSpec, Solid],
+        *,
+        radius: float,
     ) -> None:
         """A simulated pour: vessels, the pourer's movement, particles coloured by state, shares of the liquid.
 

@@ -15,14 +15,14 @@ from sim_engine.outcome import ParticleState
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from actors.protocols import SimulationResult
+    from sim_engine.simulated import SimulatedPour
     from sim_engine.task import PourTask
 
 IN_POURER, _FALLING, _RECEIVED, SPILLED, _ESCAPED = (int(state) for state in ParticleState)
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
-def simulation_png(path: Path, task: PourTask, result: SimulationResult) -> Path:
+def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
     """Picture of one simulated pour, for `decant simulate --png`.
 
     Args:
@@ -62,7 +62,7 @@ def simulation_png(path: Path, task: PourTask, result: SimulationResult) -> Path
 
 def draw_pour(
     path: Path,
-    result: SimulationResult,
+    result: SimulatedPour,
     pourer: Solid,
     receiver: Solid,
     *,

@@ -15,7 +15,8 @@ import numpy as np
 from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import PourSimulator, SimulationRun
+from sim_engine.pour import PourSimulator
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask, Scene
 from sim_engine.validation.result import Figure, Measurement, Series, at_least, at_most, reported, within
 from sim_engine.vessel.spec import cylinder
@@ -46,13 +47,13 @@ FALL = 0.35
 """Height of the lip above the receiver's rim for the free jet [m]."""
 
 
-def pour(simulator: PourSimulator, particles: int, parameters: SimulationParameters, seed: int = 1) -> SimulationRun:
+def pour(simulator: PourSimulator, particles: int, parameters: SimulationParameters, seed: int = 1) -> SimulatedPour:
     """The standard pour."""
     theta = parameters.model_copy(update={"particles": particles})
     return simulator.simulate(PourTask(SCENE, ACTION, theta, seed))
 
 
-def left_at(run: SimulationRun, times: tuple[float, ...]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def left_at(run: SimulatedPour, times: tuple[float, ...]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Fraction still in the pourer at some times [s]."""
     return np.asarray(1.0 - np.interp(times, run.outcome.curve_times, run.outcome.curve_poured), dtype=float)
 

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.outcome import PourOutcome
+from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.spec import cylinder
 
@@ -38,7 +38,7 @@ class FakeSimulator:
             with self.log.open("a") as file:
                 file.write(f"{what} {os.getpid()}\n")
 
-    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimpleNamespace:
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         if task.scene.name == "touching":
             raise InvalidSceneError("cups touch: at tilt 37° the pourer enters the receiver by 4.1 mm")
         if task.scene.name == "broken":
@@ -75,13 +75,13 @@ class FakeSimulator:
         )
         frames = None
         if task.record_rate > 0.0:
-            frames = SimpleNamespace(
+            frames = RecordedFrames(
                 times=np.arange(3.0),
                 positions=[u.random((task.parameters.particles, 3)).astype(np.float32) for _ in range(3)],
                 states=[np.zeros(task.parameters.particles, np.uint8)] * 3,
                 pourer_poses=np.zeros((3, 7)),
             )
-        return SimpleNamespace(outcome=outcome, frames=frames)
+        return SimulatedPour(outcome, frames)
 
     def close(self) -> None:
         self._note("closed")

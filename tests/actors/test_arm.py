@@ -1,4 +1,4 @@
-"""The virtual arm: scaled time, what it reads back, and a stop that does not queue behind the motion."""
+"""The arm of numbers: scaled time, what it reads back, and a stop that does not queue behind the motion."""
 
 from __future__ import annotations
 
@@ -9,19 +9,31 @@ import numpy as np
 import pytest
 
 from actors.arm.actor import DeviceArm
-from actors.arm.virtual_arm import POSITION_NOISE, Grip, VirtualArm
+from actors.arm.errors import ArmNotReleasedError, ArmStoppedError
+from actors.arm.numbers import POSITION_NOISE, Grip, NumbersArm, NumbersPath, NumbersSpec
 from actors.bench.planning import plan_pour
+from actors.contracts.arm import ArmBench, ArmContract
 from actors.device import LocalDevice, RayDevice
-from actors.protocols import LaboratoryError
 
 
 @pytest.fixture
-def motion(scene, action):
-    return plan_pour(scene, action)
+def path(scene, action):
+    return NumbersPath(plan_pour(scene, action))
 
 
-def test_arm_reads_back_the_motion_it_was_given_up_to_its_repeatability(motion):
-    executed = VirtualArm(0.0).execute(motion)
+@pytest.fixture
+def motion(path):
+    return path.motion
+
+
+def released(scale=0.0):
+    arm = NumbersArm(NumbersSpec(scale))
+    arm.release()
+    return arm
+
+
+def test_arm_reads_back_the_motion_it_was_given_up_to_its_repeatability(path, motion):
+    executed = released().execute(path)
     assert executed.completed
     assert executed.times[-1] == pytest.approx(motion.duration)
     difference = executed.poses - motion.sample(executed.times)
@@ -30,10 +42,10 @@ def test_arm_reads_back_the_motion_it_was_given_up_to_its_repeatability(motion):
     assert np.abs(difference[:, 3:]).max() < 1e-12
 
 
-def test_a_slow_arm_takes_longer_over_the_tilt_and_reaches_the_same_angle(motion):
-    arm = VirtualArm(0.0)
+def test_a_slow_arm_takes_longer_over_the_tilt_and_reaches_the_same_angle(path, motion):
+    arm = released()
     arm.grip(Grip(speed_factor=0.8))
-    executed = arm.execute(motion)
+    executed = arm.execute(path)
     tilted = motion.phases[0].end
     assert executed.times[-1] == pytest.approx(motion.duration + tilted / 0.8 - tilted)
     tilts = executed.motion.tilt(executed.times)
@@ -41,21 +53,21 @@ def test_a_slow_arm_takes_longer_over_the_tilt_and_reaches_the_same_angle(motion
     assert np.interp(tilted, executed.times, tilts) < np.deg2rad(90.0)
 
 
-def test_same_grip_reads_back_the_same_bits_at_any_pace_and_after_other_pours(motion):
-    fresh, used = VirtualArm(0.0), VirtualArm(40.0)
-    used.execute(motion)
+def test_same_grip_reads_back_the_same_bits_at_any_pace_and_after_other_pours(path):
+    fresh, used = released(), released(40.0)
+    used.execute(path)
     for arm in (fresh, used):
         arm.grip(Grip(1.03, (5, 3)))
-    a, b = fresh.execute(motion), used.execute(motion)
+    a, b = fresh.execute(path), used.execute(path)
     np.testing.assert_array_equal(a.poses, b.poses)
     np.testing.assert_array_equal(a.times, b.times)
 
 
 @pytest.mark.parametrize("scale", [10.0, 40.0])
-def test_motion_takes_its_duration_over_the_time_scale(motion, scale):
-    arm = VirtualArm(scale)
+def test_motion_takes_its_duration_over_the_time_scale(path, motion, scale):
+    arm = released(scale)
     started = time.monotonic()
-    arm.execute(motion)
+    arm.execute(path)
     assert motion.duration / scale <= time.monotonic() - started + 1e-3 < motion.duration / scale + 0.3
 
 
@@ -63,31 +75,33 @@ def test_motion_takes_its_duration_over_the_time_scale(motion, scale):
 def make_arm(request):
     if request.param == "process":
         request.getfixturevalue("ray_running")
-        return lambda scale: DeviceArm(RayDevice("arm", VirtualArm, scale), scale)
-    return lambda scale: DeviceArm(LocalDevice("arm", lambda: VirtualArm(scale)), scale)
+        return lambda spec: DeviceArm(RayDevice("arm", NumbersArm, spec), spec)
+    return lambda spec: DeviceArm(LocalDevice("arm", lambda: NumbersArm(spec)), spec)
 
 
-def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, motion):
+def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, motion):
     async def play():
-        arm = make_arm(0.2)
-        pouring = asyncio.create_task(arm.execute(motion))
+        arm = make_arm(NumbersSpec(0.2))
+        await arm.release()
+        pouring = asyncio.create_task(arm.execute(path, lambda state: None))
         while not (await arm.state()).moving or (await arm.state()).time < 0.1:
             await asyncio.sleep(0.02)
         started = time.monotonic()
         await arm.stop()
-        executed = await pouring
+        with pytest.raises(ArmStoppedError) as stopped:
+            await pouring
         took = time.monotonic() - started
-        with pytest.raises(LaboratoryError, match="release"):
-            await arm.execute(motion)
+        with pytest.raises(ArmNotReleasedError, match="release"):
+            await arm.execute(path, lambda state: None)
         await arm.release()
-        going = asyncio.create_task(arm.move_to_start(motion))
+        going = asyncio.create_task(arm.move_to_start(path))
         await asyncio.sleep(0.1)
         moving = await arm.state()
         await arm.stop()
-        with pytest.raises(LaboratoryError, match="nothing was poured"):
+        with pytest.raises(ArmStoppedError, match="during approach"):
             await going
         await arm.device.close()
-        return executed, took, moving
+        return stopped.value.executed, took, moving
 
     executed, took, moving = asyncio.run(play())
     assert took < 1.0
@@ -97,12 +111,13 @@ def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, motion)
     assert moving.phase == "approach"
 
 
-def test_progress_follows_the_tilt_through_the_phases(make_arm, motion):
+def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
     seen = []
 
     async def play():
-        arm = make_arm(2.0)
-        await arm.execute(motion, seen.append)
+        arm = make_arm(NumbersSpec(2.0))
+        await arm.release()
+        await arm.execute(path, seen.append)
         await arm.device.close()
 
     asyncio.run(play())
@@ -112,3 +127,11 @@ def test_progress_follows_the_tilt_through_the_phases(make_arm, motion):
     assert list(dict.fromkeys(s.phase for s in moving)) == ["tilt", "hold", "return"]
     for state in moving:
         assert state.tilt == pytest.approx(float(motion.tilt(np.array([state.time]))[0]), abs=1e-6)
+
+
+class TestArmOfNumbers(ArmContract):
+    @pytest.fixture
+    def bench(self, path):
+        arm = NumbersArm(NumbersSpec(2.0))
+        yield ArmBench(arm, path, 2.0, jog=("z", 0.005, 0.02))
+        arm.close()

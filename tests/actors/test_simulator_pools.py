@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.virtual_arm import VirtualArm
+from actors.arm.numbers import NumbersArm, NumbersSpec
 from actors.cluster.versions import versions
 from actors.device import RayDevice
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
@@ -133,7 +133,7 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
 @pytest.mark.ray
 def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running, fake, task):
     async def play():
-        arm = RayDevice("arm", VirtualArm, 0.0)
+        arm = RayDevice("arm", NumbersArm, NumbersSpec(0.0))
         pool = RaySimulatorPool(2, make=fake())
         try:
             await pool.simulate(task())

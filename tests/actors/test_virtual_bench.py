@@ -1,4 +1,4 @@
-"""A whole pour on the virtual bench: seeds, checkpoints, what is hidden, and what happens when something fails."""
+"""A whole pour on the bench of numbers: seeds, checkpoints, what is hidden, and what happens when something fails."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from actors.bench.hidden import draw_pose_error, spill_of
 from actors.bench.spec import VirtualBenchSpec
-from actors.bench.world import draw_pose_error, spill_of
 from actors.laboratory import open_laboratory
-from actors.protocols import InvalidActionError, LaboratoryError
+from actors.protocols import InvalidActionError, NotPouredError, PourFailedError, UnknownPourError
 from actors.spec import LaboratorySpec
 from sim_engine.action import DEG
 from sim_engine.outcome import PourOutcome
@@ -101,10 +101,10 @@ def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_bench, 
             await laboratory.bench.pour(scene, action, seed=5, progress=seen.append)
 
     asyncio.run(play())
-    order = ["operator", "tare", "approach", "tilt", "hold", "return", "settle", "weigh", "record"]
+    order = ["operator", "approach", "tilt", "hold", "return", "settle", "weigh", "record"]
     passed = list(dict.fromkeys(p.checkpoint for p in seen))
     assert [c for c in order if c in passed] == passed
-    assert {"operator", "tare", "approach", "tilt", "settle", "weigh", "record"} <= set(passed)
+    assert {"operator", "approach", "tilt", "settle", "weigh", "record"} <= set(passed)
     assert [p.fraction for p in seen] == sorted(p.fraction for p in seen)
     assert seen[-1].fraction == pytest.approx(1.0)
     assert max(p.tilt for p in seen if p.tilt is not None) > 0.5
@@ -150,6 +150,16 @@ def test_touching_vessels_are_refused_before_the_operator_has_been_called(open_b
     assert state.time == 0.0
 
 
+def test_vessels_that_touch_as_they_truly_stand_make_the_pour_fail_and_the_bench_pours_on(open_bench, scene, action):
+    async def play():
+        async with open_bench() as laboratory:
+            with pytest.raises(PourFailedError, match="as they truly stand: cups touch"):
+                await laboratory.bench.pour(replace(scene, name="touching"), action, seed=1)
+            return await laboratory.bench.pour(scene, action, seed=5)
+
+    assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=1e-3)
+
+
 def test_a_load_beyond_the_brim_is_refused(open_bench, scene, action):
     async def play():
         async with open_bench() as laboratory:
@@ -186,7 +196,7 @@ def test_a_stop_during_the_pour_leaves_it_unknown_and_the_bench_usable(request, 
             pour = asyncio.create_task(laboratory.bench.pour(scene, slow, seed=5))
             await tilting(laboratory.bench.arm)
             await laboratory.bench.arm.stop()
-            with pytest.raises(LaboratoryError, match=r"the arm was stopped .* what was poured is unknown"):
+            with pytest.raises(UnknownPourError, match=r"the arm was stopped .* What was poured is unknown"):
                 await pour
             return await laboratory.bench.pour(scene, action, seed=5)
 
@@ -200,7 +210,7 @@ def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action
             pour = asyncio.create_task(laboratory.bench.pour(scene, action, seed=5, progress=seen.append))
             await reach(seen, "approach")
             pour.cancel()
-            with pytest.raises(asyncio.CancelledError):
+            with pytest.raises(NotPouredError, match="nothing was poured"):
                 await pour
             await asyncio.sleep(0.1)
             state = await laboratory.bench.arm.state()
@@ -223,7 +233,7 @@ def test_the_death_of_the_arm_fails_the_pour_and_the_next_one_has_a_new_arm(ray_
             victim = await laboratory.bench.arm.device.pid()
             await reach(seen, "tilt")
             os.kill(victim, signal.SIGKILL)
-            with pytest.raises(LaboratoryError, match="arm: its process died during 'execute'"):
+            with pytest.raises(UnknownPourError, match="arm: its process died during 'execute'"):
                 await pour
             return await laboratory.bench.pour(scene, action, seed=5)
 

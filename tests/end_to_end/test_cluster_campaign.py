@@ -116,7 +116,7 @@ def test_a_bench_lost_during_a_pour_leaves_it_unknown_and_a_resumed_run_ends_as_
     process = place.start(*RUN)
     with ended(process):
         until(lambda: finished_in("pours", place.entries()) == 1 and pour_under_way(place.entries()), process)
-        assert {title(worker) for worker in cluster.workers(1)} >= {"ray::VirtualArm", "ray::VirtualBalance"}
+        assert {title(worker) for worker in cluster.workers(1)} >= {"ray::NumbersArm", "ray::VirtualBalance"}
         time.sleep(1.0)
         cluster.kill_node(1)
         _, errors = process.communicate(timeout=PATIENCE)

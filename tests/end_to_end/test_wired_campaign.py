@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from actors.bench.executed import unpack
+from actors.arm.joint_path import unpack
 from orchestrator.journal import Entry, Kind
 from tests.end_to_end import small
 from tests.end_to_end.command import Workplace, finished_in, pour_under_way, started_after_they_were_finished

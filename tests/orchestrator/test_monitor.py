@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from actors.protocols import Frames, SimulationResult
 from orchestrator.events import LogLine
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.monitor.simulation import simulation_rrd
 from orchestrator.monitor.worker import Worker
+from sim_engine.simulated import RecordedFrames, SimulatedPour
 from tests.orchestrator import watched
 from tests.patience import PATIENCE
 
@@ -178,7 +178,7 @@ def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None
     plan = watched.campaign()
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
     told = list(watched.events(plan))
-    broken = Frames(np.array([0.0]), [np.zeros((3, 3))], [np.zeros(3, np.uint8)], np.zeros((1, 3)))
+    broken = RecordedFrames(np.array([0.0]), [np.zeros((3, 3))], [np.zeros(3, np.uint8)], np.zeros((1, 3)))
     for event in told:
         if getattr(event, "frames", None) is not None:
             object.__setattr__(event, "frames", broken)
@@ -233,7 +233,7 @@ def test_dropped_events_are_said_in_the_recording(tmp_path: Path, monkeypatch: p
 
 def test_simulation_recording_thins_particles_to_ten_frames_a_second(tmp_path: Path) -> None:
     task, result = watched.simulation()
-    dense = SimulationResult(result.outcome, watched.frames(rate=50.0))
+    dense = SimulatedPour(result.outcome, watched.frames(rate=50.0))
     contents = Contents(simulation_rrd(tmp_path / "pour.rrd", task, dense))
     assert contents.rows("/scene/liquid", "sim_time") == 31
     assert contents.blueprints == 1
@@ -242,4 +242,4 @@ def test_simulation_recording_thins_particles_to_ten_frames_a_second(tmp_path: P
 def test_simulation_without_frames_is_refused_with_advice(tmp_path: Path) -> None:
     task, result = watched.simulation()
     with pytest.raises(ValueError, match="record rate above 0"):
-        simulation_rrd(tmp_path / "pour.rrd", task, SimulationResult(result.outcome))
+        simulation_rrd(tmp_path / "pour.rrd", task, SimulatedPour(result.outcome))

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from actors.protocols import Frames
 from orchestrator.events import (
     CampaignClosed,
     DecisionMade,
@@ -18,6 +17,7 @@ from orchestrator.events import (
 )
 from orchestrator.flights import is_recorded
 from orchestrator.requests import Pour, Simulate
+from sim_engine.simulated import RecordedFrames
 from sim_engine.task import PourTask
 from tests.orchestrator.scripted import run
 from tests.orchestrator.toy import ToyLaboratory, logical_record, toy_plan
@@ -59,7 +59,7 @@ def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path)
 
         async def with_frames(task: PourTask) -> Any:
             result = await plain(task)
-            return replace(result, frames=Frames([0.0], [], [], []) if task.record_rate > 0 else None)
+            return replace(result, frames=RecordedFrames([0.0], [], [], []) if task.record_rate > 0 else None)
 
         laboratory.simulators.simulate = with_frames  # type: ignore[method-assign]
         return laboratory

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from actors.optimizer.core.propose import propose
-from actors.protocols import SimulationResult
 from actors.spec import LaboratorySpec
 from orchestrator.config.study.sections import load_study
 from orchestrator.study.folder import opened
@@ -22,6 +21,7 @@ from orchestrator.study.worker import work
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask, Scene
 
 ROOT = Path(__file__).parents[2]
@@ -39,10 +39,10 @@ def spilled(action: Action, theta: SimulationParameters, seed: int) -> float:
 class _Simulators:
     size = 1
 
-    async def simulate(self, task: PourTask) -> SimulationResult:
+    async def simulate(self, task: PourTask) -> SimulatedPour:
         await asyncio.sleep(float(os.environ.get(PAUSE, "0")))
         share = spilled(task.action, task.parameters, task.seed)
-        return SimulationResult(PourOutcome(1 - share, share, 0, 0, 0, 500, 0.007, 0.01, 2.0, 400, 0.0, task.seed))
+        return SimulatedPour(PourOutcome(1 - share, share, 0, 0, 0, 500, 0.007, 0.01, 2.0, 400, 0.0, task.seed))
 
 
 class _Bench:

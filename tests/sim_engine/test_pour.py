@@ -11,8 +11,9 @@ import pytest
 from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import retained_volume, tilting_cup_outflow
 from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import InvalidSceneError, PourSimulator, SimulationCancelled, SimulationRun
+from sim_engine.pour import InvalidSceneError, PourSimulator, SimulationCancelled
 from sim_engine.sampled_motion import SampledMotion
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.validation.at_rest import tall_column
 from sim_engine.vessel.build import build_vessel
@@ -49,16 +50,16 @@ def task(
     return PourTask(scene, Action.compose({}, values), theta, seed, record_rate, pose_error)
 
 
-def run(simulator: PourSimulator, **kwargs: object) -> SimulationRun:
+def run(simulator: PourSimulator, **kwargs: object) -> SimulatedPour:
     return simulator.simulate(task(**kwargs))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def plain(simulator: PourSimulator) -> SimulationRun:
+def plain(simulator: PourSimulator) -> SimulatedPour:
     return run(simulator, record_rate=20.0)
 
 
-def test_every_particle_is_accounted_for(plain: SimulationRun) -> None:
+def test_every_particle_is_accounted_for(plain: SimulatedPour) -> None:
     o = plain.outcome
     assert o.received + o.spilled + o.retained + o.in_flight + o.escaped == pytest.approx(1.0)
     assert o.invalid is None
@@ -69,12 +70,12 @@ def test_every_particle_is_accounted_for(plain: SimulationRun) -> None:
     assert o.steps > 100
 
 
-def test_most_of_an_easy_pour_arrives(plain: SimulationRun) -> None:
+def test_most_of_an_easy_pour_arrives(plain: SimulatedPour) -> None:
     assert plain.outcome.received > 0.9
     assert plain.outcome.retained < 0.02
 
 
-def test_the_outflow_curve_only_rises_and_ends_at_the_outcome(plain: SimulationRun) -> None:
+def test_the_outflow_curve_only_rises_and_ends_at_the_outcome(plain: SimulatedPour) -> None:
     o = plain.outcome
     poured = np.array(o.curve_poured)
     assert np.all(np.diff(o.curve_times) > 0)
@@ -83,7 +84,7 @@ def test_the_outflow_curve_only_rises_and_ends_at_the_outcome(plain: SimulationR
     assert poured[-1] == pytest.approx(1.0 - o.retained, abs=1e-6)
 
 
-def test_same_seed_same_bits_and_recording_changes_nothing(simulator: PourSimulator, plain: SimulationRun) -> None:
+def test_same_seed_same_bits_and_recording_changes_nothing(simulator: PourSimulator, plain: SimulatedPour) -> None:
     again = run(simulator)
     assert replace(again.outcome, cpu_s=0.0) == replace(plain.outcome, cpu_s=0.0)
     assert again.frames is None
@@ -92,7 +93,7 @@ def test_same_seed_same_bits_and_recording_changes_nothing(simulator: PourSimula
     assert other.outcome.received == pytest.approx(plain.outcome.received, abs=0.06)
 
 
-def test_frames_follow_each_particle_and_the_cup(plain: SimulationRun) -> None:
+def test_frames_follow_each_particle_and_the_cup(plain: SimulatedPour) -> None:
     frames = plain.frames
     assert frames is not None
     assert len(frames.times) == len(frames.positions) == len(frames.states) == len(frames.pourer_poses)
@@ -191,7 +192,7 @@ def test_viscosity_and_cohesion_are_felt(simulator: PourSimulator) -> None:
     assert sticky.spilled != thin.spilled
 
 
-def test_errors_of_the_bench_change_the_pour_and_none_is_none(simulator: PourSimulator, plain: SimulationRun) -> None:
+def test_errors_of_the_bench_change_the_pour_and_none_is_none(simulator: PourSimulator, plain: SimulatedPour) -> None:
     same = run(simulator, pose_error=PoseError())
     assert replace(same.outcome, cpu_s=0.0) == replace(plain.outcome, cpu_s=0.0)
     off = run(simulator, pose_error=PoseError(x=0.05))
@@ -222,7 +223,7 @@ def test_a_simulation_can_be_given_up(simulator: PourSimulator) -> None:
 
 
 def test_what_an_arm_did_is_simulated_in_place_of_what_was_planned(
-    simulator: PourSimulator, plain: SimulationRun
+    simulator: PourSimulator, plain: SimulatedPour
 ) -> None:
     planned = simulator.prepare(task())
     times = np.append(np.arange(0.0, planned.duration, 0.008), planned.duration)

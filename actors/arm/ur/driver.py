@@ -13,20 +13,24 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from actors.arm.joint_path import ExecutedPath, PourPath
-from actors.arm.path.checks import recheck
-from actors.arm.protocol import ArmState
-from actors.arm.spec import Joints, UrArmSpec
-from actors.arm.ur.dashboard import DashboardError, stop_program
-from actors.arm.ur.errors import (
+from actors.arm.errors import (
     ArmError,
     ArmLostError,
     ArmNotReleasedError,
     ArmRefusedError,
     ArmStoppedError,
 )
-from actors.arm.ur.facts import ArmFacts
+from actors.arm.geometry import Joints, Pose
+from actors.arm.joint_path import ExecutedPath, PourPath
+from actors.arm.path.checks import recheck
+from actors.arm.path.frames import cell_frames
+from actors.arm.path.kinematics import MODELS, forward
+from actors.arm.protocol import ArmState, Whereabouts
+from actors.arm.spec import UrArmSpec
+from actors.arm.ur.dashboard import DashboardError, stop_program
+from actors.arm.ur.facts import UrFacts
 from actors.arm.ur.jogging import jog_path
 from actors.arm.ur.legs import Leg
 from actors.arm.ur.messages import Motion, Outcome, Reading, Settings
@@ -75,7 +79,7 @@ class UrArm:
 
     # ---- nothing moves
 
-    def connect(self) -> ArmFacts:
+    def connect(self) -> UrFacts:
         """Find the robot, by a new worker. Nothing moves, and nothing may until `release`.
 
         Raises:
@@ -87,7 +91,7 @@ class UrArm:
             self.lock()
             return self._session.open()
 
-    def facts(self) -> ArmFacts:
+    def facts(self) -> UrFacts:
         """The robot as it is now; not during a motion."""
         with self._at_work("asking for facts"):
             return self._session.find_out()
@@ -105,6 +109,15 @@ class UrArm:
         reading: Reading = self._session.ask("read")
         a, b, c, d, e, f = reading.joints
         return a, b, c, d, e, f
+
+    def where(self) -> Whereabouts:
+        """See `Arm.where`."""
+        joints = self.joints()
+        rotation, position = forward(np.array([joints]), MODELS[self._spec.model])
+        tool = cell_frames(self._spec).tool
+        x, y, z = map(float, position[0] + rotation[0] @ tool.position)
+        rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
+        return Whereabouts(Pose(x, y, z, rx, ry, rz), joints, self._spec.home)
 
     def release(self) -> None:
         """An operator consents to the next cycle: way there, pour, way back; or to one recovery, un-tilting or jog.

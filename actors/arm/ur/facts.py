@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from actors.arm.spec import Joints, Pose, Vector
+from actors.arm.geometry import Joints, Pose, Vector
+from actors.arm.protocol import ArmFacts
 from actors.arm.ur.messages import Facts
 
 ROBOT_MODES = {
@@ -33,14 +34,13 @@ SAFETY_MODES = {
 
 
 @dataclass(frozen=True)
-class ArmFacts:
+class UrFacts(ArmFacts):
     """A robot as its controller tells of it.
 
     Attributes:
-        model, serial, version: as on the controller.
+        checksum: of the safety configuration, eight hexadecimal digits; '' if it isn't told.
         robot_mode, safety_mode: in words; 'running' and 'normal' if it could move.
         remote: remote control is on; None where the controller knows no such thing.
-        checksum: of the safety configuration, eight hexadecimal digits; '' if it isn't told.
         tool: TCP in the flange's frame, as set at present.
         payload: as set at present [kg]; `payload_centre` [m].
         joints: measured [rad].
@@ -50,19 +50,15 @@ class ArmFacts:
         joint_speeds: likewise [rad/s].
     """
 
-    model: str
-    serial: str
-    version: str
-    robot_mode: str
-    safety_mode: str
-    remote: bool | None
-    checksum: str
-    tool: Pose
-    payload: float
-    payload_centre: Vector
-    joints: Joints
-    slider: float
-    program: str
+    robot_mode: str = ""
+    safety_mode: str = ""
+    remote: bool | None = None
+    tool: Pose = field(default_factory=Pose)
+    payload: float = 0.0
+    payload_centre: Vector = (0.0, 0.0, 0.0)
+    joints: Joints = (0.0,) * 6
+    slider: float = 1.0
+    program: str = ""
     joint_ranges: tuple[tuple[float, float], ...] = ()
     joint_speeds: tuple[float, ...] = ()
 
@@ -72,17 +68,21 @@ class ArmFacts:
         return int(self.version.split(".")[0]) >= 5
 
 
-def facts_of(told: Facts) -> ArmFacts:
+def facts_of(told: Facts) -> UrFacts:
     """As a worker has found out."""
     r = told.reading
     a, b, c, d, e, f = r.joints
     x, y, z = r.centre
-    return ArmFacts(
+    robot_mode = ROBOT_MODES.get(r.robot_mode, str(r.robot_mode))
+    safety_mode = SAFETY_MODES.get(r.safety_mode, str(r.safety_mode))
+    ready = robot_mode == "running" and safety_mode in ("normal", "reduced")
+    return UrFacts(
         model=told.model,
         serial=told.serial,
         version=".".join(map(str, told.version)),
-        robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
-        safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
+        problem="" if ready else f"{robot_mode}, safety {safety_mode}",
+        robot_mode=robot_mode,
+        safety_mode=safety_mode,
         remote=told.remote,
         checksum=told.checksum,
         tool=Pose(*told.tool),

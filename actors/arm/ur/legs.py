@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from actors.arm.errors import ArmRefusedError, ArmStoppedError
 from actors.arm.joint_path import ExecutedPath, FloatArray, JointPath, PourPath
 from actors.arm.spec import UrArmSpec
-from actors.arm.ur.errors import ArmRefusedError, ArmStoppedError
 from actors.arm.ur.messages import Outcome
 from actors.arm.ur.script import checked
 from actors.arm.ur.ways import HARDLY, leans, rejoin

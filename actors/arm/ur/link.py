@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from actors.arm.ur.errors import client_missing
+from actors.arm.ur.client import client_missing
 from actors.arm.ur.messages import (
     CLOCK,
     GO,

@@ -160,7 +160,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the worker found out about a controller; see `facts.ArmFacts`."""
+    """What the worker found out about a controller; see `facts.UrFacts`."""
 
     model: str
     serial: str

@@ -19,7 +19,7 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 from multiprocessing.connection import Connection
 from typing import Any
 
-from actors.arm.ur.errors import ArmLostError, ArmRefusedError
+from actors.arm.errors import ArmLostError, ArmRefusedError
 from actors.arm.ur.messages import Progress, TroubleError
 
 SIGN_OF_LIFE = 0.1

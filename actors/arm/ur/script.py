@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from actors.arm.errors import ArmRefusedError
 from actors.arm.joint_path import FloatArray, JointPath
-from actors.arm.ur.errors import ArmRefusedError
 from actors.arm.ur.messages import (
     CLOCK,
     DONE,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from actors.arm.errors import ArmError, ArmLostError, ArmRefusedError
 from actors.arm.spec import UrArmSpec
-from actors.arm.ur.errors import ArmError, ArmLostError, ArmRefusedError
-from actors.arm.ur.facts import ArmFacts, facts_of
+from actors.arm.ur.facts import UrFacts, facts_of
 from actors.arm.ur.messages import SILENCE, Progress
 from actors.arm.ur.process import WorkerProcess
 
@@ -27,9 +27,9 @@ class Session:
     def __init__(self, spec: UrArmSpec) -> None:
         self._spec = spec
         self._worker: WorkerProcess | None = None
-        self.facts: ArmFacts | None = None
+        self.facts: UrFacts | None = None
 
-    def open(self) -> ArmFacts:
+    def open(self) -> UrFacts:
         """Connect anew; nothing moves.
 
         Raises:
@@ -60,7 +60,7 @@ class Session:
             worker.kill()
             raise
 
-    def find_out(self) -> ArmFacts:
+    def find_out(self) -> UrFacts:
         """The robot as it is now."""
         return facts_of(self.ask("facts"))
 
@@ -94,7 +94,7 @@ class Session:
         self.kill()
         self._worker, self.facts = None, None
 
-    def _check_model(self, facts: ArmFacts) -> None:
+    def _check_model(self, facts: UrFacts) -> None:
         model = facts.model.lower().removesuffix("e") + ("e" if facts.e_series else "")
         if model != self._spec.model:
             raise ArmRefusedError(

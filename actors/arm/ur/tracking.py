@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from actors.arm.joint_path import ExecutedPath, FloatArray, JointPath
-from actors.arm.path.frames import cell_frames
+from actors.arm.path.frames import cell_frames, pourer_motion
 from actors.arm.path.kinematics import MODELS, forward
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.messages import Sample
@@ -45,7 +45,8 @@ def executed_path(
         times, joints = np.concatenate([[0.0], times]), np.vstack([path.joints[0], joints])
     followed = np.ones(len(times), dtype=bool) if completed else times <= clocks.max()
     tracking = _tracking(times[followed], joints[followed], path, spec) if np.any(followed) else {}
-    return ExecutedPath(times, joints, completed, tracking | {"slider": slider})
+    poses = pourer_motion(joints, times, spec).poses if len(times) > 1 else np.zeros((0, 7))
+    return ExecutedPath(times, joints, completed, tracking | {"slider": slider}, poses)
 
 
 def best_lag(times: FloatArray, joints: FloatArray, path: JointPath) -> float:

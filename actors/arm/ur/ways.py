@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from actors.arm.errors import ArmRefusedError
 from actors.arm.joint_path import FloatArray, JointPath, PourPath
 from actors.arm.path.frames import pourer_frames
 from actors.arm.spec import UrArmSpec
-from actors.arm.ur.errors import ArmRefusedError
 
 OFF_PATH = 0.1
 """Joints farther than that from every point of a path are not on it [rad]: something has moved the arm."""

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.geometry import ArmLimits, Cell, Pose
 from actors.arm.path.travel import follow
-from actors.arm.spec import ArmLimits, Cell, Pose, UrArmSpec
+from actors.arm.spec import UrArmSpec
 from orchestrator.config.load import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from actors.arm.geometry import Pose
 from actors.arm.path.frames import flange_poses, pourer_frames, pourer_motion, quaternions
 from actors.arm.path.kinematics import MODELS, inverse
 from actors.arm.path.plan import plan_path
-from actors.arm.spec import Pose
 from sim_engine.action import DEG
 from sim_engine.contact import rotations
 from tests.depth import examples

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from actors.arm.geometry import Plane
 from actors.arm.joint_path import JointPath, PourPath
 from actors.arm.path.checks import recheck
 from actors.arm.path.frames import cell_frames, pourer_frames, pourer_motion
@@ -18,7 +19,7 @@ from actors.arm.path.kinematics import MODELS, forward
 from actors.arm.path.pace import STEEPEST
 from actors.arm.path.plan import plan_path
 from actors.arm.path.travel import TOOL_ACCELERATION
-from actors.arm.spec import Plane, UrArmSpec
+from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from orchestrator.config.load import load_campaign
 from sim_engine.action import DEG

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from actors.arm.joint_path import JointPath, PathReport, PourPath
-from actors.arm.spec import ArmLimits, Cell, Pose, UrArmSpec
+from actors.arm.geometry import ArmLimits, Cell, Pose
+from actors.arm.joint_path import JointPath, PourPath
+from actors.arm.protocol import PathReport
+from actors.arm.spec import UrArmSpec
 
 HOME = tuple(math.radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))
 START = tuple(math.radians(v) for v in (12.0, -85.0, 88.0, -93.0, -90.0, 3.0))

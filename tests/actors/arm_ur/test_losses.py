@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.arm.errors import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.joint_path import JointPath
 from actors.arm.ur.driver import UrArm
-from actors.arm.ur.errors import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.ur.messages import Settings
 from actors.arm.ur.script import path_program
 from actors.protocols import LaboratoryError

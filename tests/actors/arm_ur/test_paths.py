@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
+from actors.arm.errors import ArmRefusedError
 from actors.arm.joint_path import JointPath
-from actors.arm.ur.errors import ArmRefusedError
 from actors.arm.ur.jogging import jog_path
 from actors.arm.ur.messages import Settings
 from actors.arm.ur.primary import PrimaryError, split

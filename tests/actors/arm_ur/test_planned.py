@@ -9,11 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from actors.arm.errors import ArmStoppedError
+from actors.arm.geometry import ArmLimits, Cell, Pose
 from actors.arm.path.frames import pourer_motion
 from actors.arm.path.plan import plan_path
-from actors.arm.spec import ArmLimits, Cell, Pose, UrArmSpec
+from actors.arm.spec import UrArmSpec
 from actors.arm.ur.driver import UrArm
-from actors.arm.ur.errors import ArmStoppedError
 from actors.arm.ur.ways import leans
 from actors.virtual_ur import VirtualController
 from sim_engine.action import DEG, Action

@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 
 from actors.balance.placement import Placement
-from actors.bench.place import Site
+from actors.balance.spec import SerialBalanceSpec
+from actors.bench.device_stand_ins import DeviceStandIns
+from actors.bench.pouring_bench import PouringBench
 from actors.bench.things import Things
+from actors.bench.virtual_bench import FollowedBench, VirtualBench
 from actors.bench.virtual_operator import VirtualOperator
-from actors.bench.wired import WiredBench
 from actors.laboratory import InProcessLaboratory
 from actors.operator import OperatorSpec, Question
 from actors.protocols import Notice
@@ -93,8 +95,8 @@ class Stage:
     """A laboratory that is open, and everything that was said in it."""
 
     laboratory: InProcessLaboratory
-    bench: WiredBench = field(init=False)
-    site: Site = field(init=False)
+    bench: PouringBench = field(init=False)
+    site: DeviceStandIns = field(init=False)
     operator: VirtualOperator = field(init=False)
     things: Things = field(init=False)
     notices: list[Notice] = field(default_factory=list)
@@ -110,17 +112,17 @@ class Stage:
 
     def attend(self) -> None:
         """Stand beside the operator, and look at the controller whenever it is asked something."""
-        rooms = self.laboratory.wired
-        assert rooms is not None
-        assert rooms.site is not None
-        assert rooms.bench.reality is not None
-        assert isinstance(rooms.operator, VirtualOperator)
-        self.bench, self.site, self.operator = rooms.bench, rooms.site, rooms.operator
-        self.things = rooms.bench.reality.things
+        opened = self.laboratory.opened
+        assert opened is not None
+        assert opened.stand_ins is not None
+        assert isinstance(opened.bench.nature, VirtualBench)
+        assert isinstance(opened.operator, VirtualOperator)
+        self.bench, self.site, self.operator = opened.bench, opened.stand_ins, opened.operator
+        self.things = opened.bench.nature.things
         ask = self.operator.ask
 
         async def attended(question: Question) -> str:
-            state = await self.site.fault("state")
+            state = await self._seen()
             if question.hands and (state["runtime_state"] != "STOPPED" or max(map(abs, state["speeds"])) > 1e-3):
                 self.unsafe.append(question.about)
             if (hook := self.before.pop(question.about, None)) is not None:
@@ -130,6 +132,12 @@ class Stage:
             return answer
 
         self.operator.ask = attended  # type: ignore[method-assign]
+
+    async def _seen(self) -> dict[str, Any]:
+        """What the controller knows of itself; an arm without one never runs a program."""
+        if not isinstance(self.bench.nature, FollowedBench):
+            return {"runtime_state": "STOPPED", "speeds": [0.0], "time": 0.0}
+        return await self.site.fault("state")
 
     @property
     def heard(self) -> list[str]:
@@ -150,7 +158,7 @@ class Stage:
 
     async def now(self) -> float:
         """Of the controller [s]; it goes on counting when the controller's clock begins anew."""
-        return self.unwrapped(float((await self.site.fault("state"))["time"]))
+        return self.unwrapped(float((await self._seen())["time"]))
 
     def unwrapped(self, clock: float) -> float:
         if clock < self.clock:
@@ -170,16 +178,17 @@ def wired_spec(
     spec = load_laboratory(LABORATORIES / "virtual.yaml")
     assert spec.arm is not None
     assert spec.balance is not None
-    assert spec.balance.serial is not None
-    assert spec.balance.virtual is not None
+    device = spec.balance.device
+    assert isinstance(device, SerialBalanceSpec)
+    assert device.virtual is not None
     assert spec.bench is not None
-    rule = replace(spec.balance.serial.settling, deadline=10.0)
+    rule = replace(device.settling, deadline=10.0)
     arm = replace(spec.arm, time_scale=pace)
     if hurried:
         rule = replace(rule, readings=2, span=0.2)
         arm = replace(arm, announcement=1.0, untilt_speed=60 * DEG, approach_speed=90 * DEG)
-    serial = replace(spec.balance.serial, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule)
-    virtual = replace(spec.balance.virtual, noise=0.0, drift=0.0, settling_time=0.5)
+    virtual = replace(device.virtual, noise=0.0, drift=0.0, settling_time=0.5)
+    device = replace(device, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule, virtual=virtual)
     manual = placement is Placement.MANUAL
     return replace(
         spec,
@@ -188,8 +197,7 @@ def wired_spec(
         balance=replace(
             spec.balance,
             placement=placement,
-            serial=None if manual else serial,
-            virtual=None if manual else virtual,
+            device=None if manual else device,
         ),
         bench=replace(spec.bench, time_scale=pace),
         operator=operator or OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),

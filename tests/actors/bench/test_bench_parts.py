@@ -7,12 +7,11 @@ import asyncio
 import numpy as np
 import pytest
 
-from actors.arm.joint_path import ExecutedPath
+from actors.arm.joint_path import ExecutedPath, pack, unpack
 from actors.balance.placement import Placement, weighings
-from actors.bench.executed import pack, unpack
 from actors.bench.questions import NobodyAnsweredError, Questions
-from actors.bench.reality import LONGEST_REST, executed_pour
 from actors.bench.things import POURER, RECEIVER, TRAY, Things
+from actors.bench.virtual_bench import LONGEST_REST, executed_pour
 from actors.bench.virtual_operator import Hands, PlayedOperator
 from actors.operator import OperatorSpec, Question
 from actors.protocols import Notice
@@ -79,7 +78,7 @@ def test_what_was_executed_comes_back_from_the_journal_as_exactly_as_an_arm_repe
     np.testing.assert_allclose(again.joints, joints, atol=1e-6)
     assert (again.completed, again.tracking) == (False, {"lag": 0.03})
     assert len(packed["packed"]) < 30_000
-    with pytest.raises(ValueError, match="no executed path"):
+    with pytest.raises(ValueError, match="not an executed path"):
         unpack({"packed": "nothing of the kind"})
 
 

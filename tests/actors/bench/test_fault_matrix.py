@@ -20,7 +20,6 @@ import psutil
 import pytest
 
 from actors.arm.path.frames import pourer_motion
-from actors.bench.planning import planner
 from actors.bench.virtual_operator import VirtualOperator
 from actors.operator import OperatorSpec
 from actors.protocols import LaboratoryError, NotPouredError, UnknownPourError
@@ -158,7 +157,7 @@ class Recorder:
 
 async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any]) -> float:
     """Have a fault happen in the middle of a phase; the controller's time then [s]."""
-    spans = {name: (begin, end) for name, begin, end in planner(SPEC.arm)(SCENE, SLOWLY).phases}
+    spans = {name: (begin, end) for name, begin, end in SPEC.arm.plan(SCENE, SLOWLY).phases}
     end = time.monotonic() + PATIENCE
     while True:
         assert time.monotonic() < end, f"never came to {phase}"

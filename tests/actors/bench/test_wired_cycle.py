@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from actors.arm.joint_path import unpack
 from actors.arm.path.frames import pourer_motion
 from actors.balance.placement import Placement
-from actors.bench.executed import unpack
 from actors.operator import OperatorSpec
 from actors.protocols import InvalidActionError, NotPouredError
 

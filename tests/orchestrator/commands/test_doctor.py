@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import time
 from collections.abc import Iterator
 from math import radians
 from pathlib import Path
@@ -12,7 +13,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from actors.arm.checksum import ChecksumError, require_accepted
+from actors.arm.errors import NotAcceptedError
+from actors.arm.ur.accepted import require_accepted
 from actors.balance.virtual_serial.handle import VirtualSerialBalance
 from actors.virtual_ur.launcher import VirtualController
 from orchestrator.cli import app
@@ -225,9 +227,29 @@ def test_balance_that_is_unplugged_or_silent_is_told_with_what_to_do(
 
 def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_changed() -> None:
     require_accepted("22c99aa2", "22C99AA2", "robot")
-    with pytest.raises(ChecksumError, match="decant doctor"):
+    with pytest.raises(NotAcceptedError, match="decant doctor"):
         require_accepted(None, "22C99AA2", "robot")
-    with pytest.raises(ChecksumError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
+    with pytest.raises(NotAcceptedError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
         require_accepted("22C99AA2", "DEADBEEF", "robot")
-    with pytest.raises(ChecksumError, match="tells no safety checksum"):
+    with pytest.raises(NotAcceptedError, match="tells no safety checksum"):
         require_accepted("22C99AA2", None, "robot")
+
+
+@pytest.mark.parametrize(("up", "state"), [("0, 9.82, 0", "fail"), ("0, 0.5, 9.8", "ok")])
+def test_a_robot_that_hangs_where_the_file_has_it_stand_is_told(
+    laboratory: Path, controller: VirtualController, up: str, state: str
+) -> None:
+    """What the tool feels tells where up is."""
+    with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
+        connection.sendall(f"def hang():\n set_gravity([{up}])\nend\n".encode())
+        time.sleep(0.3)
+    try:
+        found = checked(laboratory)["mount"]
+    finally:
+        with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
+            connection.sendall(b"def stand():\n set_gravity([0, 0, 9.82])\nend\n")
+            time.sleep(0.3)
+    assert found["state"] == state, found
+    if state == "fail":
+        assert "tilt 90 deg, turn 0 deg would agree" in found["found"]
+        assert "mount" in found["advice"]

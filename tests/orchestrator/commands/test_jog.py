@@ -8,6 +8,9 @@ from typing import Any
 
 import pytest
 
+from actors.arm.geometry import Pose
+from actors.arm.protocol import Whereabouts
+from actors.arm.spec import UrArmSpec
 from actors.protocols import LaboratoryError
 from actors.virtual_ur.launcher import VirtualController
 from orchestrator.commands.jog import JogError, Jogging, Step, parse_step, steps_home
@@ -23,11 +26,14 @@ class Arm:
     """Does as it is told, and writes it down."""
 
     def __init__(self, joints: tuple[float, ...]) -> None:
-        self._joints = list(joints)
+        self._joints, self.home = list(joints), joints
         self.said: list[Any] = []
 
     def joints(self) -> tuple[float, ...]:
         return tuple(self._joints)
+
+    def where(self) -> Whereabouts:
+        return Whereabouts(Pose(x=0.5), tuple(self._joints), self.home)
 
     def release(self) -> None:
         self.said.append("release")
@@ -43,10 +49,10 @@ class Arm:
 class Session:
     def __init__(self, *typed: str) -> None:
         spec = load_laboratory(LABORATORY).arm
-        assert spec is not None
+        assert isinstance(spec, UrArmSpec)
         self.home = spec.home
         self.arm, self.screen, self._typed = Arm(spec.home), "", list(typed)
-        self.jogging = Jogging(self.arm, spec, self._read, self._tell)  # type: ignore[arg-type]
+        self.jogging = Jogging(self.arm, self._read, self._tell)  # type: ignore[arg-type]
 
     def _read(self, prompt: str) -> str:
         self.screen += prompt

@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from actors.bench.questions import Questions
-from actors.bench.wired_words import stopped_question
+from actors.bench.words import stopped_question
 from actors.operator import OperatorSpec, Question
 from actors.protocols import LaboratoryError, Notice
 from orchestrator.events import LogLine

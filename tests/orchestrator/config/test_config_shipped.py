@@ -12,7 +12,6 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from actors.bench.planning import planner
 from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
 from orchestrator.config.schema import (
@@ -103,7 +102,7 @@ def test_first_pours_of_a_real_arm_fit_the_limits_of_its_first_day(tmp_path: Pat
     assert plan.deployment is not None
     assert plan.laboratory.arm is not None
     assert (plan.laboratory.mode, plan.deployment.strategy, plan.deployment.pours) == ("hardware", "D2", 3)
-    scene, plan_path = plan.deployment.scenes[0], planner(plan.laboratory.arm)
+    scene, plan_path = plan.deployment.scenes[0], plan.laboratory.arm.plan
     speeds, offsets = ([axis.lower, axis.upper] for axis in plan.deployment.actions.axes)
     for speed, offset in itertools.product(speeds, offsets):
         action = Action(**scene.fixed, angular_velocity=speed, x_offset=offset)

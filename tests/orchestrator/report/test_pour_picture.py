@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.protocols import SimulationResult
 from orchestrator.report.scene import _moments, simulation_png
 from orchestrator.report.section import place, section
 from sim_engine.motion import plan_motion
+from sim_engine.simulated import SimulatedPour
 from sim_engine.vessel.build import build_vessel
 from tests.orchestrator import watched
 from tests.orchestrator.reported import is_picture
@@ -44,7 +44,7 @@ def test_snapshots_show_the_flow_from_its_beginning_to_its_end() -> None:
 def test_simulation_without_frames_is_refused_with_advice(tmp_path: Path) -> None:
     task, result = watched.simulation()
     with pytest.raises(ValueError, match="record rate above 0"):
-        simulation_png(tmp_path / "pour.png", task, SimulationResult(result.outcome))
+        simulation_png(tmp_path / "pour.png", task, SimulatedPour(result.outcome))
 
 
 def test_section_of_a_cup_is_its_wall_cut_open() -> None:

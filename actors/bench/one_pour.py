@@ -1,0 +1,416 @@
+"""One pour: the operator's steps, consent, the arm's ways, the weighings, and the way back from a stop.
+
+Two rules hold throughout. While somebody is asked to put hands into the cell, no program runs on the controller, which
+is read back first. And nothing moves unless somebody has just said that it may, and been told how long they have.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from actors.arm.actor import DeviceArm
+from actors.arm.errors import ArmError, ArmLostError, ArmRefusedError, ArmStoppedError
+from actors.arm.protocol import ArmFacts, ArmState, Executed, PlannedPour
+from actors.arm.spec import ArmSpec
+from actors.balance.actor import DeviceBalance
+from actors.balance.errors import BalanceError
+from actors.balance.placement import Weighed
+from actors.balance.spec import BalanceSpec
+from actors.balance.weighing import Weighings
+from actors.bench.progress import PourReport
+from actors.bench.questions import Questions
+from actors.bench.virtual_bench import Nature, PourAsk
+from actors.bench.words import (
+    grams,
+    start_question,
+    stopped_question,
+    unsafe_question,
+    upright_question,
+    way_home_question,
+)
+from actors.device import DeviceLostError
+from actors.operator import Question
+from actors.protocols import (
+    BenchLostError,
+    InvalidActionError,
+    LaboratoryError,
+    Notice,
+    NotPouredError,
+    PourFailedError,
+    ProgressCallback,
+    UnknownPourError,
+)
+from sim_engine.action import Action
+from sim_engine.outcome import PourMeasurement
+from sim_engine.sampled_motion import SampledMotion
+from sim_engine.task import Scene
+
+WEIGHING_TIME = 3.0
+"""Bench time that a weight usually takes, for the progress bar [s]."""
+
+SETTLING_TIME = 2.0
+"""From the arm's return home to the first weighing [s of bench time]: the last drops fall."""
+
+LOOK_INTERVAL = 0.1
+"""Between two looks at the balance's display [s of the clock]."""
+
+_BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
+_STUCK = (ArmError, DeviceLostError)
+
+
+class RefusedError(LaboratoryError):
+    """The operator said no."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all pours on a bench share; see `pouring_bench.PouringBench`."""
+
+    mode: str
+    spec: ArmSpec
+    balance_spec: BalanceSpec
+    operator_time: float
+    arm: DeviceArm
+    balance: DeviceBalance | None
+    questions: Questions
+    nature: Nature
+    tell: Callable[[Notice], None]
+
+
+class OnePour:
+    """One pour, from the first question to the last weight.
+
+    Args:
+        setup: of the bench.
+        scene, action: what to pour.
+        path: checked.
+        seed: of a virtual bench's chance.
+        known: weighings of this pourer that still hold.
+        progress: told where it stands.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        scene: Scene,
+        action: Action,
+        path: PlannedPour,
+        *,
+        seed: int,
+        known: Mapping[str, Weighed] | None,
+        progress: ProgressCallback | None,
+    ) -> None:
+        self._setup, self._scene, self._action, self._path, self._seed = setup, scene, action, path, seed
+        self._weighings = Weighings(
+            setup.balance_spec, setup.balance, self._ask, known, self._note_weight, nominal=scene.liquid.mass
+        )
+        self._report = PourReport(progress, _expected(setup, path), path.pour_time)
+        self._begun = False
+        self._broken: Exception | None = None
+        self._executed: Executed | None = None
+        self._facts: ArmFacts | None = None
+
+    @property
+    def lasting(self) -> dict[str, Weighed]:
+        """Weighings that hold for later pours with this pourer."""
+        return self._weighings.lasting
+
+    async def run(self) -> PourMeasurement:
+        """All of it.
+
+        Raises:
+            NotPouredError: nothing was poured.
+            UnknownPourError: something may have been.
+        """
+        self._setup.questions.take_log()
+        watching = asyncio.create_task(self._watch())
+        try:
+            await self._before()
+            await self._move()
+            return await self._after()
+        except asyncio.CancelledError as error:
+            await self._leave_safe()
+            if self._begun:
+                weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
+                self._setup.tell(Notice("warning", weighed))
+                raise
+            raise NotPouredError("the pour was given up before it began; nothing was poured") from error
+        except (InvalidActionError, PourFailedError):
+            await self._leave_safe()
+            raise
+        except LaboratoryError as error:
+            if self._begun and not isinstance(error, BalanceError):
+                await self._keep_what_shows()
+            await self._leave_safe()
+            raise self._said(error) from error
+        finally:
+            watching.cancel()
+            await asyncio.gather(watching, return_exceptions=True)
+            await self._setup.nature.end()
+
+    # ---- in order
+
+    async def _before(self) -> None:
+        setup = self._setup
+        self._report.enter("operator")
+        self._facts = await setup.arm.ready()
+        await self._make_safe()
+        if setup.balance is not None:
+            await setup.balance.device.revive()
+            await setup.balance.resume()
+        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed))
+        await self._weighings.before()
+
+    async def _move(self) -> None:
+        """Out, pour, home: all of it after one consent, unless something stops it."""
+        setup, path = self._setup, self._path
+        await self._consent(start_question(setup.spec, path))
+        async with self._setup.nature.followed():
+            await self._out_and_home()
+
+    async def _out_and_home(self) -> None:
+        setup, path = self._setup, self._path
+        self._report.enter("approach")
+        try:
+            await setup.nature.lasting(setup.arm.move_to_start(path), path.approach_time)
+        except _STUCK as error:
+            await self._bring_home(error)
+            raise
+        await setup.nature.note()
+        await setup.nature.tilts()
+        self._report.enter("tilt")
+        self._begun = True
+        try:
+            self._executed = await setup.nature.lasting(setup.arm.execute(path, self._follow), path.pour_time)
+        except ArmRefusedError as error:  # before anything moved
+            self._begun = False
+            await self._bring_home(error)
+            raise
+        except _BROKEN_OFF as error:
+            self._broken, self._executed = error, getattr(error, "executed", None)
+            await self._bring_upright(error)
+        await setup.nature.note()
+        try:
+            if self._broken is not None:
+                await setup.arm.release()  # agreed to with the un-tilting
+            await setup.arm.retreat(path)
+        except _STUCK as error:
+            await self._bring_home(error)
+        await self._let_it_land()
+
+    async def _after(self) -> PourMeasurement:
+        await self._make_safe()
+        self._report.enter("settle")
+        await self._setup.nature.settle(SETTLING_TIME)
+        self._report.enter("weigh")
+        await self._weighings.after()
+        measured = self._weighings.measurement(self._scene.liquid.mass)
+        self._report.enter("record", 1.0)
+        if self._broken is not None:
+            raise self._broken
+        return PourMeasurement(measured.loaded, measured.spilled, measured.retained, self._notes(measured))
+
+    # ---- the operator
+
+    async def _ask(self, question: Question) -> str:
+        """Put a question; one that invites hands into the cell only while nothing can move."""
+        if question.hands:
+            await self._make_safe()
+        return await self._setup.questions.ask(question)
+
+    async def _make_safe(self) -> None:
+        """See that nothing moves and nothing can; where that can't be seen, nobody is invited into the cell.
+
+        Raises:
+            RefusedError: it can't, and the operator leaves it at that.
+        """
+        problem = ""
+        while True:
+            try:
+                if problem:
+                    await self._setup.arm.ready()
+                await self._setup.arm.hands_in()
+                return
+            except BenchLostError:
+                raise
+            except _STUCK as error:
+                if not problem:
+                    problem = str(error)  # the connection may be made anew without anybody's help
+                    continue
+                problem = str(error)
+            if not await self._agreed(unsafe_question(problem)):
+                raise RefusedError(f"it can't be seen that the arm keeps still: {problem}")
+
+    async def _agreed(self, question: Question) -> bool:
+        return (await self._ask(question)).strip().lower() in ("yes", "y")
+
+    async def _consent(self, question: Question) -> None:
+        """Have somebody say that the arm may move, announce it, and release it.
+
+        Raises:
+            RefusedError: they said no.
+        """
+        if not await self._agreed(question):
+            raise RefusedError("the operator did not let the arm move")
+        spec = self._setup.spec
+        text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
+        # The driver waits for as long from the release to the first movement.
+        await self._setup.questions.announce(text, spec.on_clock(spec.announcement))
+        await self._setup.arm.release()
+
+    # ---- the way back from a stop
+
+    async def _bring_upright(self, error: Exception) -> None:
+        """After a stop with the pourer tilted: nothing moves before somebody has looked at it and said so, twice."""
+        while True:
+            await self._recover(error)
+            await self._consent(upright_question(self._setup.spec))
+            try:
+                await self._setup.arm.untilt(self._path)
+                return
+            except _STUCK as again:
+                error = again
+
+    async def _bring_home(self, error: Exception) -> None:
+        """After a stop on the way to the pour or from it."""
+        while True:
+            await self._recover(error)
+            await self._consent(way_home_question(self._setup.spec))
+            try:
+                await self._setup.arm.retreat(self._path)
+                return
+            except _STUCK as again:
+                error = again
+
+    async def _recover(self, error: Exception) -> None:
+        """Make the robot ready again, once somebody has seen to the cause; nothing moves yet.
+
+        Raises:
+            RefusedError: they would rather leave it as it is.
+        """
+        if isinstance(error, BenchLostError):
+            raise error  # nobody can mend it from here
+        problem = str(error)
+        while await self._agreed(stopped_question(error, problem, begun=self._begun)):
+            try:
+                done = await self._setup.arm.recover()
+            except BenchLostError:
+                raise
+            except _STUCK as again:
+                problem = str(again)
+                continue
+            self._setup.tell(Notice("info", f"the arm is ready again: {done or 'nothing had to be done'}"))
+            return
+        raise RefusedError(f"{error}; the operator leaves the arm as it stands")
+
+    async def _leave_safe(self) -> None:
+        """Stop what moves, whatever has failed: also when this task itself is being cancelled."""
+        setup = self._setup
+
+        async def stop() -> None:
+            with contextlib.suppress(LaboratoryError):
+                await setup.arm.stop()
+            if setup.balance is not None:
+                with contextlib.suppress(LaboratoryError):
+                    await setup.balance.interrupt()
+
+        stopping = asyncio.ensure_future(stop())
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.shield(stopping)
+
+    # ---- the liquid
+
+    async def _let_it_land(self) -> None:
+        """What was executed is over: the liquid does what it does, and lies on the balance."""
+        await self._setup.nature.lands(self._executed, self._broken)
+
+    async def _keep_what_shows(self) -> None:
+        """Of a pour that was broken off, whatever can be weighed without touching anything."""
+        with contextlib.suppress(LaboratoryError):
+            await self._let_it_land()
+            await self._setup.nature.settle(SETTLING_TIME)
+            await self._weighings.at_once()
+
+    # ---- what is kept
+
+    def _note_weight(self, key: str, weighed: Weighed) -> None:
+        """Into the journal at once: no weight is lost, whatever happens next."""
+        self._setup.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
+
+    def _said(self, error: Exception) -> LaboratoryError:
+        """The error for those above, with what is known of the liquid."""
+        if not self._begun:
+            return NotPouredError(f"{error}. Nothing was poured")
+        text = f"{error}. What was poured is unknown"
+        with contextlib.suppress(LaboratoryError):
+            m = self._weighings.measurement()
+            text = (
+                f"{error}. It was not the pour that was asked for; weighed were {grams(m.loaded)} loaded, "
+                f"{grams(m.spilled)} spilled, {grams(m.retained)} retained"
+            )
+        return UnknownPourError(f"{text}. All weighings: {self._weighed()}")
+
+    def _weighed(self) -> str:
+        return ", ".join(f"{key} {grams(w.mass)}" for key, w in self._weighings.weighed.items()) or "nothing"
+
+    def _notes(self, measured: PourMeasurement) -> dict[str, Any]:
+        executed = self._executed
+        assert executed is not None
+        return {
+            "mode": self._setup.mode,
+            **measured.notes,
+            "arm": _who(self._facts),
+            "executed_s": float(executed.times[-1]),
+            "largest_tilt_deg": _largest_tilt(executed),
+            "executed": executed.record(),
+            "operator": self._setup.questions.take_log(),
+        }
+
+    # ---- screens
+
+    def _follow(self, state: ArmState) -> None:
+        self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
+
+    async def _watch(self) -> None:
+        """Give the balance's display to those who watch; it can't hold the pour up."""
+        balance = self._setup.balance
+        if balance is None:
+            return
+        while True:
+            with contextlib.suppress(LaboratoryError):
+                weight = await balance.read()
+                if math.isfinite(weight.mass):
+                    self._report.show(weight.mass)
+            await asyncio.sleep(LOOK_INTERVAL)
+
+
+def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
+    """Time of each checkpoint [s of bench time]."""
+    return {
+        "operator": setup.operator_time + 4.0 * WEIGHING_TIME,
+        "approach": setup.spec.announcement + path.approach_time,
+        **{name: end - start for name, start, end in path.phases},
+        "settle": path.retreat_time + SETTLING_TIME,
+        "weigh": WEIGHING_TIME,
+        "record": 2.0 * WEIGHING_TIME,
+    }
+
+
+def _largest_tilt(executed: Executed) -> float:
+    """As read back [deg]."""
+    if len(executed.times) < 2:
+        return 0.0
+    return math.degrees(float(SampledMotion(executed.times, executed.poses).tilt(executed.times).max()))
+
+
+def _who(facts: ArmFacts | None) -> dict[str, Any]:
+    """Of the robot, what a later reader will ask for."""
+    if facts is None:
+        return {}
+    told = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
+    return {name: text for name, text in told.items() if text}

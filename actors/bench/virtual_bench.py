@@ -1,0 +1,342 @@
+"""The virtual bench: what truly becomes of the liquid, when something that isn't there stands in for arm and balance.
+
+Nothing of it is known to those who learn but what the balance shows. What the arm executed counts, and neither what was
+planned nor what the driver believes: a motion that was broken off leaves liquid in the pourer, or lets it run on while
+the pourer stands tilted. Where part of a motion is not known, nobody says what became of the liquid.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Awaitable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.protocol import Executed, PlannedPour
+from actors.arm.spec import UrArmSpec
+from actors.bench.device_stand_ins import DeviceStandIns
+from actors.bench.hidden import draw_pose_error, hidden_pour, spill_of, stream
+from actors.bench.spec import VirtualBenchSpec
+from actors.bench.stand_ins import History
+from actors.bench.virtual_operator import Hands
+from actors.protocols import LaboratoryError, SimulatorPool
+from sim_engine.action import Action
+from sim_engine.liquid import SimulationParameters
+from sim_engine.sampled_motion import SampledMotion
+from sim_engine.task import PoseError, PourTask, Scene
+
+FloatArray = NDArray[np.float64]
+T = TypeVar("T")
+
+AT_START = 2e-3
+"""How near the pour's first pose the arm stands when it begins [rad]."""
+
+AT_REST = 1e-6
+"""Joints that change by less from sample to sample stand still [rad]."""
+
+UPRIGHT = math.radians(0.5)
+"""Below this tilt [rad] a pourer is upright; ways to and from a pour keep it so."""
+
+LONGEST_REST = 6.0
+"""Rest in the middle of a motion is simulated for so long [s]: what runs out meanwhile has run out by then."""
+
+NOTING_INTERVAL = 40.0
+"""Between two looks at what the arm did [s of its time]; a virtual controller remembers two minutes."""
+
+LONGEST_GAP = 0.1
+"""Between two samples of a history without a gap [s of controller time]; it is sampled at 125 Hz."""
+
+
+@dataclass(frozen=True)
+class PourAsk:
+    """The pour that is under way; `seed` is that of all its chance."""
+
+    scene: Scene
+    action: Action
+    path: PlannedPour
+    seed: int
+
+
+class Nature:
+    """What happens around arm and balance during a pour. On hardware nobody here has to do anything about it.
+
+    Args:
+        time_scale: bench seconds per second of the clock.
+    """
+
+    def __init__(self, time_scale: float) -> None:
+        self._time_scale = time_scale
+
+    async def prepare(self, pour: PourAsk) -> None:
+        """A pour is about to be prepared by the operator."""
+
+    @contextlib.asynccontextmanager
+    async def followed(self) -> AsyncIterator[None]:
+        """Entered before the arm leaves home, left when it is back."""
+        yield
+
+    async def note(self) -> None:
+        """The arm has come to the end of a way."""
+
+    async def tilts(self) -> None:
+        """The arm stands at the pour's first pose, and is about to tilt."""
+
+    async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
+        """What was executed is over: the liquid does what it does.
+
+        Args:
+            executed: as the arm read it back, if it did.
+            broken: why the pour was broken off, if it was.
+
+        Raises:
+            LaboratoryError: nobody can say what became of it.
+        """
+
+    async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
+        """Something that takes the arm so long [s of bench time]."""
+        return await doing
+
+    async def wait(self, seconds: float) -> None:
+        """Bench time passes [s]."""
+        await asyncio.sleep(seconds / self._time_scale)
+
+    async def settle(self, seconds: float) -> None:
+        """The last drops fall, for so long at least [s of bench time]."""
+        await self.wait(seconds)
+
+    async def end(self) -> None:
+        """The pour is over, however."""
+
+
+class VirtualBench(Nature):
+    """A bench without hardware, whose liquid follows what the arm read back.
+
+    Args:
+        spec: what is hidden.
+        time_scale: bench seconds per second of the clock.
+        stand_ins: of arm and balance.
+        hands: that fill the pourer, and know what stands where.
+        simulators: a pool of its own for the hidden liquid.
+    """
+
+    def __init__(
+        self,
+        spec: VirtualBenchSpec,
+        time_scale: float,
+        stand_ins: DeviceStandIns,
+        hands: Hands,
+        simulators: SimulatorPool,
+    ) -> None:
+        super().__init__(time_scale)
+        self._spec, self._simulators = spec, simulators
+        self.stand_ins, self.things, self._hands = stand_ins, hands.things, hands
+        self._pour: PourAsk | None = None
+        self._landed = False
+
+    async def prepare(self, pour: PourAsk) -> None:
+        """See `Nature.prepare`."""
+        self._pour = pour
+        self._hands.prepare(pour.scene.liquid.mass, stream(pour.seed, "arm"))
+        await self.stand_ins.prepare(stream(pour.seed, "balance"))
+        await self.stand_ins.put(self.things.carried)
+
+    @contextlib.asynccontextmanager
+    async def followed(self) -> AsyncIterator[None]:
+        """See `Nature.followed`."""
+        self._landed = False
+        yield
+
+    async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
+        """See `Nature.lands`: the liquid follows, once, and the balance carries what became of it.
+
+        Raises:
+            LaboratoryError: with the errors of this pour's placement the vessels would touch, the liquid could not be
+                simulated, or part of the motion is not known.
+        """
+        assert self._pour is not None
+        if self._landed:
+            return
+        error = draw_pose_error(self._spec, self._pour.seed)
+        motion = self._motion(executed, error.tilt)
+        self._landed = True
+        if motion is not None:
+            spilled, retained = await self._simulate(self._pour, motion, error)
+            self.things.receive(spilled, retained)
+        await self.stand_ins.put(self.things.carried)
+
+    def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
+        """What the pourer truly did; None if nothing left it."""
+        if executed is None or not executed.completed or len(executed.times) < 2:
+            raise LaboratoryError(
+                "the virtual bench can't tell what became of the liquid: its arm only tells of pours that it completed"
+            )
+        return slipped(SampledMotion(executed.times, executed.poses), grip_tilt)
+
+    async def _simulate(self, pour: PourAsk, motion: SampledMotion, error: PoseError) -> tuple[float, float]:
+        """Masses spilled and retained [kg]; same motion, same seed, same masses."""
+        mass = self.things.in_pourer
+        scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))
+        shift = PoseError(x=error.x, y=error.y)
+        task = PourTask(scene, pour.action, SimulationParameters(), 0, pose_error=shift, motion=motion)
+        spill = spill_of(await hidden_pour(self._spec, self._simulators, task, pour.seed), mass)
+        return spill.spilled, spill.retained
+
+
+class FollowedBench(VirtualBench):
+    """A virtual bench whose arm has a history of its own: what its stand-in did counts, also of a broken motion.
+
+    Args:
+        spec, stand_ins, hands, simulators: as for `VirtualBench`.
+        arm: the cell as everybody believes it to be.
+    """
+
+    def __init__(
+        self,
+        spec: VirtualBenchSpec,
+        arm: UrArmSpec,
+        stand_ins: DeviceStandIns,
+        hands: Hands,
+        simulators: SimulatorPool,
+    ) -> None:
+        super().__init__(spec, arm.time_scale, stand_ins, hands, simulators)
+        self._arm = arm
+        self._noting = asyncio.Lock()
+        self._times: list[float] = []
+        self._joints: list[tuple[float, ...]] = []
+        self._since = self._earlier = 0.0
+        self._gap = ""
+
+    @contextlib.asynccontextmanager
+    async def followed(self) -> AsyncIterator[None]:
+        """See `Nature.followed`: what the arm does is noted again and again, however long anybody needs."""
+        self._times, self._joints, self._landed, self._gap = [], [], False, ""
+        self._earlier, self._since = 0.0, (await self.stand_ins.history(math.inf)).now
+        following = asyncio.create_task(self._follow())
+        try:
+            yield
+        finally:
+            following.cancel()
+            await asyncio.gather(following, return_exceptions=True)
+
+    async def _follow(self) -> None:
+        while True:
+            await asyncio.sleep(NOTING_INTERVAL / self._arm.time_scale)
+            with contextlib.suppress(LaboratoryError):  # what matters is noted once more at the end
+                await self.note()
+
+    async def note(self) -> None:
+        """Take down what the arm did since.
+
+        The controller remembers two minutes of its time: whoever comes later, because its process was held up, misses
+        part of the motion. That is kept in mind, and then nobody says what became of the liquid.
+        """
+        async with self._noting:
+            history = await self.stand_ins.history(self._since)
+            if history.now < self._since:  # the controller was switched off, and its clock begins anew
+                self._gap = self._gap or "the controller was switched off, and forgot what its arm had done before"
+                self._earlier += self._since
+                self._since = 0.0
+                history = await self.stand_ins.history(0.0)
+            if (missed := _missed(history, self._since)) > LONGEST_GAP:
+                self._gap = self._gap or f"{missed:.0f} s of its arm's motion are forgotten by the controller"
+            self._take(history)
+
+    def _take(self, history: History) -> None:
+        last = self._times[-1] if self._times else -math.inf
+        for t, q in zip(history.times, history.joints, strict=True):
+            if t <= history.now and t + self._earlier > last:
+                self._times.append(t + self._earlier)
+                self._joints.append(q)
+                self._since = t
+
+    async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
+        """See `VirtualBench.lands`."""
+        if not self._landed:
+            await self.note()
+        await super().lands(executed, broken)
+        self._times, self._joints = [], []
+
+    def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
+        """What the pourer truly did, from the pour's first pose on; None if it never left it."""
+        from actors.arm.path.frames import pourer_motion
+
+        if self._gap:
+            raise LaboratoryError(
+                f"the virtual bench can't tell what became of the liquid: {self._gap}, because a process of the bench "
+                "was stopped or starved meanwhile"
+            )
+        assert self._pour is not None
+        if len(self._times) < 2:
+            return None
+        start = self._pour.path.pour.joints[0]  # type: ignore[attr-defined]
+        cut = executed_pour(np.array(self._times), np.array(self._joints), start)
+        if cut is None:
+            return None
+        times, joints = cut
+        tilted = np.flatnonzero(pourer_motion(joints, times, self._arm).tilt(times) > UPRIGHT)
+        if len(tilted) == 0:
+            return None
+        end = min(int(tilted[-1]) + 2, len(times))  # what follows is the way home
+        return pourer_motion(joints[:end], times[:end], self._arm, grip_tilt=grip_tilt)
+
+
+def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
+    """The motion of a pourer that sits in the fingers turned by so much [rad] about the y axis of its underside."""
+    c, s = math.cos(0.5 * grip_tilt), math.sin(0.5 * grip_tilt)
+    w, x, y, z = (motion.poses[:, k] for k in range(3, 7))
+    turned = np.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x], axis=-1)
+    return SampledMotion(motion.times, np.concatenate([motion.poses[:, :3], turned], axis=-1))
+
+
+def _missed(history: History, since: float) -> float:
+    """How long nothing is known of the motion, from a time on that was asked for until what was kept of it [s]."""
+    return max((history.times[0] if history.times else history.now) - since, 0.0)
+
+
+def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """The part of a history that is the pour: from the first movement away from its first pose to the last movement.
+
+    The clock plays no part in where it begins or ends, and long rests are shortened, so that the same motion is cut the
+    same however long anybody took over it.
+
+    Args:
+        times: shape (T,), increasing [s].
+        joints: shape (T, 6) [rad].
+        start: the pour's first joints, shape (6,) [rad].
+
+    Returns:
+        Times from 0, and joints; None if nothing moved after the arm had stood there.
+    """
+    away = np.max(np.abs(joints - start), axis=1) >= AT_START
+    moves = np.max(np.abs(np.diff(joints, axis=0)), axis=1) > AT_REST
+    rests = np.flatnonzero(~away[:-1] & ~moves)
+    if len(rests) == 0:
+        return None
+    first = int(rests[0])
+    left = np.flatnonzero(away[first:])
+    if len(left) == 0:
+        return None
+    begin = first + int(left[0])
+    while begin > first and moves[begin - 1]:
+        begin -= 1
+    end = begin + int(np.flatnonzero(moves[begin:])[-1]) + 1
+    return _without_long_rests(np.diff(times[begin : end + 1]), moves[begin:end], joints[begin : end + 1])
+
+
+def _without_long_rests(
+    gaps: FloatArray, moved: NDArray[np.bool_], joints: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Times from 0; of a rest only its beginning is kept."""
+    kept, now, rest = [(0.0, 0)], 0.0, 0.0
+    for i, (gap, moves) in enumerate(zip(gaps, moved, strict=True), start=1):
+        allowed = float(gap) if moves else min(float(gap), LONGEST_REST - rest)
+        rest = 0.0 if moves else rest + allowed
+        if allowed > 0.0:
+            now += allowed
+            kept.append((now, i))
+    return np.array([t for t, _ in kept]), joints[[i for _, i in kept]]
