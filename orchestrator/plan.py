@@ -187,6 +187,11 @@ class DeploymentPlan:
         """Real pours per scene."""
         return self.settings.pours or 0
 
+    def largest_wanted(self, scene: Scene) -> float:
+        """Volume that the receiver of a scene has to hold [m³]: the load, unless less is asked for."""
+        load = scene.liquid.volume
+        return load if self.objectives is None else self.objectives.largest_wanted(load)
+
     @property
     def loss_name(self) -> str:
         """What results call that which is minimised."""

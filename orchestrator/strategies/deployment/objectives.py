@@ -102,6 +102,11 @@ class Objectives:
     def _timed(self) -> bool:
         return any(part.name == "time" for part in self.parts)
 
+    def largest_wanted(self, load: float) -> float:
+        """What the receiver has to hold of a load if a pour goes as it is wanted [m³]."""
+        targets = [part.volume + part.tolerance for part in self.parts if part.name == "target_volume"]
+        return min([load, *([max(targets)] if targets else [])])
+
     def _wanted(self, scene: Scene) -> float:
         """Share of the load that should arrive."""
         targets = [part.volume / scene.liquid.volume for part in self.parts if part.name == "target_volume"]
