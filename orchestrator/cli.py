@@ -321,6 +321,17 @@ app.command(
 )(bench_verbs.pour)
 
 
+@app.command(epilog=examples("decant plugins", "decant plugins --json"))
+def plugins(as_json: Json = False) -> None:
+    """List what installed packages add: strategies, objectives, balances, arms and sources of vessels.
+
+    Exit code 1 if a package registers something that can't be used; it is named with its package and the reason.
+    """
+    from orchestrator.commands import plugins as verb
+
+    call(verb.plugins, as_json=as_json)
+
+
 @app.command(
     epilog=examples("decant physics", "decant physics outflow walls --full", "decant physics --full --write docs"),
 )

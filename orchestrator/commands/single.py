@@ -118,7 +118,7 @@ def wanted_in(plan: CampaignPlan, scene: Scene, name: str | None) -> float | Non
     """
     if plan.deployment is None or name in ("calibration", "transfer"):
         return None
-    return plan.deployment.largest_wanted(scene)
+    return plan.deployment.wanted(scene)
 
 
 def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:

@@ -129,7 +129,7 @@ class _Checker:
 
     def reachable(self, plan: CalibrationPlan | DeploymentPlan, scene: Scene, role: _Role) -> None:
         """Some action of the space must pour, not touch, and be one that the arm can make."""
-        wanted = plan.largest_wanted(scene) if isinstance(plan, DeploymentPlan) else None
+        wanted = plan.wanted(scene) if isinstance(plan, DeploymentPlan) else None
         vessels = self.scene(scene, role, wanted)
         self._payload(scene)
         actions = plan.actions
