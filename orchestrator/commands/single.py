@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, mention, print_json, stdout_for_results
+from orchestrator.commands.waiting import waiting_for
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -123,14 +125,16 @@ def wanted_in(plan: CampaignPlan, scene: Scene, name: str | None) -> float | Non
 
 def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:
     """One after the other; Taichi ends with them."""
-    from rich.console import Console
+    begin = time.monotonic()
+    runs: list[SimulatedPour] = []
 
-    note = "the first pour ever also compiles kernels, about 10 s"
-    runs = []
-    with stdout_for_results(), Console(stderr=True).status("") as status:
+    def doing() -> str:
+        note = "" if runs else "; the first pour ever also compiles kernels, about 10 s"
+        return f"simulating seed {len(runs) + 1} of {len(tasks)}, {time.monotonic() - begin:.0f} s so far{note}"
+
+    with stdout_for_results(), waiting_for(doing):
         try:
-            for i, task in enumerate(tasks, start=1):
-                status.update(f"simulating seed {i} of {len(tasks)} ({note}) …")
+            for task in tasks:
                 runs.append(simulator.simulate(task))
         finally:
             simulator.close()
