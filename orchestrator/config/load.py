@@ -40,6 +40,8 @@ def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
+    if laboratory is not None:
+        load_laboratory(laboratory)  # what is wrong with it is not the campaign's fault
     report = Report()
     place = Place(Document.read(resolved(path)))
     if (other := wrong_kind(place.document, "campaign")) is not None:
