@@ -152,3 +152,52 @@ def test_what_nobody_has_is_refused_with_what_is_meant(decant: Decant, folder: P
     said = decant("validate", "example.yaml", cwd=folder)
     assert said.returncode == 2
     assert "'sprong' is not known here; did you mean 'spring'?" in said.stderr
+
+
+CAMPAIGN = """\
+name: outside
+seed: 3
+laboratory: example.yaml
+liquid: {mass: 100 g}
+pourer: beaker.yaml
+motion: {hold_time: 0.3 s, return_velocity: 120 deg/s}
+simulator: {parameters: {particles: 300}}
+deployment:
+  strategy: hypercube
+  centred: true
+  receiver: cone.yaml
+  motion: {max_angle: 115 deg, height: 60 mm}
+  actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [60 mm, 90 mm]}
+  objectives: [{name: spillage}, {name: gentle, weight: 0.2, rough: 100 deg/s}]
+  pours: 2
+outputs: {directory: runs}
+"""
+
+
+def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: Decant, folder: Path) -> None:
+    (folder / "campaign.yaml").write_text(CAMPAIGN)
+    checked = decant("validate", "campaign.yaml", cwd=folder)
+    assert checked.returncode == 0, checked.stderr
+    ran = decant("run", "campaign.yaml", "--json", cwd=folder)
+    assert ran.returncode == 0, ran.stderr
+    (run,) = (folder / "runs").iterdir()
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["pours"] == 2
+    resolved = json.loads((run / "resolved.json").read_text())
+    assert resolved["deployment"]["strategy"] == "hypercube"
+    assert resolved["laboratory"]["balance"]["kind"] == "spring"
+    assert resolved["laboratory"]["arm"]["kind"] == "stand"
+    assert resolved["deployment"]["receiver"]["cone"]["top"] == "0.045 m"
+    assert any(part["name"] == "gentle" for part in resolved["deployment"]["objectives"])
+    again = decant("validate", str(run / "resolved.json"), cwd=folder)
+    assert again.returncode == 0, again.stderr
+
+
+def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: Path, folder: Path) -> None:
+    said = command(site)("doctor", "example.yaml", "--json", cwd=folder)
+    checks = {check["name"]: check for check in json.loads(said.stdout.splitlines()[-1])["checks"]}
+    assert checks["balance"]["found"] == "balance: a spring, step 0.1 g"
+    assert checks["balance reading"]["state"] == "ok"
+    said = command(site, broken)("doctor", "example.yaml", "--json", cwd=folder)
+    found = [check["found"] for check in json.loads(said.stdout.splitlines()[-1])["checks"]]
+    assert any("decant-broken 0.3" in text for text in found)
