@@ -30,11 +30,12 @@ from orchestrator.config.yaml.sections import Choice, Section
 from orchestrator.config.yaml.validate import sections_in
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment.objectives import Objective
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.risk import RiskSettings
 from orchestrator.strategies.deployment.trust import TrustSettings
 from orchestrator.strategies.deployment.window import WindowSettings
-from orchestrator.strategies.doors import STRATEGIES
+from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquid import SimulationParameters
 from sim_engine.validation import sensitivity
@@ -55,7 +56,7 @@ SECTIONS: dict[str, type[Section]] = {
     "prices": PricesSettings,
     "data": campaign.DataSection,
     "loss": campaign.LossSection,
-    "objective": campaign.ObjectiveSection,
+    "objective": Objective,
     "outputs": campaign.OutputsSection,
     "liquid": vessel.LiquidFile,
     "vessel": vessel.VesselFile,
@@ -96,7 +97,8 @@ OF_SECTIONS = {
     "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
     "LossSection": "[loss](#losses)",
-    "ObjectiveSection": "[objective](#objectives)",
+    "Objective": "[objective](#objectives)",
+    **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "TrustSettings": "[trust](#trust)",
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
     "WindowSettings": "[window](#risk-and-the-safe-window)",
@@ -212,7 +214,10 @@ def section(model: type[Section]) -> str:
     for key, name in model.written_keys().items():
         info = model.model_fields[name]
         default = _default(key, info, model)
-        rows.append((f"`{key}`", _value(info.annotation, info.metadata), default, _one_line(info.description or "")))
+        value = _value(info.annotation, info.metadata)
+        if model is Objective and name == model.tag:
+            value = ", ".join(f"`{word}`" for word in OBJECTIVES.names)
+        rows.append((f"`{key}`", value, default, _one_line(info.description or "")))
     return _table(("key", "value", "unless given", "meaning"), rows)
 
 
@@ -247,6 +252,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{name: partial(section, model) for name, model in SECTIONS.items()},
     "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),
     "deployment-strategies": partial(variants, campaign.DEPLOYMENTS, campaign.DeploymentSection),
+    "objectives": partial(variants, OBJECTIVES.all, Objective),
     "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Section),
     "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Section),
 }

@@ -17,9 +17,7 @@ from orchestrator.strategies.calibration.design import DesignedPours, DesignPour
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
 from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.risk import Disturbances
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.liquid import SimulationParameters
@@ -148,11 +146,8 @@ def prediction_stages(
             action = None if recommended is None else scene.action(dict(recommended.action_si))
             theta, known = _theta(plan, results), with_posterior(deployment, results)
             costing = Costing.of(deployment, scene, theta)
-            risk = known.settings.risk if isinstance(known.settings, D1Settings) else None
-            if risk is None:
-                return RepeatedSimulation(costing, action, seeds, seed, thetas)
-            draws = Disturbances(risk, deployment.actions, theta, seed, known.thetas).draws(seeds)
-            drawn = [draw.parameters for draw in draws] if risk.theta == "posterior" else thetas
+            draws = known.settings.draws(known, theta, seeds, seed)
+            drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
             return RepeatedSimulation(costing, action, seeds, seed, drawn, [draw.error for draw in draws])
 
         return build

@@ -5,11 +5,12 @@ from __future__ import annotations
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign.complaints import PlacedComplaints
 from orchestrator.config.campaign.resolve_data import resolve_data
-from orchestrator.config.campaign.resolve_objectives import STOPS, resolve_objectives
+from orchestrator.config.campaign.resolve_objectives import resolve_objectives
 from orchestrator.config.campaign.scenes import SceneBuilder
 from orchestrator.config.campaign.sections import DeploymentSection, LearningSection, LossSection
 from orchestrator.config.yaml.source import Place
 from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.deployment.objectives import STOPS
 from orchestrator.strategies.settings import Premises
 from sim_engine.losses import Loss
 from sim_engine.space import Space

@@ -21,6 +21,8 @@ from pydantic import (
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
+from sim_engine.marks import Mark
+
 Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
 
@@ -52,13 +54,6 @@ Name = Annotated[str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", m
 """A name that is also good as a part of a file's name."""
 
 Text = Annotated[str, Strict(), Field(min_length=1)]
-
-
-@dataclass(frozen=True)
-class Mark:
-    """Says something of a field where it is declared."""
-
-    meaning: str
 
 
 @dataclass(frozen=True)
@@ -148,6 +143,8 @@ def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
         variants: by the word that the key has; two or more.
         default: the variant that is meant where the key is missing; with none the key must be given.
     """
+    if not variants:
+        raise RuntimeError("Decant's own entry points are not registered; install it again (pip install -e .)")
     key = next(iter(variants.values())).tag
 
     def word(value: Any) -> str | None:
