@@ -303,7 +303,7 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     if origin is dict:
         return "mapping"
     if isinstance(annotation, type) and issubclass(annotation, Section):
-        return OF_SECTIONS[annotation.__name__]
+        return OF_SECTIONS.get(annotation.__name__, f"mapping: {_one_line(annotation.__doc__ or '')}")
     metadata = [deep for m in metadata for deep in (m.metadata if isinstance(m, FieldInfo) else [m])]
     if annotation is int:
         lowest = next((m.ge for m in metadata if getattr(m, "ge", None) is not None), None)

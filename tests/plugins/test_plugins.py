@@ -78,7 +78,7 @@ LABORATORY = (
 name: example
 in_process: true
 simulators: 1
-arm: {kind: stand}
+arm: {kind: stand, fastest: 130 deg/s}
 balance: {kind: spring, swing: 0.5 s, step: 0.1 g}
 """
     + BENCH
@@ -201,3 +201,44 @@ def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: P
     said = command(site, broken)("doctor", "example.yaml", "--json", cwd=folder)
     found = [check["found"] for check in json.loads(said.stdout.splitlines()[-1])["checks"]]
     assert any("decant-broken 0.3" in text for text in found)
+
+
+DIALECT = """
+from actors.balance.serial_balance import SerialBalance
+from actors.balance.spec import SerialBalanceSpec
+from actors.balance.virtual_serial.handle import VirtualSerialBalance
+
+far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
+balance = SerialBalance(SerialBalanceSpec(far.port, time_scale=20.0))
+print(balance.connect())
+balance.tare()
+far.put(0.2)
+print(balance.weigh().mass)
+balance.close()
+far.close()
+"""
+
+
+def python(folder: Path, program: str) -> list[str]:
+    """Lines that a program prints with a folder of packages installed."""
+    path = os.pathsep.join([str(folder), str(ROOT)])
+    ran = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout.splitlines()
+
+
+def test_a_dialect_from_outside_is_found_out_and_has_a_virtual_balance(site: Path) -> None:
+    said, mass = python(site, DIALECT)
+    assert said.startswith("Example's plain balance on ")
+    assert float(mass) == pytest.approx(0.2, abs=1e-3)
+
+
+def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
+    program = "import runpy; print(runpy.run_path('docs/make_tables.py')['TABLES']['vessel']())"
+    assert any("`cone`" in line and "A cone that opens upwards" in line for line in python(site, program))
