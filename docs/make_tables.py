@@ -24,6 +24,7 @@ from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_na
 from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
 from orchestrator.config.laboratory import arm_sections, cluster, operator
 from orchestrator.config.laboratory import sections as laboratory
+from orchestrator.config.laboratory.arms import ARMS
 from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Choice, Section
@@ -63,7 +64,7 @@ SECTIONS: dict[str, type[Section]] = {
     "profile": vessel.ProfileSection,
     "laboratory": laboratory.LaboratoryFile,
     "ray": cluster.RaySection,
-    "arm": arm_sections.ArmSection,
+    "arm": arm_sections.UrArmSection,
     "limits": arm_sections.LimitsSection,
     "cell": arm_sections.CellSection,
     "operator": operator.OperatorSection,
@@ -79,7 +80,7 @@ SECTIONS: dict[str, type[Section]] = {
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BalanceSection": "[balance](#bench)",
-    "ArmSection": "[arm](#arm-and-cell)",
+    **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm-and-cell)"),
     "CellSection": "[cell](#arm-and-cell)",
     "LimitsSection": "[limits](#arm-and-cell)",
     "BoxSection": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
