@@ -22,7 +22,7 @@ from orchestrator.config import pose, vessel
 from orchestrator.config.campaign import sections as campaign
 from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
-from orchestrator.config.laboratory import arm_sections, cluster, operator
+from orchestrator.config.laboratory import arm_sections, cell, cluster, operator
 from orchestrator.config.laboratory import sections as laboratory
 from orchestrator.config.laboratory.arms import ARMS
 from orchestrator.config.study import sections as study
@@ -66,7 +66,7 @@ SECTIONS: dict[str, type[Section]] = {
     "ray": cluster.RaySection,
     "arm": arm_sections.UrArmSection,
     "limits": arm_sections.LimitsSection,
-    "cell": arm_sections.CellSection,
+    "cell": cell.CellSection,
     "operator": operator.OperatorSection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
