@@ -41,8 +41,17 @@ def load_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
+    return campaign_from(Document.read(resolved(path)), laboratory)
+
+
+def campaign_from(document: Document, laboratory: Path | None = None) -> CampaignPlan:
+    """The plan of a campaign that was read already; relative paths in it start from the folder of its path.
+
+    Raises:
+        ConfigError: as `load_campaign`.
+    """
     report = Report()
-    place = Place(Document.read(resolved(path)))
+    place = Place(document)
     if (other := wrong_kind(place.document, "campaign")) is not None:
         raise ConfigError([other])
     section = validate(CampaignFile, place, report)
