@@ -10,7 +10,7 @@ import itertools
 import re
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.config import vessel
+from orchestrator.config import pose, vessel
 from orchestrator.config.campaign import sections as campaign
 from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
@@ -27,8 +27,14 @@ from orchestrator.config.laboratory import sections as laboratory
 from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.validate import sections_in
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.deployment.risk import RiskSettings
+from orchestrator.strategies.deployment.trust import TrustSettings
+from orchestrator.strategies.deployment.window import WindowSettings
+from orchestrator.strategies.doors import STRATEGIES
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquid import SimulationParameters
 from sim_engine.validation import sensitivity
@@ -43,10 +49,10 @@ SECTIONS: dict[str, type[Section]] = {
     "pours": campaign.PoursSection,
     "transfer": campaign.TransferSection,
     "deployment": campaign.DeploymentSection,
-    "trust": campaign.TrustSection,
-    "risk": campaign.RiskSection,
-    "window": campaign.WindowSection,
-    "prices": campaign.PricesSection,
+    "trust": TrustSettings,
+    "risk": RiskSettings,
+    "window": WindowSettings,
+    "prices": PricesSettings,
     "data": campaign.DataSection,
     "loss": campaign.LossSection,
     "objective": campaign.ObjectiveSection,
@@ -62,13 +68,11 @@ SECTIONS: dict[str, type[Section]] = {
     "operator": operator.OperatorSection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
-    "pose-error": laboratory.PoseErrorSection,
+    "pose-error": pose.PoseErrorSection,
     "study": study.StudyFile,
     "level": study.LevelSection,
     "compared-calibrations": study.CalibrationsSection,
-    "compared-calibration": study.CalibrationArmSection,
     "compared-deployments": study.DeploymentsSection,
-    "compared-deployment": study.DeploymentArmSection,
 }
 
 OF_SECTIONS = {
@@ -82,6 +86,7 @@ OF_SECTIONS = {
     "PointSection": "`{x, y, z}`, lengths",
     "CentreSection": "`{x, y, z}`, lengths",
     "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
+    "MountSection": "`{tilt, turn}`, angles",
     "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
     "BalanceDeviceSection": "[balance](balances.md#settings)",
     "OperatorSection": "[operator](#operator)",
@@ -91,10 +96,10 @@ OF_SECTIONS = {
     "TransferSection": "[transfer](#pours)",
     "LossSection": "[loss](#losses)",
     "ObjectiveSection": "[objective](#objectives)",
-    "TrustSection": "[trust](#trust)",
-    "RiskSection": "[risk](#risk-and-the-safe-window)",
-    "WindowSection": "[window](#risk-and-the-safe-window)",
-    "PricesSection": "[prices](#prices)",
+    "TrustSettings": "[trust](#trust)",
+    "RiskSettings": "[risk](#risk-and-the-safe-window)",
+    "WindowSettings": "[window](#risk-and-the-safe-window)",
+    "PricesSettings": "[prices](#prices)",
     "DataSection": "[data](#existing-data)",
     "ProfileSection": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
@@ -108,8 +113,9 @@ OF_SECTIONS = {
         model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"
         for model in (study.CalibrationsSection, study.DeploymentsSection)
     },
-    "CalibrationArmSection": "[mapping](#studies)",
-    "DeploymentArmSection": "[mapping](#studies)",
+    **{f"{name}ArmSection": "[mapping](#studies)" for name in STRATEGIES.names},
+    **{model.__name__: "[calibration](#calibration)" for model in campaign.CALIBRATIONS.values()},
+    **{model.__name__: "[deployment](#deployment)" for model in campaign.DEPLOYMENTS.values()},
 }
 
 
@@ -209,6 +215,27 @@ def section(model: type[Section]) -> str:
     return _table(("key", "value", "unless given", "meaning"), rows)
 
 
+def variants(models: Mapping[str, type[Section]], common: type[Section]) -> str:
+    """Keys of a tagged union that not all sections of its kind have, each with the variants that have it."""
+    owners: dict[tuple[str, ...], list[str]] = {}
+    tag = next(iter(models.values())).tag
+    for name, model in models.items():
+        for key, field in model.written_keys().items():
+            info = model.model_fields[field]
+            if field in common.model_fields or field == tag:
+                continue
+            described = _value(info.annotation, info.metadata), _default(key, info, model)
+            owners.setdefault((f"`{key}`", *described, _one_line(info.description or "")), []).append(name)
+    rows = [("all" if len(names) == len(models) else ", ".join(names), *row) for row, names in owners.items()]
+    return _table(("of", "key", "value", "unless given", "meaning"), rows)
+
+
+def _arms(model: type[Section]) -> dict[str, type[Section]]:
+    """Sections of the arms of a study, by the strategy that each is of."""
+    found = [s for info in model.model_fields.values() for s in sections_in(info.annotation)]
+    return {section.variant: section for section in found}
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "actions": actions,
     "parameters": parameters,
@@ -217,6 +244,10 @@ TABLES: dict[str, Callable[[], str]] = {
     "columns": columns,
     "states": states,
     **{name: partial(section, model) for name, model in SECTIONS.items()},
+    "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),
+    "deployment-strategies": partial(variants, campaign.DEPLOYMENTS, campaign.DeploymentSection),
+    "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Section),
+    "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Section),
 }
 
 

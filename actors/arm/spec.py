@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from actors.arm.geometry import ArmLimits, Cell, Joints, Pose, Vector
+from actors.arm.geometry import ArmLimits, Cell, Joints, Mount, Pose, Vector
 from actors.arm.look import ArmLook
 from sim_engine.action import Action
+from sim_engine.marks import FREE
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
@@ -107,6 +108,7 @@ class UrArmSpec(ArmSpec):
         cell: what stands where.
         home: joints where it waits, out of people's way, the pourer upright [rad].
         address: of the controller; '' for a virtual one, which is started and has its address filled in.
+        mount: how the robot is screwed down.
         tool: TCP in the flange's frame.
         payload: of gripper and filled pourer [kg].
         payload_centre: in the flange's frame [m].
@@ -123,7 +125,8 @@ class UrArmSpec(ArmSpec):
     limits: ArmLimits
     cell: Cell
     home: Joints
-    address: str = ""
+    address: Annotated[str, FREE] = ""
+    mount: Mount = field(default_factory=Mount)
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0
     payload_centre: Vector = (0.0, 0.0, 0.0)

@@ -14,24 +14,22 @@ ANSWER_DEADLINE = 30.0
 
 
 class DeviceBalance:
-    """`actors.balance.protocol.Balance` over a `Device` that holds a `SerialBalance` or a `VirtualBalance`.
+    """`actors.balance.protocol.Balance` over a `Device` that holds a `BalanceDriver`.
 
     Args:
         device: of the driver.
         time_scale: bench seconds per wall second, for deadlines; 0 waits for nothing.
-        longest_call: wall time that the driver allows itself [s], see `SerialBalanceSpec.longest_call`; None for a
-            `VirtualBalance`.
+        longest_call: wall time that the driver allows itself [s], see `BalanceDevice.longest_call`.
     """
 
-    def __init__(self, device: Device, time_scale: float = 1.0, *, longest_call: float | None = None) -> None:
+    def __init__(self, device: Device, time_scale: float = 1.0, *, longest_call: float = 0.0) -> None:
         self.device = device
         self._scale = time_scale
         self._longest_call = longest_call
 
     def _deadline(self, bench_time: float) -> float:
-        if self._longest_call is not None:
-            return ANSWER_DEADLINE + self._longest_call
-        return ANSWER_DEADLINE + (2.0 * bench_time / self._scale if self._scale > 0.0 else 0.0)
+        passing = 2.0 * bench_time / self._scale if self._scale > 0.0 else 0.0
+        return ANSWER_DEADLINE + max(self._longest_call, passing)
 
     async def tare(self) -> None:
         """See `Balance.tare`."""
@@ -54,7 +52,7 @@ class DeviceBalance:
             await asyncio.sleep(interval)
 
     async def connect(self) -> str:
-        """Balances on serial lines only: open the port, find out what is there; says what was found."""
+        """See `BalanceDriver.connect`."""
         said: str = await self.device.call("connect", deadline=self._deadline(PATIENCE))
         return said
 
@@ -63,7 +61,7 @@ class DeviceBalance:
         await self.device.call("zero", deadline=self._deadline(PATIENCE))
 
     async def keep_reference(self) -> None:
-        """Balances on serial lines only: after a lost connection a person confirms that the tare still holds."""
+        """See `BalanceDriver.keep_reference`."""
         await self.device.call("keep_reference", deadline=ANSWER_DEADLINE, urgent=True)
 
     async def statistics(self) -> dict[str, int]:
@@ -72,23 +70,23 @@ class DeviceBalance:
         return counts
 
     async def resume(self) -> None:
-        """Balances on serial lines only: let waits last again after `interrupt`."""
+        """See `BalanceDriver.resume`."""
         await self.device.call("resume", deadline=ANSWER_DEADLINE, urgent=True)
 
     async def release(self) -> None:
-        """Balances on serial lines only: close the port."""
+        """Let go of it."""
         await self.device.call("close", deadline=ANSWER_DEADLINE)
 
     async def prepare(self, seed: tuple[int, ...]) -> None:
-        """Virtual balances only: empty tray, bench time 0, noise of a new pour."""
+        """Balances that are told what stands on them only: empty tray, bench time 0, noise of a new pour."""
         await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
 
     async def put(self, load: Load) -> None:
-        """Virtual balances only: what comes onto the tray from now on."""
+        """Balances that are told what stands on them only: what comes onto the tray from now on."""
         await self.device.call("put", load, deadline=ANSWER_DEADLINE)
 
     async def pass_time(self, seconds: float) -> None:
-        """Virtual balances only: bench time passes [s]."""
+        """Balances that are told what stands on them only: bench time passes [s]."""
         await self.device.call("pass_time", seconds, deadline=self._deadline(seconds))
 
     async def interrupt(self) -> None:

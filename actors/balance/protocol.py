@@ -29,6 +29,57 @@ class Weight:
     shown: str = ""
 
 
+class BalanceDriver(Protocol):
+    """What talks to one balance: plain and blocking; it is put into a process (or thread) of its own.
+
+    `actors.contracts.balance` has the tests that every driver has to pass.
+    """
+
+    def connect(self) -> str:
+        """Find out what is there.
+
+        Returns:
+            What was found, for people.
+
+        Raises:
+            LaboratoryError: nobody understandable is there.
+        """
+        ...
+
+    def tare(self) -> None:
+        """See `Balance.tare`."""
+        ...
+
+    def weigh(self) -> Weight:
+        """See `Balance.weigh`. After a lost connection it refuses until `keep_reference` or another tare.
+
+        Raises:
+            ReferenceLostError: the balance may have been off since the last tare, and begun at a new zero.
+            LaboratoryError: see `Balance.weigh`; the text is for the person beside it.
+        """
+        ...
+
+    def read(self) -> Weight:
+        """See `Balance.read`; never fails, and doesn't wait for a call that is under way."""
+        ...
+
+    def keep_reference(self) -> None:
+        """After a lost connection: a person has seen that the tare still holds."""
+        ...
+
+    def interrupt(self) -> None:
+        """End the wait that is under way with a LaboratoryError, and later ones at once, until `resume`."""
+        ...
+
+    def resume(self) -> None:
+        """Let waits last again."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it; never fails, and may be called again."""
+        ...
+
+
 class Balance(Protocol):
     """A laboratory balance with a tray."""
 

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.doors import dialects
 from actors.balance.placement import Placement
+from actors.balance.protocol import BalanceDriver
 from actors.balance.settling import SettlingRule
-from actors.balance.virtual_balance import BalanceSettings
+from actors.balance.virtual_balance import PATIENCE, BalanceSettings, VirtualBalance
 from actors.balance.virtual_serial.scale import ScaleSettings
+from actors.checks import Check
+from actors.protocols import LaboratoryError
+from sim_engine.marks import FREE
 
 AUTO = "auto"
 """Dialect that is found out."""
@@ -22,8 +27,141 @@ DRIFTING = 60.0
 Handshake = Literal["none", "software", "hardware"]
 
 
+COARSE = 0.5e-3
+"""A display with larger steps tells little of small spills [kg]."""
+
+
+class BalanceStandIn(Protocol):
+    """What a driver finds at its far end on a virtual bench, in place of a balance."""
+
+    @property
+    def device(self) -> BalanceDevice:
+        """The settings, with its address filled in."""
+        ...
+
+    def prepare(self, seed: tuple[int, ...]) -> None:
+        """A new pour: its chance begins anew, and it is empty."""
+        ...
+
+    def put(self, mass: float) -> None:
+        """What stands on it from now on [kg]."""
+        ...
+
+    def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
+        """Have something else done to it, for tests."""
+        ...
+
+    def close(self) -> None:
+        """End it. May be called again."""
+        ...
+
+
+class BalanceDevice(ABC):
+    """Settings of what weighs: frozen values that travel to where the bench is, and know which driver they are for.
+
+    Attributes:
+        kind: as registered at the door `decant.balances`, and as written in files.
+        told: on a virtual bench nothing is at its far end: the driver itself is told what stands on it, and has
+            `prepare` and `put` as `actors.balance.virtual_balance.VirtualBalance` has them.
+        time_scale: bench seconds per second of the clock; 1 for anything real, 0 waits for nothing.
+        repeatability: standard deviation of weighing the same thing again [kg].
+    """
+
+    kind: ClassVar[str]
+    told: ClassVar[bool] = False
+    time_scale: float = 1.0
+    repeatability: float = 0.0
+
+    @abstractmethod
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """The class of the driver (an `actors.balance.protocol.BalanceDriver`), importable by name, and its arguments.
+
+        Args:
+            name: for messages.
+        """
+
+    @property
+    def longest_call(self) -> float:
+        """No call lasts longer than this [s of the clock]; what holds the driver should wait a little longer."""
+        return 120.0
+
+    def stand_in(self) -> BalanceStandIn | None:
+        """Start what stands in for it on a virtual bench; None where nothing does."""
+        return None
+
+    def paced(self, time_scale: float) -> BalanceDevice:
+        """The same balance in a virtual bench's time."""
+        return replace(self, time_scale=time_scale)  # type: ignore[type-var]
+
+    def look(self, *, tare: bool) -> list[Check]:
+        """What `decant doctor` tells of it: who is there, a stable reading, its step; and whether it obeys a tare.
+
+        Args:
+            tare: also tare it.
+        """
+        cls, arguments = self.driver("balance")
+        driver: BalanceDriver = cls(*arguments)
+        checks: list[Check] = []
+        try:
+            checks.append(Check("balance", "ok", driver.connect()))
+            weight = driver.weigh()
+            checks.append(Check("balance reading", "ok", f"{1e3 * weight.mass:g} g, stable"))
+            coarse = weight.step > COARSE
+            advice = "spills of less than a few steps can't be told apart; a finer balance would help" if coarse else ""
+            checks.append(Check("balance step", "warn" if coarse else "ok", f"{1e3 * weight.step:g} g", advice))
+            if tare:
+                driver.tare()
+                checks.append(Check("balance tare", "ok", "it obeyed, and rests at zero"))
+            else:
+                said = "not tried; --tare tries it (what is on it counts as nothing then)"
+                checks.append(Check("balance tare", "ok", said))
+        except LaboratoryError as error:
+            todo = "docs/balances.md has a table of what it says and what to do"
+            checks.append(Check("balance", "fail", str(error), todo))
+        finally:
+            driver.close()
+        return checks
+
+
 @dataclass(frozen=True)
-class SerialBalanceSpec:
+class NumbersBalanceSpec(BalanceDevice):
+    """A balance of numbers.
+
+    Attributes:
+        sheet: what its data sheet says; its pace is the bench's.
+    """
+
+    sheet: BalanceSettings
+
+    kind: ClassVar[str] = "numbers"
+    told: ClassVar[bool] = True
+
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `BalanceDevice.driver`."""
+        return VirtualBalance, (self.sheet, name)
+
+    def paced(self, time_scale: float) -> NumbersBalanceSpec:
+        """See `BalanceDevice.paced`."""
+        return NumbersBalanceSpec(replace(self.sheet, time_scale=time_scale))
+
+    @property
+    def longest_call(self) -> float:
+        """See `BalanceDevice.longest_call`."""
+        return 2.0 * PATIENCE / self.sheet.time_scale if self.sheet.time_scale > 0.0 else 0.0
+
+    @property
+    def time_scale(self) -> float:  # type: ignore[override]
+        """See `BalanceDevice`."""
+        return self.sheet.time_scale
+
+    @property
+    def repeatability(self) -> float:  # type: ignore[override]
+        """See `BalanceDevice`."""
+        return math.hypot(self.sheet.noise, self.sheet.drift * DRIFTING)
+
+
+@dataclass(frozen=True)
+class SerialBalanceSpec(BalanceDevice):
     """A balance on a serial line.
 
     Attributes:
@@ -39,20 +177,25 @@ class SerialBalanceSpec:
         answer_time: longest wait for an answer [s of the clock].
         reconnect_time: how long a vanished port is waited for [s].
         time_scale: bench seconds per second of the clock; 1 for everything real.
+        virtual: what the data sheet of the balance at the other end would say, where there is none: it is started on a
+            virtual bench, and `port` filled in.
     """
 
-    port: str
+    kind: ClassVar[str] = "serial"
+
+    port: Annotated[str, FREE]
     dialect: str = AUTO
-    baud: int | None = None
-    format: str | None = None
-    handshake: Handshake = "none"
+    baud: Annotated[int | None, FREE] = None
+    format: Annotated[str | None, FREE] = None
+    handshake: Annotated[Handshake, FREE] = "none"
     settling: SettlingRule = field(default_factory=SettlingRule)
     step: float | None = None
     repeatability: float = 0.0
     interval: float = 0.15
     answer_time: float = 1.0
-    reconnect_time: float = 20.0
+    reconnect_time: Annotated[float, FREE] = 20.0
     time_scale: float = 1.0
+    virtual: ScaleSettings | None = None
 
     def __post_init__(self) -> None:
         if self.dialect != AUTO and self.dialect not in dialects():
@@ -62,9 +205,28 @@ class SerialBalanceSpec:
         if self.format is not None:
             parse_format(self.format)
 
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `BalanceDevice.driver`."""
+        from actors.balance.serial_balance import SerialBalance
+
+        return SerialBalance, (self, name)
+
+    def stand_in(self) -> BalanceStandIn | None:
+        """See `BalanceDevice.stand_in`."""
+        from actors.balance.virtual_serial.stand_in import SerialStandIn
+
+        return None if self.virtual is None else SerialStandIn(self, self.virtual)
+
+    def look(self, *, tare: bool) -> list[Check]:
+        """See `BalanceDevice.look`: the port first."""
+        from actors.balance.port import look_at_port
+
+        port = look_at_port(self.port)
+        return [port] if port.state == "fail" else [port, *super().look(tare=tare)]
+
     @property
     def longest_call(self) -> float:
-        """No call lasts longer than this [s of the clock]; what holds the driver should wait a little longer."""
+        """See `BalanceDevice.longest_call`."""
         return 4.0 * self.settling.deadline / self.time_scale + 4.0 * self.reconnect_time + 60.0
 
     @property
@@ -90,26 +252,20 @@ class BalanceSpec:
 
     Attributes:
         placement: where it stands.
-        serial: its line; None where the operator types what it shows.
-        virtual: what its data sheet would say, where there is none: it is started, and `serial.port` set to its port.
+        device: what weighs; None where the operator types what it shows.
         pourer_elsewhere: the pourer is weighed on another balance, and typed.
         load_tolerance: how far a load may lie from the one asked for [kg].
-        numbers: what a balance of numbers is like; in place of a line.
     """
 
     placement: Placement
-    serial: SerialBalanceSpec | None
-    virtual: ScaleSettings | None = None
+    device: BalanceDevice | None
     pourer_elsewhere: bool = False
     load_tolerance: float = 5e-3
-    numbers: BalanceSettings | None = None
 
     @property
     def repeatability(self) -> float:
         """Standard deviation of weighing the same thing again [kg]."""
-        if self.numbers is not None:
-            return math.hypot(self.numbers.noise, self.numbers.drift * DRIFTING)
-        return 0.0 if self.serial is None else self.serial.repeatability
+        return 0.0 if self.device is None else self.device.repeatability
 
 
 def parse_format(text: str) -> tuple[int, str, int]:

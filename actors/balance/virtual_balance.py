@@ -111,6 +111,13 @@ class VirtualBalance:
     def close(self) -> None:
         """Nothing has to be let go of."""
 
+    def connect(self) -> str:
+        """See `BalanceDriver.connect`."""
+        return f"{self._name}: a balance of numbers, step {1e3 * self._settings.resolution:g} g"
+
+    def keep_reference(self) -> None:
+        """Its connection can't be lost."""
+
     def tare(self) -> None:
         """See `Balance.tare`."""
         mass = self._stable()

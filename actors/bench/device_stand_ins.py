@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from actors.balance.actor import DeviceBalance
+from actors.balance.virtual_balance import Load
 from actors.bench.stand_ins import Found, History
 from actors.device import Device
 
@@ -16,10 +18,14 @@ class DeviceStandIns:
 
     Args:
         device: that holds it.
+
+    Attributes:
+        told: a balance whose driver is itself told what stands on it; None where something stands in for it.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
+        self.told: DeviceBalance | None = None
 
     async def found(self) -> Found:
         """Where they are."""
@@ -29,10 +35,15 @@ class DeviceStandIns:
     async def prepare(self, seed: tuple[int, ...]) -> None:
         """A new pour."""
         await self.device.call("prepare", seed, deadline=DEADLINE)
+        if self.told is not None:
+            await self.told.prepare(seed)
 
     async def put(self, mass: float) -> None:
         """What stands on the balance from now on [kg]."""
-        await self.device.call("put", mass, deadline=DEADLINE)
+        if self.told is not None:
+            await self.told.put(Load((0.0,), (mass,)))
+        else:
+            await self.device.call("put", mass, deadline=DEADLINE)
 
     async def history(self, since: float) -> History:
         """What the joints did since a controller time [s]; nothing, for a time to come."""

@@ -15,7 +15,7 @@ from actors.arm.numbers import Grip
 from actors.arm.protocol import Executed
 from actors.balance.actor import DeviceBalance
 from actors.balance.placement import Placement
-from actors.balance.spec import BalanceSpec
+from actors.balance.spec import BalanceSpec, NumbersBalanceSpec
 from actors.balance.virtual_balance import BalanceSettings, Load
 from actors.bench.hidden import Spill, TouchingError, draw_pose_error, hidden_spill, stream
 from actors.bench.questions import Questions
@@ -41,7 +41,7 @@ def numbers_balance(spec: VirtualBenchSpec) -> BalanceSpec:
         settling_time=spec.settling_time,
         time_scale=spec.time_scale,
     )
-    return BalanceSpec(Placement.TARED, None, numbers=settings, load_tolerance=float("inf"))
+    return BalanceSpec(Placement.TARED, NumbersBalanceSpec(settings), load_tolerance=float("inf"))
 
 
 class NumbersBench(Nature):

@@ -11,9 +11,7 @@ from actors.arm.actor import DeviceArm
 from actors.arm.numbers import NumbersSpec
 from actors.arm.spec import ArmSpec, UrArmSpec
 from actors.balance.actor import DeviceBalance
-from actors.balance.serial_balance import SerialBalance
-from actors.balance.spec import BalanceSpec
-from actors.balance.virtual_balance import VirtualBalance
+from actors.balance.spec import BalanceDevice, BalanceSpec
 from actors.bench.device_stand_ins import DeviceStandIns
 from actors.bench.numbers_bench import NumbersBench, NumbersOperator, numbers_balance
 from actors.bench.one_pour import Setup
@@ -76,6 +74,10 @@ class _Opening:
         cls, args = spec.driver(accepted)
         return DeviceArm(self("arm", cls, *args), spec)
 
+    def balance(self, spec: BalanceDevice, name: str) -> DeviceBalance:
+        cls, args = spec.driver(name)
+        return DeviceBalance(self("balance", cls, *args), spec.time_scale, longest_call=spec.longest_call)
+
 
 def needs_person(spec: LaboratorySpec) -> bool:
     """Whether somebody has to be there to answer."""
@@ -124,7 +126,8 @@ async def open_bench(
 def _numbers(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
     arm_spec, balance_spec = NumbersSpec(spec.time_scale), numbers_balance(spec)
     arm = opening.arm(arm_spec)
-    balance = DeviceBalance(opening("balance", VirtualBalance, balance_spec.numbers), spec.time_scale)
+    assert balance_spec.device is not None
+    balance = opening.balance(balance_spec.device, "virtual")
     nature = NumbersBench(spec, liquid, arm, balance)
     operator = NumbersOperator(nature, balance, spec.operator_time)
     setup = Setup("virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, nature, _nobody)
@@ -147,16 +150,14 @@ async def _wired(
     stand_ins: DeviceStandIns | None = None
     follows = False
     if spec.mode == "virtual":
-        stand_ins = DeviceStandIns(opening("stand-ins", StandIns, arm_spec, balance_spec))
+        stand_ins = DeviceStandIns(opening("stand-ins", StandIns, arm_spec, balance_spec.device))
         found = await stand_ins.found()
         arm_spec, follows = found.arm, found.follows
-        if balance_spec.serial is not None:
-            balance_spec = replace(balance_spec, serial=replace(balance_spec.serial, port=found.port))
+        balance_spec = replace(balance_spec, device=found.balance)
     arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum)
-    balance: DeviceBalance | None = None
-    if balance_spec.serial is not None:
-        device = opening("balance", SerialBalance, balance_spec.serial, spec.name)
-        balance = DeviceBalance(device, balance_spec.serial.time_scale, longest_call=balance_spec.serial.longest_call)
+    balance = None if balance_spec.device is None else opening.balance(balance_spec.device, spec.name)
+    if stand_ins is not None and balance_spec.device is not None and balance_spec.device.told:
+        stand_ins.told = balance
     nature = Nature(arm_spec.time_scale)
     if stand_ins is not None and spec.bench is not None and liquid is not None:
         hands = Hands(Things(balance_spec.placement), None if balance is None else stand_ins.put)

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from actors.arm.spec import ArmSpec
-from actors.balance.spec import AUTO, BalanceSpec
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
+from actors.balance.spec import BalanceDevice, BalanceStandIn
 from actors.protocols import LaboratoryError
 
 
@@ -21,12 +20,12 @@ class Found:
 
     Attributes:
         arm: the arm's settings, with the address of what stands in for it.
-        port: of the balance; '' if there is none.
+        balance: the balance's settings likewise; None where weights are typed.
         follows: whether `history` can be asked for.
     """
 
     arm: ArmSpec
-    port: str
+    balance: BalanceDevice | None
     follows: bool
 
 
@@ -83,24 +82,24 @@ class StandIns:
 
     Args:
         arm: which arm.
-        balance: what the balance's data sheet says; None for weights that are typed.
+        balance: which balance; None for weights that are typed.
     """
 
-    def __init__(self, arm: ArmSpec, balance: BalanceSpec | None) -> None:
+    def __init__(self, arm: ArmSpec, balance: BalanceDevice | None) -> None:
         self._spec = arm
         self._arm = stand_in_of(arm)
-        self._balance: VirtualSerialBalance | None = None
+        self._weighs = balance
+        self._balance: BalanceStandIn | None = None
         try:
-            if balance is not None and balance.serial is not None and balance.virtual is not None:
-                self._balance = _start_balance(balance, arm.time_scale)
+            self._balance = None if balance is None else balance.stand_in()
         except BaseException:
             self.close()
             raise
 
     def found(self) -> Found:
         """Where they are."""
-        port = "" if self._balance is None else self._balance.port
-        return Found(self._spec if self._arm is None else self._arm.arm, port, self._arm is not None)
+        arm = self._spec if self._arm is None else self._arm.arm
+        return Found(arm, self._weighs if self._balance is None else self._balance.device, self._arm is not None)
 
     def install(self) -> None:
         """See `StandIn.install`."""
@@ -132,10 +131,10 @@ class StandIns:
         return self._arm
 
     def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
-        """Have something done to the balance: 'unplug', 'plug', 'faults' …, see `VirtualSerialBalance`."""
+        """Have something done to the balance: 'unplug', 'plug', 'faults' …, see what stands in for it."""
         if self._balance is None:
             raise LaboratoryError("there is no virtual balance here")
-        return self._balance.order(what, **values)
+        return self._balance.order(what, values)
 
     def close(self) -> None:
         """End both. May be called again."""
@@ -143,10 +142,3 @@ class StandIns:
             self._arm.close()
         if self._balance is not None:
             self._balance.close()
-
-
-def _start_balance(balance: BalanceSpec, time_scale: float) -> VirtualSerialBalance:
-    assert balance.serial is not None
-    dialect = "kcp" if balance.serial.dialect == AUTO else balance.serial.dialect
-    # A line that takes no time: in scaled time its characters would be the slowest thing on the bench.
-    return VirtualSerialBalance.start(dialect, baud=0, scale=balance.virtual, time_scale=time_scale, latency=0.002)

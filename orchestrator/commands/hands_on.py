@@ -31,14 +31,13 @@ def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
     from actors.bench.stand_ins import StandIns
 
     assert spec.arm is not None
-    stand_ins = StandIns(spec.arm, spec.balance)
+    stand_ins = StandIns(spec.arm, None if spec.balance is None else spec.balance.device)
     try:
         where = stand_ins.found()
         stand_ins.install()
         balance = spec.balance
-        if balance is not None and balance.serial is not None:
-            serial = dataclasses.replace(balance.serial, port=where.port)
-            balance = dataclasses.replace(balance, serial=serial)
+        if balance is not None:
+            balance = dataclasses.replace(balance, device=where.balance)
         yield dataclasses.replace(spec, arm=where.arm, balance=balance)
     finally:
         stand_ins.close()

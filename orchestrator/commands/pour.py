@@ -264,7 +264,7 @@ def _only(chosen: Chosen) -> CampaignPlan:
     """The campaign without everything that this pour isn't of."""
     plan = chosen.plan
     if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
-        deployment = dataclasses.replace(plan.deployment, scenes=(chosen.scene,), pours=1)
+        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(chosen.scene,))
         return dataclasses.replace(plan, calibration=None, deployment=deployment)
     return dataclasses.replace(plan, deployment=None)
 
@@ -279,4 +279,4 @@ def told(weighed: WeighedPour) -> str:
     )
     parts = {"loaded": weighed.loaded, "spilled": weighed.spilled, "retained": weighed.retained}
     masses = ", ".join(f"{name} {1e3 * mass:.1f} g" for name, mass in parts.items())
-    return f"{masses}; {r}"
+    return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"

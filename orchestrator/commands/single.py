@@ -82,6 +82,8 @@ def simulate(
     if rrd is not None or png is not None:
         _show(tasks[0], runs[0], rrd, png)
     over_seeds = spreads(outcomes)
+    received = over_seeds.get("received")
+    delivered = None if received is None else received.mean * scene.liquid.mass
     if as_json:
         prediction = {name: spread.as_json() for name, spread in over_seeds.items()}
         print_json(
@@ -90,6 +92,8 @@ def simulate(
                 "action": action.values(),
                 "theta": theta.model_dump(),
                 "scene": scene.name,
+                "delivered_g": None if delivered is None else 1e3 * delivered,
+                "delivered_ml": None if delivered is None else scene.liquid.millilitres(delivered),
                 "prediction": {**prediction, "seeds": [task.seed for task in tasks]},
                 "regimes": None if regime is None else regime.as_json(),
                 "not_covered": [] if regime is None else [one.as_json() for one in regime.not_covered],
@@ -97,7 +101,8 @@ def simulate(
         )
     else:
         say(f"{scene.name}: {action.display()}")
-        print(told(outcomes, over_seeds))
+        amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
+        print(told(outcomes, over_seeds, amount))
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)
@@ -119,13 +124,20 @@ def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[Simulate
     return runs
 
 
-def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, Spread]) -> str:
-    """The outcomes in one line: mean ± standard deviation of the seeds."""
+def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, Spread], delivered: str = "") -> str:
+    """The outcomes in one line: mean ± standard deviation of the seeds.
+
+    Args:
+        outcomes: one for each seed.
+        over_seeds: their means and deviations.
+        delivered: how much is in the receiver, in the mean; '' if nobody knows.
+    """
     from sim_engine.spread import FRACTIONS
 
     first = outcomes[0]
     shown = {name: over_seeds[name].percent(2 if name == "escaped" else 1) for name in FRACTIONS if name in over_seeds}
     fractions = "  ".join(f"{name.replace('_', ' ')} {text}" for name, text in shown.items())
+    fractions += f"  delivered {delivered}" if delivered else ""
     valid = sum(outcome.invalid is None for outcome in outcomes)
     seeds = (
         "1 seed, so no spread; --seeds 5 would tell it" if valid == 1 else f"mean ± standard deviation, {valid} seeds"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from bisect import bisect_right
 from itertools import accumulate
@@ -13,7 +12,6 @@ from pydantic import create_model
 
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign.resolve import resolve_campaign
-from orchestrator.config.campaign.resolved import campaign_as_file
 from orchestrator.config.campaign.sections import CampaignFile
 from orchestrator.config.laboratory.sections import LaboratoryFile, resolve_laboratory
 from orchestrator.config.motion import parameter_quantity
@@ -60,7 +58,7 @@ def campaign_from(document: Document, laboratory: Path | None = None) -> Campaig
     plan = None if section is None else resolve_campaign(section, place, report)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"
-    return dataclasses.replace(plan, resolved=campaign_as_file(plan))
+    return plan
 
 
 def load_vessel(path: Path) -> VesselSpec:

@@ -27,6 +27,9 @@ SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
 PANELS_ABREAST = 3
 """More panels than these go into further rows."""
 
+CHARACTER = 0.075
+"""Width of a character in a legend [inch]."""
+
 FEW = 20
 """Points of a reference from which it is a line."""
 
@@ -123,9 +126,11 @@ def draw(figure: Figure, path: Path) -> Path:
     # Below the panels: inside it would lie on curves, wherever it stood.
     handles = {n: h for place in axes.flat for h, n in zip(*place.get_legend_handles_labels(), strict=True)}
     names = [name for name in looks if name in handles]
+    room = wide * columns / (0.55 + CHARACTER * max(map(len, names), default=1))
     canvas.legend(
-        [handles[name] for name in names], names, loc="outside lower center", ncols=3, fontsize=8.5, frameon=False
-    )
+        [handles[name] for name in names], names, loc="outside lower center", ncols=max(1, min(int(room), len(names))),
+        fontsize=8.5, frameon=False,
+    )  # fmt: skip
     return style.save(canvas, path)
 
 

@@ -28,7 +28,7 @@ from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
 from orchestrator.strategies.learnt import Learnt, Part
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.regimes import NotCovered
 from sim_engine.spread import Spread
 
@@ -108,6 +108,9 @@ class ReceiverSummary(Part):
     """Those that were weighed."""
 
     failed_pours: int
+    failures: tuple[str, ...]
+    """Why these failed, in the order made: 'pour 2: the gripper slipped'."""
+
     refused_pours: int
     simulations: int
     first_loss: float | None
@@ -116,6 +119,12 @@ class ReceiverSummary(Part):
     best_spillage: float | None
     best_pour: int | None
     """Number of the pour with the least loss."""
+
+    best_delivered_g: float | None
+    """That was in the receiver after it."""
+
+    best_delivered_ml: float | None
+    """The same by the liquid's density."""
 
     best_measured_action: dict[str, float | None] | None
     """Its action in display units."""
@@ -139,6 +148,12 @@ class ReceiverSummary(Part):
     window: WindowFound | None
     prediction: dict[str, Spread] | None
     """What fresh seeds of the recommended action came to, by quantity."""
+
+    predicted_delivered_g: float | None
+    """Mean over these seeds of what is in the receiver."""
+
+    predicted_delivered_ml: float | None
+    """The same by the liquid's density."""
 
     not_covered: tuple[NotCovered, ...]
     """What is not simulated of the recommended action."""
@@ -224,6 +239,7 @@ def summarise(
     found = theta_of(results)
     names, predictions = receiver_names(plan), predictions_of(results)
     spreads = {scene: foreseen.over_seeds for scene, foreseen in predictions.items()}
+    liquids = {} if plan.deployment is None else {scene.name: scene.liquid for scene in plan.deployment.scenes}
     return RunSummary(
         **dict(totals or Totals()),
         campaign=plan.name,
@@ -236,7 +252,11 @@ def summarise(
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         receivers={
             scene: _receiver(
-                names.get(scene, scene), result, spreads.get(scene), (best_not_covered or {}).get(scene, ())
+                names.get(scene, scene),
+                result,
+                spreads.get(scene),
+                (best_not_covered or {}).get(scene, ()),
+                liquids.get(scene),
             )
             for scene, result in deployments_of(results).items()
         },
@@ -272,15 +292,22 @@ _NOTHING: dict[str, None] = dict.fromkeys(Recommended.model_fields)
 
 
 def _receiver(
-    name: str, result: Deployed, prediction: dict[str, Spread] | None, not_covered: Sequence[NotCovered]
+    name: str,
+    result: Deployed,
+    prediction: dict[str, Spread] | None,
+    not_covered: Sequence[NotCovered],
+    liquid: Liquid | None,
 ) -> ReceiverSummary:
     pours, best = result.weighed, result.best
+    received = None if prediction is None else prediction.get("received")
+    delivered = None if received is None or liquid is None else received.mean * liquid.mass
     recommended: Mapping[str, Any] = _NOTHING if result.recommended is None else dict(result.recommended)
     return ReceiverSummary(
         receiver=name,
         strategy=result.strategy,
         pours=len(pours),
         failed_pours=result.failed_pours,
+        failures=tuple(f"pour {row.number}: {row.reason}" for row in result.pours if row.status == "failed"),
         refused_pours=result.refused_pours,
         simulations=result.simulations,
         first_loss=pours[0].loss if pours else None,
@@ -288,6 +315,8 @@ def _receiver(
         best_loss=None if best is None else best.loss,
         best_spillage=None if best is None else best.spillage,
         best_pour=None if best is None else best.number,
+        best_delivered_g=None if best is None else best.delivered_g,
+        best_delivered_ml=None if best is None else best.delivered_ml,
         best_measured_action=None if best is None else best.action,
         best_action=recommended["action"],
         best_action_si=recommended["action_si"],
@@ -303,6 +332,8 @@ def _receiver(
         risk=result.risk,
         window=result.window,
         prediction=prediction,
+        predicted_delivered_g=None if delivered is None else 1e3 * delivered,
+        predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),
         not_covered=tuple(not_covered),
     )
 

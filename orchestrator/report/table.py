@@ -103,6 +103,7 @@ def _receiver_table(rows: Sequence[ReceiverSummary], unit: LossUnit) -> Renderab
         "pours": ("right", [str(row.pours or "") for row in rows]),
         "first": ("right", ["" if row.first_loss is None else unit.text(row.first_loss) for row in rows]),
         "best measured": ("right", [_best_measured(row, unit) for row in rows]),
+        "delivered": ("right", [_amount(row.best_delivered_g, row.best_delivered_ml) for row in rows]),
         "best expected": ("right", [_best_expected(row, unit) for row in rows]),
         "best action": ("left", [style.display_values(dict(row.best_action_si or {})) for row in rows]),
     }
@@ -117,6 +118,11 @@ def _receiver_table(rows: Sequence[ReceiverSummary], unit: LossUnit) -> Renderab
 
 def _best_measured(row: ReceiverSummary, unit: LossUnit) -> str:
     return "" if row.best_loss is None else f"{unit.text(row.best_loss)} (pour {row.best_pour})"
+
+
+def _amount(grams: float | None, millilitres: float | None) -> str:
+    """'193.2 g, 193.6 mL'."""
+    return "" if grams is None or millilitres is None else f"{grams:.1f} g, {millilitres:.1f} mL"
 
 
 def _best_expected(row: ReceiverSummary, unit: LossUnit) -> str:
@@ -134,7 +140,9 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
         if row.untrustworthy_simulation:
             remarks.append(Text(f"  {receiver}: {trust_line(row.trust)}", style="yellow"))
         if row.failed_pours:
-            remarks.append(Text(f"  {receiver}: {row.failed_pours} pour(s) failed", style="yellow"))
+            what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
+            why = f": {'; '.join(row.failures)}" if row.failures else ""
+            remarks.append(Text(f"  {receiver}: {what}{why}", style="yellow"))
         if row.gave_up:
             remarks.append(Text(f"  {receiver}: {row.gave_up}", style="yellow"))
         elif not _has_losses(row):
@@ -145,7 +153,9 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
         if row.window is not None:
             remarks.append(Text(f"  {receiver}, {window_line(row.window, unit)}"))
         if row.prediction is not None:
-            remarks.append(Text(f"  {receiver}, best action: {_prediction(row.prediction)}"))
+            amount = _amount(row.predicted_delivered_g, row.predicted_delivered_ml)
+            delivered = f"; delivered {amount} in the mean" if amount else ""
+            remarks.append(Text(f"  {receiver}, best action: {_prediction(row.prediction)}{delivered}"))
         for one in row.not_covered:
             remarks.append(Text(f"  {receiver}, best action, {one.kind}: {one.text}", style="yellow"))
     return remarks

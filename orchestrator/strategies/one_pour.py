@@ -6,6 +6,7 @@ from typing import Literal
 
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.learnt import Learnt, Part
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
 from sim_engine.losses import normalised_spillage
@@ -24,6 +25,12 @@ class WeighedPour(Part):
 
     retained: float
     """Mass left in the pourer [kg]."""
+
+    delivered_g: float
+    """In the receiver: what is neither beside it nor left in the pourer."""
+
+    delivered_ml: float
+    """The same by the liquid's density."""
 
     poured_fraction: float
     """Share of the load that left the pourer."""
@@ -55,6 +62,7 @@ class OnePour:
 
     def __init__(self, scene: Scene, action: Action, seed: int) -> None:
         self._request = Pour(scene.name, action, 1, SeedStream(seed, "one pour").next())
+        self._liquid = scene.liquid
         self._asked = False
         self._outcome: PourMeasurement | Failed | None = None
         self.decisions = [Decision(f"one pour, as it was asked for: {action.display()}")]
@@ -87,9 +95,9 @@ class OnePour:
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Pours done, pours in all."""
-        return int(self.finished), 1
+        return Progress(pours=int(self.finished), of_pours=1)
 
     def result(self) -> OnePoured:
         """What was weighed, or why there is nothing."""
@@ -100,6 +108,8 @@ class OnePour:
                     loaded=measured.loaded,
                     spilled=measured.spilled,
                     retained=measured.retained,
+                    delivered_g=1e3 * measured.delivered,
+                    delivered_ml=self._liquid.millilitres(measured.delivered),
                     poured_fraction=fractions.poured,
                     spillage=normalised_spillage(fractions),
                 )

@@ -90,7 +90,7 @@ def strays(figure: Any) -> list[str]:
         for line in axes.lines:
             if line.get_marker() not in ("None", None, "", "_") and line.get_clip_on() and len(line.get_xdata()):
                 radius = line.get_markersize() / 2 * figure.dpi / 72
-                found += _cut_off(axes, np.column_stack(line.get_data()), radius)
+                found += _cut_off(axes, np.column_stack(line.get_data()).astype(float), radius)
     return found
 
 

@@ -21,7 +21,7 @@ from actors.protocols import PourProgress, ProgressCallback
 from actors.spec import LaboratorySpec
 from orchestrator.campaign import CampaignResult, run_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.plan import CampaignPlan, OutputPlan
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -38,6 +38,7 @@ from orchestrator.requests import (
 from orchestrator.results import Results, learnt_by
 from orchestrator.stages import StageDefinition
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
 from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
@@ -46,6 +47,7 @@ from sim_engine.simulated import SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
+from tests.orchestrator import plans
 
 SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
 SCENE = Scene(
@@ -59,7 +61,7 @@ THETA = SimulationParameters(particles=500)
 
 
 def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
-    deployment = DeploymentPlan("D3", (SCENE,), SPACE, Loss(), pours=3, per_pour=2)
+    deployment = plans.deployment(scenes=(SCENE,), actions=SPACE, loss=Loss(), pours=3, per_pour=2)
     values: dict[str, Any] = {
         "name": "toy",
         "seed": 7,
@@ -271,8 +273,8 @@ class ToyStrategy:
         del self._waiting[request]
         self._told_pours += isinstance(request, Pour)
 
-    def progress(self) -> tuple[int, int]:
-        return self._told_pours, self._pours
+    def progress(self) -> Progress:
+        return Progress(pours=self._told_pours, of_pours=self._pours)
 
     def result(self) -> Toyed:
         return Toyed(spillages=tuple(self.spillages), simulations=self._asked_simulations)

@@ -27,7 +27,7 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.plan import CampaignPlan, OutputPlan
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -42,6 +42,7 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import Foreseen
 from sim_engine.action import DEG, Action
@@ -52,6 +53,7 @@ from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
+from tests.orchestrator import plans
 
 BEAKER = cylinder("beaker", inner_radius=0.035, inner_height=0.09)
 TUMBLER = Scene("tumbler", BEAKER, cylinder("tumbler", inner_radius=0.05, inner_height=0.09), Liquid(mass=0.2))
@@ -72,8 +74,19 @@ LEARNT = Foreseen(scene="narrow cup", simulations=0, simulations_lost=0, thetas=
 
 def campaign(*, pours: int = 3) -> CampaignPlan:
     """Calibration in the tumbler, D3 into the narrow cup."""
-    calibration = CalibrationPlan("C4", TUMBLER, ACTIONS, THETA, {}, 8, 2, None, None, simulations=8, initial=4)
-    deployment = DeploymentPlan("D3", (NARROW,), ACTIONS, Loss(), pours=pours, prior_simulations=6)
+    calibration = plans.calibration(
+        scene=TUMBLER,
+        actions=ACTIONS,
+        parameters=THETA,
+        fixed_parameters={},
+        pour_count=8,
+        holdout=2,
+        simulations=8,
+        initial=4,
+    )
+    deployment = plans.deployment(
+        scenes=(NARROW,), actions=ACTIONS, loss=Loss(), pours=pours, prior_simulations=6, per_pour=0
+    )
     return CampaignPlan(
         "narrow-cup",
         7,
@@ -150,7 +163,7 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
             seconds=2.0,
             frames=frames(),
         )
-        yield StrategyProgressed(time=now, stage="calibration", done=number, total=2, result=LEARNT)
+        yield StrategyProgressed(time=now, stage="calibration", progress=Progress(number, 2), result=LEARNT)
     # As C4 does it: observations carry the action behind θ.
     question = SuggestProblem(THETA, Data(((0.2, 0.3, 0.5, 0.5), (0.7, 0.3, 0.1, 0.9)), (0.2, 0.05)), map_resolution=9)
     yield _answered("calibration", 3, question, now)
@@ -171,7 +184,9 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
         points = tuple((0.1 * i, 0.5) for i in range(1, number + 1))
         question = SuggestProblem(ACTIONS, Data(points, tuple(0.1 for _ in points)), map_resolution=9)
         yield _answered("narrow cup", 10 * number + 1, question, now)
-        yield StrategyProgressed(time=now, stage="narrow cup", done=number, total=pours, result=LEARNT)
+        yield StrategyProgressed(
+            time=now, stage="narrow cup", progress=Progress(pours=number, of_pours=pours), result=LEARNT
+        )
     yield LogLine(time=now, level="warning", text="the balance drifts")
     yield StageClosed(time=now, stage="narrow cup", result=LEARNT)
     yield CampaignClosed(time=now, state="finished", results={})

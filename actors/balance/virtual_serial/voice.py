@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -85,11 +86,11 @@ class Voice(Protocol):
 
 
 def weight_line(dialect: Lines, reading: Reading) -> bytes:
-    """The line for a reading; a dialect that can't say it reports a fault instead."""
-    try:
-        return dialect.encode(reading)
-    except ValueError:
-        return dialect.encode(Reading(Status.ERROR))
+    """The line for a reading; a dialect that can't say it reports a fault instead, or has no words for that either."""
+    for said in (reading, Reading(Status.ERROR)):
+        with contextlib.suppress(ValueError):
+            return dialect.encode(said)
+    return b""
 
 
 class PlainVoice:

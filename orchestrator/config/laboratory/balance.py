@@ -11,7 +11,7 @@ from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
 from actors.balance.spec import AUTO, BalanceSpec, SerialBalanceSpec, parse_format
 from actors.balance.virtual_serial.scale import ScaleSettings
-from orchestrator.config.yaml.quantities import Quantity, format_quantity
+from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import PositiveCount, Section, Text
 from orchestrator.config.yaml.source import Place, Report
 
@@ -28,10 +28,6 @@ PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=T
 
 USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
 """Speeds that balances can be set to [bits per second]."""
-
-VIRTUAL_DIALECT = "kcp"
-"""Spoken by a virtual balance unless another dialect is named."""
-
 
 DialectName: Any = Literal[(AUTO, *dialects())]  # what is installed, ours as everybody's
 
@@ -144,8 +140,7 @@ def resolve_balance(section: BalanceDeviceSection, place: Place, report: Report,
         return None
     return BalanceSpec(
         placement=Placement(section.placement),
-        serial=None if section.placement == "manual" else _serial(section),
-        virtual=None if section.virtual is None else ScaleSettings(**section.virtual.model_dump()),
+        device=None if section.placement == "manual" else _serial(section),
         pourer_elsewhere=section.pourer == "elsewhere",
         load_tolerance=section.load_tolerance,
     )
@@ -192,10 +187,9 @@ def _check_step(step: float, tolerance: float, place: Place, report: Report) -> 
 
 
 def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:
-    named = section.dialect if section.virtual is None or section.dialect != AUTO else VIRTUAL_DIALECT
     return SerialBalanceSpec(
         port=section.port or "",
-        dialect=named,
+        dialect=section.dialect,
         baud=section.baud,
         format=section.format,
         handshake=section.handshake,
@@ -205,38 +199,5 @@ def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:
         interval=section.interval,
         answer_time=section.answer_time,
         reconnect_time=section.reconnect_time,
+        virtual=None if section.virtual is None else ScaleSettings(**section.virtual.model_dump()),
     )
-
-
-def balance_as_file(spec: BalanceSpec) -> dict[str, Any]:
-    """The balance as a file would have it, JSON-ready."""
-    table: dict[str, Any] = {"placement": str(spec.placement)}
-    if spec.serial is not None:
-        s, rule = spec.serial, spec.serial.settling
-        table |= {} if spec.virtual is not None else {"port": s.port}
-        table |= {"dialect": s.dialect, "handshake": s.handshake}
-        table |= {key: value for key, value in (("baud", s.baud), ("format", s.format)) if value is not None}
-        table |= {} if s.step is None else {"step": format_quantity(s.step, "kg", "g")}
-        table |= {
-            "repeatability": format_quantity(s.repeatability, "kg", "g"),
-            "settling": {
-                "readings": rule.readings,
-                "span": format_quantity(rule.span, "s", "s"),
-                "steps": rule.steps,
-                "deadline": format_quantity(rule.deadline, "s", "s"),
-            },
-            "interval": format_quantity(s.interval, "s", "s"),
-            "answer_time": format_quantity(s.answer_time, "s", "s"),
-            "reconnect_time": format_quantity(s.reconnect_time, "s", "s"),
-            "pourer": "elsewhere" if spec.pourer_elsewhere else "here",
-        }
-    if spec.virtual is not None:
-        v = spec.virtual
-        table["virtual"] = {
-            "resolution": format_quantity(v.resolution, "kg", "g"),
-            "capacity": format_quantity(v.capacity, "kg", "kg"),
-            "noise": format_quantity(v.noise, "kg", "g"),
-            "drift": format_quantity(v.drift, "kg/s", "g/s"),
-            "settling_time": format_quantity(v.settling_time, "s", "s"),
-        }
-    return table | {"load_tolerance": format_quantity(spec.load_tolerance, "kg", "g")}

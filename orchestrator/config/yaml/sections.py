@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+import functools
+import operator
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
@@ -40,6 +44,19 @@ Name = Annotated[str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", m
 Text = Annotated[str, Strict(), Field(min_length=1)]
 
 
+@dataclass(frozen=True)
+class Mark:
+    """Says something of a field where it is declared."""
+
+    meaning: str
+
+
+IN_FILE = Mark("a path, relative to the file that it is written in")
+
+FilePath = Annotated[Text, IN_FILE]
+"""The path of a file or folder, relative to the file that names it."""
+
+
 class Section(BaseModel):
     """A mapping in a file.
 
@@ -52,10 +69,28 @@ class Section(BaseModel):
     required: ClassVar[dict[str, str]] = {}
     """Keys that must be given, each with an example."""
 
+    recorded_as_given: ClassVar[bool] = False
+    """Whether a run's record leaves out what was left out, because some keys may not stand beside others."""
+
+    tag: ClassVar[str] = ""
+    """Key that tells the variants of a tagged union apart; empty for a section without variants."""
+
+    variant: ClassVar[str] = ""
+    """What a section is a variant of that stands under a key of its own; so that keys of its siblings are known."""
+
+    @classmethod
+    def unknown_tag(cls, word: str) -> str:
+        """Why no variant has this tag, if more can be said than which there are."""
+        return ""
+
     @classmethod
     def written_keys(cls) -> dict[str, str]:
         """Keys as written in files, mapped to field names."""
         return {field.alias or name: name for name, field in cls.model_fields.items()}
+
+    def completed(self) -> Self:
+        """With what is meant by keys that are left out, for a run's record."""
+        return self
 
     def value(self, key: str) -> Any:
         """Value of a key as written in files; None where it was not given."""
@@ -67,6 +102,32 @@ S = TypeVar("S", bound=Section)
 
 def _form(value: Any) -> str:
     return "path" if isinstance(value, str) else "inline"
+
+
+def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
+    """One of several sections, told apart by the key that they call their `tag`: `{strategy: D3, …}`.
+
+    Args:
+        variants: by the word that the key has; two or more.
+        default: the variant that is meant where the key is missing; with none the key must be given.
+    """
+    key = next(iter(variants.values())).tag
+
+    def word(value: Any) -> str | None:
+        found = value.get(key, default) if isinstance(value, Mapping) else getattr(value, key, None)
+        return found if isinstance(found, str) else ""
+
+    union = functools.reduce(operator.or_, (Annotated[model, Tag(name)] for name, model in variants.items()))
+    return Annotated[union, Discriminator(word)]
+
+
+def word_or(word: str, model: type[Section]) -> Any:
+    """A section, or a word in its place."""
+
+    def form(value: Any) -> str:
+        return "word" if isinstance(value, str) else "section"
+
+    return Annotated[Annotated[Literal[word], Tag("word")] | Annotated[model, Tag("section")], Discriminator(form)]
 
 
 PathOr = Annotated[Annotated[Text, Tag("path")] | Annotated[S, Tag("inline")], Discriminator(_form)]

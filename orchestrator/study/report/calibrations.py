@@ -9,7 +9,7 @@ import numpy as np
 from orchestrator.report import style
 from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.drawing import Drawn, colour, look, strategy_of
+from orchestrator.study.report.drawing import Drawn, colour, legend, log_axis, look, strategy_of
 from orchestrator.study.report.gather import UNCALIBRATED, Found, Gathered, mean, running_least
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate
 
@@ -71,22 +71,32 @@ def _against_simulations(known: Mapping[str, Found]) -> Drawn:
         rows += [[name, spent, e.count, e.mean, e.low, e.high] for spent, e in points]
         spent, means = [p[0] for p in points], [p[1].mean for p in points]
         if len(points) == 1:
-            axes.errorbar(spent, means, yerr=error(points[0][1]), fmt="s", color=colour(name), capsize=4, label=name)
+            axes.errorbar(
+                spent,
+                means,
+                yerr=error(points[0][1]),
+                fmt="s",
+                color=colour(name),
+                capsize=4,
+                label=name,
+                clip_on=False,
+            )
         else:
             axes.plot(spent, means, look(name, list(known)).line, color=colour(name), label=name)
-            low, high = [p[1].low for p in points], [p[1].high for p in points]
-            axes.fill_between(spent, low, high, color=colour(name), alpha=0.2, linewidth=0)
-    axes.set_xscale("log")
+            axes.errorbar(
+                spent[-1:], means[-1:], yerr=error(points[-1][1]), fmt="o", color=colour(name), capsize=4, clip_on=False
+            )
+    log_axis(axes.xaxis)
     axes.set_ylim(bottom=0.0)
-    axes.legend(fontsize=9, frameon=False)
+    legend(figure, list(known))
     style.dress(axes, title="Discrepancy against simulations", x="simulations", y="best discrepancy [%]", grid="both")
     return Drawn(
         "figure-3c",
         "3c",
         "Best discrepancy against simulations",
         "On training pours. C3: least mean discrepancy of the θ tried so far; C4: least that its surrogate had "
-        "expected of a θ it chose, and at last of θ*; C1 and C2 choose all θ beforehand, and are one point. Bands "
-        "and bars: 95 % t intervals over repetitions.",
+        "expected of a θ it chose, and at last of θ*; C1 and C2 choose all θ beforehand, and are one point. Bars, of "
+        "a curve at its end: 95 % t intervals over repetitions.",
         figure,
         ("strategy", "simulations", "repetitions", "best_percent", "low", "high"),
         rows,
@@ -126,38 +136,39 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
                         tried.setdefault(place, []).append(100 * trial.discrepancy)
             places = list(tried)
             values = [mean(tried[place]) for place in places]
-            shown = axes.scatter([p[0] for p in places], [p[1] for p in places], c=values, marker="s", s=70, **settings)
+            xs, ys = [p[0] for p in places], [p[1] for p in places]
+            shown = axes.scatter(xs, ys, c=values, marker="s", s=46, clip_on=False, **settings)
             rows += [[name, "trial", names[0], x, names[1], y, v] for (x, y), v in zip(places, values, strict=True)]
         elif maps:
             alike = [m for m in maps if list(m.over) == names]
             surface = 100 * np.mean([np.maximum(m.mean, 0.0) for m in alike], axis=0)
-            xs, ys = alike[0].axes[names[0]], alike[0].axes[names[1]]
-            shown = axes.pcolormesh(xs, ys, surface, shading="nearest", **settings)
+            xs, ys = list(alike[0].axes[names[0]]), list(alike[0].axes[names[1]])
+            shown = axes.pcolormesh(xs, ys, surface, shading="gouraud", **settings)
             rows += [
                 [name, "surrogate", names[0], x, names[1], y, float(surface[j, i])]
                 for j, y in enumerate(ys)
                 for i, x in enumerate(xs)
             ]
         stars = [(getattr(theta.theta, names[0]), getattr(theta.theta, names[1])) for theta in found]
-        axes.plot([x for x, _ in stars], [y for _, y in stars], "x", color=style.BEST, markersize=8, label="θ*")
+        axes.plot(
+            [x for x, _ in stars], [y for _, y in stars], "X", color=style.BEST, markeredgecolor="white", markersize=9,
+            label="θ* of a repetition", clip_on=False, zorder=4,
+        )  # fmt: skip
         rows += [[name, "theta*", names[0], x, names[1], y, ""] for x, y in stars]
-        for axis, limit, scale in (
-            (box[names[0]], axes.set_xlim, axes.set_xscale),
-            (box[names[1]], axes.set_ylim, axes.set_yscale),
-        ):
-            if axis.scale == "log":
-                scale("log")
-            limit(axis.lower, axis.upper)
         first = axes is grid[0][0]
         style.dress(axes, title=name, x=style.label(names[0]), y=style.label(names[1]) if first else "", grid=None)
+        style.frame(axes, box[names[0]], "x")
+        style.frame(axes, box[names[1]], "y")
     if shown is not None:
-        figure.colorbar(shown, ax=list(grid[0]), label="discrepancy [%]", shrink=0.85)
+        figure.colorbar(shown, ax=list(grid[0]), label="discrepancy [%]", extend="max", pad=0.02)
+    legend(figure, [])
     return Drawn(
         "figure-4",
         "4",
         "Discrepancy over θ",
         "C1 and C2: mean over the training pours of each θ that was tried, over the repetitions. C3 and C4: posterior "
-        "mean of the surrogate, averaged over the repetitions. Crosses: θ* of each repetition.",
+        "mean of the surrogate, averaged over the repetitions. Crosses: θ* of each repetition. "
+        "Colours end at the ninth decile of what was found.",
         figure,
         ("strategy", "what", "x_name", "x", "y_name", "y", "discrepancy_percent"),
         rows,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -9,10 +11,8 @@ import numpy as np
 
 from orchestrator.report import style
 from orchestrator.report.units import LossUnit, deployment_unit, largest_loss
-from orchestrator.study.cells import deployment_simulations
 from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.calibrations import error
-from orchestrator.study.report.drawing import Drawn, colour, legend, log_axis, look
+from orchestrator.study.report.drawing import Drawn, Look, colour, legend, log_axis, look
 from orchestrator.study.report.gather import Gathered, Key, at_pour, mean
 from orchestrator.study.report.intervals import Estimate, Range, estimate
 
@@ -62,26 +62,83 @@ def checkpoints(study: StudyPlan, wanted: tuple[int, ...] = CHECKPOINTS) -> list
     return sorted({min(pour, most_pours(study)) for pour in wanted})
 
 
-def bars(axes: Axes, groups: Sequence[str], arms: Sequence[str], of: Callable[[int, str], Estimate]) -> Rows:
-    """A group of bars for each name, in it one for each arm, with their intervals.
+def means(
+    axes: Axes, groups: Sequence[str], arms: Sequence[str], of: Callable[[int, str], Estimate], least: float
+) -> Rows:
+    """A group of means for each name, in it one for each arm, with their intervals, on a logarithmic axis.
 
     Args:
         of: an estimate by the number of its group and its arm.
+        least: what less is drawn at.
 
     Returns:
-        Group's number, arm, and numbers of each bar.
+        Group's number, arm, and numbers of each mean.
     """
     width, rows = 0.8 / len(arms), []
     for i in range(len(groups)):
         for j, arm in enumerate(arms):
-            one, shown = of(i, arm), look(arm, arms)
-            axes.bar(
-                i + (j + 0.5) * width - 0.4, one.mean, 0.92 * width, color=shown.colour, hatch=shown.hatch,
-                edgecolor="white", linewidth=0.0, yerr=error(one), capsize=2, error_kw={"linewidth": 1.2}, label=arm,
-            )  # fmt: skip
+            one = of(i, arm)
+            _mean(axes, i + (j + 0.5) * width - 0.4, one, look(arm, arms), least, arm)
             rows.append((i, arm, [one.count, one.mean, one.low, one.high]))
+        if i:
+            axes.axvline(i - 0.5, color=style.PALE, linewidth=0.8, zorder=0)
+    axes.set_xlim(-0.5, len(groups) - 0.5)
     axes.set_xticks(range(len(groups)), groups)
+    axes.tick_params(axis="x", length=0)
+    log_axis(axes.yaxis)
     return rows
+
+
+def _mean(axes: Axes, x: float, one: Estimate, shown: Look, least: float, label: str) -> None:
+    """A mean and its interval; one that reaches below what is shown ends in an arrow."""
+    if math.isnan(one.mean):
+        return
+    middle, low, high = (max(value, least) for value in (one.mean, one.low, one.high))
+    if not math.isnan(one.low):
+        axes.plot([x, x], [low, high], color=shown.colour, linewidth=1.4, zorder=2)
+        if one.low < least < one.high:
+            axes.plot([x], [least], "v", color=shown.colour, markersize=4, zorder=2, clip_on=False)
+    axes.plot(
+        [x], [middle], shown.marker, color=shown.colour, markerfacecolor=shown.face, markersize=6, label=label,
+        zorder=3, clip_on=False,
+    )  # fmt: skip
+
+
+def level_note(study: StudyPlan, level: str) -> str:
+    """In what a level's bench differs from the others: 'particles 600, friction 0.05, receiver -2 mm'."""
+    benches = {one.name: one.bench for one in study.levels}
+    liquids = {name: bench.liquid.model_dump() for name, bench in benches.items()}
+    told = [
+        f"{name} {value:g}".replace("_", HARD_SPACE).replace(" ", HARD_SPACE)
+        for name, value in liquids[level].items()
+        if len({liquid[name] for liquid in liquids.values()}) > 1
+    ]
+    if len({bench.pose_error.x for bench in benches.values()}) > 1:
+        told.append(f"receiver{HARD_SPACE}{1e3 * benches[level].pose_error.x:+.0f}{HARD_SPACE}mm")
+    return ", ".join(told)
+
+
+def level_title(study: StudyPlan, level: str) -> str:
+    """Of a panel: the level's name, and below it what its bench is like."""
+    return "\n".join([f"{level} mismatch", *textwrap.wrap(level_note(study, level), TITLE_WIDTH)])
+
+
+LEVELS = (
+    "A level's mismatch says how far its bench is from the simulator, not how hard it is to pour there: each has a "
+    "liquid of its own, and most may be lost at the smallest mismatch."
+)
+"""For the captions of figures that have a panel for each level."""
+
+HARD_SPACE = "\N{NO-BREAK SPACE}"
+"""Where a title's line is not to be broken."""
+
+TITLE_WIDTH = 42
+"""Characters of a line above a panel."""
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    words = list(map(str, numbers))
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def least_shown(unit: LossUnit) -> float:
@@ -92,22 +149,24 @@ def least_shown(unit: LossUnit) -> float:
 def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
     levels, receivers, arms = places(study, found)
     unit, receiver, pours = deployment_unit(study.deployments[0].plan), receivers[0], checkpoints(study)
-    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
+    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.2), squeeze=False, sharey=True)
     rows: list[list[object]] = []
     for axes, level in zip(grid[0], levels, strict=True):
 
         def after(i: int, arm: str, level: str = level) -> Estimate:
             return mean_loss(study, at_pour(found.best_so_far(Key(level, receiver, arm)), pours[i]))
 
-        drawn = bars(axes, [str(pour) for pour in pours], arms, after)
+        drawn = means(axes, [str(pour) for pour in pours], arms, after, least_shown(unit))
         rows += [[level, receiver, arm, pours[i], *numbers] for i, arm, numbers in drawn]
-        style.dress(axes, title=f"{level} mismatch", x="pours", y=f"least {unit.label}" if level == levels[0] else "")
+        y = f"least {unit.label}" if level == levels[0] else ""
+        style.dress(axes, title=level_title(study, level), x="pours", y=y)
     legend(figure, arms)
     return Drawn(
         "figure-5a",
         "5a",
         f"Least loss after so many pours into '{receiver}'",
-        "Mean over repetitions of the least loss so far, with 95 % t intervals. D1 pours once: its number stays.",
+        "Mean over repetitions of the least loss so far, with 95 % t intervals; arrows: the interval goes on below "
+        f"{least_shown(unit):g} {unit.unit}. D1 pours once: its number stays. {LEVELS}",
         figure,
         ("level", "receiver", "strategy", "pours", "repetitions", f"least_{unit.unit}", "low", "high"),
         rows,
@@ -124,14 +183,16 @@ def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
         def of_all(i: int, arm: str, level: str = level) -> Estimate:
             return mean_loss(study, [mean(pours) for pours in found.losses.get(Key(level, receivers[i], arm), [])])
 
-        rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in bars(axes, receivers, arms, of_all)]
-        style.dress(axes, title=f"{level} mismatch", y=f"mean {unit.label}" if level == levels[0] else "")
+        drawn = means(axes, receivers, arms, of_all, least_shown(unit))
+        rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in drawn]
+        style.dress(axes, title=level_title(study, level), y=f"mean {unit.label}" if level == levels[0] else "")
     legend(figure, arms)
     return Drawn(
         "figure-5b",
         "5b",
         "Mean loss of a pour",
-        "Over all pours of a repetition, exploring ones too; mean over repetitions with 95 % t intervals.",
+        "Over all pours of a repetition, exploring ones too; mean over repetitions with 95 % t intervals; arrows: the "
+        f"interval goes on below {least_shown(unit):g} {unit.unit}. {LEVELS}",
         figure,
         ("level", "receiver", "strategy", "repetitions", f"mean_{unit.unit}", "low", "high"),
         rows,
@@ -157,28 +218,28 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
                 points = [mean_loss(study, at_pour(curves, pour)) for pour in numbers]
                 rows += [[level, receiver, arm, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points)]  # noqa: B905
                 shown = look(arm, arms)
-                middle, low, high = ([max(v, least) for v in values] for values in zip(*map(_ends, points)))  # noqa: B905
-                axes.plot(numbers, middle, shown.line, color=shown.colour, label=arm)
-                axes.fill_between(numbers, low, high, color=shown.colour, alpha=0.15, linewidth=0)
+                middle = [max(one.mean, least) for one in points]
+                axes.plot(numbers, middle, shown.line, color=shown.colour, label=arm, linewidth=1.7)
+                for pour in checkpoints(study):
+                    # Bars beside each other, and no bands: those of several strategies would fill the panel.
+                    aside = 0.6 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
+                    _mean(axes, pour + aside, points[pour - 1], shown, least, "")
             x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if j == 0 else ""
             style.dress(axes, title=f"{receiver}, {level} mismatch", x=x, y=y, grid="both")
-            log_axis(axes.yaxis)
+            log_axis(axes.yaxis, decades=True)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend(figure, arms)
     return Drawn(
         "figure-6",
         "6",
         "Least loss so far against real pours",
-        "Mean over repetitions with 95 % t intervals, on a logarithmic axis: less than "
-        f"{least:g} {unit.unit}, nothing too, is drawn there. D1 is planned in simulation alone and poured once.",
+        f"Mean over repetitions; 95 % t intervals after {_listed(checkpoints(study))} pours, side by side. On a "
+        f"logarithmic axis: less than {least:g} {unit.unit}, nothing too, is drawn there, and intervals that go on "
+        f"below end in an arrow. D1 is planned in simulation alone and poured once. {LEVELS}",
         figure,
         ("level", "receiver", "strategy", "pour", "repetitions", f"least_{unit.unit}", "low", "high"),
         rows,
     )
-
-
-def _ends(one: Estimate) -> tuple[float, float, float]:
-    return one.mean, one.low, one.high
 
 
 def _prices(study: StudyPlan, found: Gathered) -> Drawn:
@@ -228,14 +289,9 @@ def _spent(
     study: StudyPlan, found: Gathered, level: str, receivers: list[str], arm: str, simulation: float, pour: float
 ) -> tuple[list[float], list[float]]:
     """Total time after each pour, and the least loss so far, averaged over receivers."""
-    plan = study.deployment(arm).plan
+    settings = study.deployment(arm).plan.settings
     curves = [curve for name in receivers for curve in found.best_so_far(Key(level, name, arm))]
     length = max((len(curve) for curve in curves), default=0)
-    if plan.strategy == "D1":
-        before, each = deployment_simulations(plan) * simulation, pour
-    elif plan.strategy == "D3":
-        before, each = plan.prior_simulations * simulation, max(pour, (plan.per_pour or 0) * simulation)
-    else:
-        before, each = 0.0, pour
+    before, each = settings.simulations_before * simulation, max(pour, settings.simulations_beside * simulation)
     numbers = range(1, length + 1)
     return [before + n * each for n in numbers], [mean(at_pour(curves, n)) for n in numbers]

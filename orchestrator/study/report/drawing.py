@@ -28,11 +28,14 @@ COLOURS = {
     "D3-paper": style.GOOD,
 }
 PAPER = "-paper"
-"""End of the label of a strategy as the paper has it: hatched and dashed."""
+"""End of the label of a strategy as the paper has it: dashed, its marks open."""
 
 LINES = (":", "--", "-", "-.")
-HATCHES = ("..", "//", "", "xx")
+MARKERS = ("v", "^", "<", ">")
 """Of several D1, by iterations."""
+
+MARKER = {"D1": "v", "D2": "s", "D3": "o"}
+"""Of each strategy; of calibrations a diamond."""
 
 MOST_ABREAST = 8
 """Entries of a legend's row."""
@@ -46,14 +49,21 @@ class Look:
     """How one arm is drawn; no two of a figure share it, and none is told by its colour alone that has kin.
 
     Attributes:
-        colour: of lines and bars.
+        colour: of lines and marks.
         line: style of its lines.
-        hatch: of its bars.
+        marker: of its means.
+        filled: whether that is filled.
     """
 
     colour: str
     line: str
-    hatch: str
+    marker: str
+    filled: bool = True
+
+    @property
+    def face(self) -> str:
+        """Colour that a mark is filled with."""
+        return self.colour if self.filled else "white"
 
 
 @dataclass
@@ -108,14 +118,15 @@ def look(arm: str, arms: Sequence[str]) -> Look:
         arm: its label.
         arms: all of the figure, this one among them.
     """
+    marker = MARKER.get(strategy_of(arm), "D")
     if arm.endswith(PAPER):
-        return Look(colour(arm), "--", "//")
+        return Look(colour(arm), "--", marker, filled=False)
     kin = sorted((other for other in arms if _iterations(other) is not None), key=lambda other: _iterations(other) or 0)
     if arm not in kin or len(kin) == 1:
-        return Look(colour(arm), "-", "")
+        return Look(colour(arm), "-", marker)
     place = kin.index(arm)
     share = PALEST + (DARKEST - PALEST) * place / (len(kin) - 1)
-    return Look(_shade(colour(arm), share), LINES[place % len(LINES)], HATCHES[place % len(HATCHES)])
+    return Look(_shade(colour(arm), share), LINES[place % len(LINES)], MARKERS[place % len(MARKERS)])
 
 
 def _iterations(arm: str) -> int | None:
@@ -132,13 +143,13 @@ def _shade(colour: str, share: float) -> str:
     return to_hex((keep * r + add * other[0], keep * g + add * other[1], keep * b + add * other[2]))
 
 
-def log_axis(axis: Axis) -> None:
-    """A logarithmic axis whose ticks are numbers that people read: 0.5, 1, 2, 5, 10."""
+def log_axis(axis: Axis, *, decades: bool = False) -> None:
+    """A logarithmic axis whose ticks are numbers that people read: 0.5, 1, 2, 5, 10; or `decades` alone."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     axes = axis.axes
     (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_locator(LogLocator(subs=(1.0,) if decades else (1.0, 2.0, 5.0)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -146,6 +157,6 @@ def log_axis(axis: Axis) -> None:
 def legend(figure: Figure, arms: Sequence[str]) -> None:
     """One legend for all panels below them, in the arms' order; an arm may be missing in some of the panels."""
     handles = {name: h for axes in figure.axes for h, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    names = [arm for arm in arms if arm in handles]
+    names = [*(arm for arm in arms if arm in handles), *(name for name in handles if name not in arms)]
     columns = -(-len(names) // -(-len(names) // MOST_ABREAST))
     figure.legend([handles[n] for n in names], names, loc="outside lower center", ncols=columns, frameon=False)

@@ -7,7 +7,15 @@ from collections.abc import Sequence
 from orchestrator.report import style
 from orchestrator.report.units import deployment_unit
 from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.deployments import bars, loss_range, mean_loss, places
+from orchestrator.study.report.deployments import (
+    LEVELS,
+    least_shown,
+    level_title,
+    loss_range,
+    mean_loss,
+    means,
+    places,
+)
 from orchestrator.study.report.drawing import Drawn, legend
 from orchestrator.study.report.effects import Effect, effect
 from orchestrator.study.report.gather import Gathered, Key, mean
@@ -27,18 +35,20 @@ def draw_finals(study: StudyPlan, found: Gathered) -> list[Drawn]:
         return []
     levels, receivers, arms = final_places(study, found)
     unit = deployment_unit(study.deployments[0].plan)
-    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
+    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.2), squeeze=False, sharey=True)
     rows: list[list[object]] = []
     for axes, level in zip(grid[0], levels, strict=True):
 
         def poured_again(i: int, arm: str, level: str = level) -> Estimate:
             return mean_loss(study, list(final_losses(found, level, [receivers[i]], arm).values()))
 
-        rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in bars(axes, receivers, arms, poured_again)]
-        style.dress(axes, title=f"{level} mismatch", y=f"{unit.label}" if level == levels[0] else "")
+        drawn = means(axes, receivers, arms, poured_again, least_shown(unit))
+        rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in drawn]
+        style.dress(axes, title=level_title(study, level), y=f"{unit.label}" if level == levels[0] else "")
     legend(figure, arms)
     header = ("level", "receiver", "strategy", "repetitions", f"final_{unit.unit}", "low", "high")
-    return [Drawn("figure-final", "", "Loss of the recommended action", CAPTION, figure, header, rows)]
+    caption = f"{CAPTION} Arrows: the interval goes on below {least_shown(unit):g} {unit.unit}. {LEVELS}"
+    return [Drawn("figure-final", "", "Loss of the recommended action", caption, figure, header, rows)]
 
 
 def final_places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str], list[str]]:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from actors.balance.placement import Placement
+from actors.balance.spec import SerialBalanceSpec
 from actors.bench.device_stand_ins import DeviceStandIns
 from actors.bench.pouring_bench import PouringBench
 from actors.bench.things import Things
@@ -171,16 +172,17 @@ def wired_spec(
     spec = load_laboratory(LABORATORIES / "virtual.yaml")
     assert spec.arm is not None
     assert spec.balance is not None
-    assert spec.balance.serial is not None
-    assert spec.balance.virtual is not None
+    device = spec.balance.device
+    assert isinstance(device, SerialBalanceSpec)
+    assert device.virtual is not None
     assert spec.bench is not None
-    rule = replace(spec.balance.serial.settling, deadline=10.0)
+    rule = replace(device.settling, deadline=10.0)
     arm = replace(spec.arm, time_scale=pace)
     if hurried:
         rule = replace(rule, readings=2, span=0.2)
         arm = replace(arm, announcement=1.0, untilt_speed=60 * DEG, approach_speed=90 * DEG)
-    serial = replace(spec.balance.serial, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule)
-    virtual = replace(spec.balance.virtual, noise=0.0, drift=0.0, settling_time=0.5)
+    virtual = replace(device.virtual, noise=0.0, drift=0.0, settling_time=0.5)
+    device = replace(device, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule, virtual=virtual)
     manual = placement is Placement.MANUAL
     return replace(
         spec,
@@ -189,8 +191,7 @@ def wired_spec(
         balance=replace(
             spec.balance,
             placement=placement,
-            serial=None if manual else serial,
-            virtual=None if manual else virtual,
+            device=None if manual else device,
         ),
         bench=replace(spec.bench, time_scale=pace),
         operator=operator or OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),

@@ -323,6 +323,8 @@ def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
     assert prediction["received"]["deviation"] > 0.0
     assert abs(prediction["received"]["mean"] - outcome["received"]) < 5 * prediction["received"]["deviation"] + 1e-9
     assert outcome["regimes"]["lip"]["weber"][0] < outcome["regimes"]["lip"]["weber"][1]
+    assert outcome["delivered_g"] == pytest.approx(100.0 * outcome["prediction"]["received"]["mean"])
+    assert outcome["delivered_ml"] == pytest.approx(outcome["delivered_g"] / 0.998)
     assert outcome["not_covered"] == []
     assert "not simulated" not in simulated.stderr
 
@@ -334,6 +336,7 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert done.returncode == 0, done.stderr
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
     assert "mean ± standard deviation, 2 seeds" in done.stdout
+    assert re.search(r"delivered \d+\.\d g, \d+\.\d mL", done.stdout)
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
 
 

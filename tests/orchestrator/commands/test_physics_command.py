@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +155,10 @@ def test_the_legend_lies_on_no_curve_and_no_number_is_tiny(panels: int, monkeypa
     )
     words = tuple(f"panel {panel}" for panel in range(panels))
     canvas = saved(Figure(words, words, words, curves, log_x=True), monkeypatch)
+    long = Series("a = 28.6 mm, experiment of others", (1.0, 2.0), (0.1, 0.2), "reference")
     assert strays(canvas) == []
+    several = (*curves, *(replace(long, name=f"{long.name} {i}") for i in range(3)))
+    assert strays(saved(Figure(words, words, words, several), monkeypatch)) == []
     assert [axes.get_legend() for axes in canvas.axes] == [None] * panels
     (legend,) = canvas.legends
     assert [text.get_text() for text in legend.get_texts()] == list(names)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from textwrap import dedent
 
@@ -10,18 +9,18 @@ import pytest
 
 from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
-from actors.balance.spec import BalanceSpec
+from actors.balance.spec import BalanceSpec, SerialBalanceSpec
 from actors.balance.virtual_serial.scale import ScaleSettings
 from orchestrator.config.laboratory.balance import (
     BalanceDeviceSection,
     SettlingSection,
     VirtualScaleSection,
-    balance_as_file,
     resolve_balance,
 )
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
+from tests.orchestrator.good_files import written_out
 
 
 def load(text: str, mode: str = "hardware") -> BalanceSpec:
@@ -59,8 +58,8 @@ def test_every_key_reaches_the_balance():
     assert spec.placement is Placement.RECEIVER
     assert spec.pourer_elsewhere
     assert spec.load_tolerance == pytest.approx(2e-3)
-    serial = spec.serial
-    assert serial is not None
+    serial = spec.device
+    assert isinstance(serial, SerialBalanceSpec)
     assert (serial.port, serial.dialect, serial.baud, serial.format) == (
         "/dev/serial/by-id/usb-KERN", "kern-swt", 4800, "7E1")  # fmt: skip
     assert serial.handshake == "software"
@@ -71,30 +70,29 @@ def test_every_key_reaches_the_balance():
 
 
 def test_a_port_is_enough_and_the_rest_is_found_out():
-    serial = load(SIMPLE).serial
-    assert serial is not None
+    serial = load(SIMPLE).device
+    assert isinstance(serial, SerialBalanceSpec)
     assert (serial.dialect, serial.baud, serial.format) == ("auto", None, None)
 
 
-def test_a_virtual_balance_has_a_data_sheet_and_speaks_kcp_unless_told_otherwise():
-    spec = load(VIRTUAL, mode="virtual")
-    assert spec.virtual == ScaleSettings(1e-5, 3.0, 2e-5, 1e-6, 2.0)
-    assert spec.serial is not None
-    assert spec.serial.dialect == "kcp"
-    other = load(VIRTUAL + "dialect: sbi\n", mode="virtual").serial
-    assert other is not None
+def test_a_virtual_balance_has_a_data_sheet():
+    device = load(VIRTUAL, mode="virtual").device
+    assert isinstance(device, SerialBalanceSpec)
+    assert device.virtual == ScaleSettings(1e-5, 3.0, 2e-5, 1e-6, 2.0)
+    other = load(VIRTUAL + "dialect: sbi\n", mode="virtual").device
+    assert isinstance(other, SerialBalanceSpec)
     assert other.dialect == "sbi"
 
 
 def test_where_the_operator_types_there_is_no_line():
-    assert load("placement: manual\nload_tolerance: 1 g\n").serial is None
+    assert load("placement: manual\nload_tolerance: 1 g\n").device is None
 
 
 @pytest.mark.parametrize(("text", "mode"), [(FULL, "hardware"), (SIMPLE, "hardware"), (VIRTUAL, "virtual"),
                                             ("placement: manual", "hardware")])  # fmt: skip
 def test_the_resolved_balance_loads_to_the_same(text, mode):
     spec = load(text, mode)
-    assert load(json.dumps(balance_as_file(spec)), mode) == spec
+    assert load(written_out(BalanceDeviceSection, text), mode) == spec
 
 
 def test_the_page_on_balances_names_every_key():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,13 +10,13 @@ import pytest
 
 from actors.balance.placement import Placement
 from actors.spec import LaboratorySpec
-from orchestrator.codec import from_json, to_json
 from orchestrator.config.campaign.check import check_campaign
-from orchestrator.config.laboratory.sections import laboratory_as_file
+from orchestrator.config.laboratory.sections import LaboratoryFile
 from orchestrator.config.load import load_campaign, load_laboratory
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
 from orchestrator.plan import CampaignPlan
+from tests.orchestrator.good_files import written_out
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 VIRTUAL = (CONFIGS / "laboratories" / "virtual.yaml").read_text(encoding="utf-8")
@@ -51,14 +50,14 @@ def test_the_shipped_laboratories_are_what_they_say(tmp_path):
     virtual, hardware = load(tmp_path, VIRTUAL), load(tmp_path, HARDWARE)
     assert virtual.arm is not None
     assert virtual.balance is not None
-    assert virtual.balance.serial is not None
+    assert virtual.balance.device is not None
     assert (virtual.mode, virtual.operator.answers, virtual.arm.address) == ("virtual", "virtual", "")
-    assert virtual.arm.time_scale == virtual.balance.serial.time_scale == 30.0
+    assert virtual.arm.time_scale == virtual.balance.device.time_scale == 30.0
     assert hardware.arm is not None
     assert hardware.balance is not None
-    assert hardware.balance.serial is not None
+    assert hardware.balance.device is not None
     assert (hardware.mode, hardware.operator.answers, hardware.bench) == ("hardware", "person", None)
-    assert hardware.arm.time_scale == hardware.balance.serial.time_scale == 1.0
+    assert hardware.arm.time_scale == hardware.balance.device.time_scale == 1.0
 
 
 def test_hardware_differs_from_virtual_in_addresses_and_limits_only(tmp_path):
@@ -77,8 +76,7 @@ def test_hardware_differs_from_virtual_in_addresses_and_limits_only(tmp_path):
 @pytest.mark.parametrize("text", [VIRTUAL, HARDWARE, TWIN], ids=["virtual", "ur10-kern", "twin"])
 def test_a_laboratory_as_written_out_loads_to_the_same(tmp_path, text):
     spec = load(tmp_path, text)
-    assert load(tmp_path, json.dumps(laboratory_as_file(spec))) == spec
-    assert from_json(json.loads(json.dumps(to_json(spec, LaboratorySpec))), LaboratorySpec) == spec
+    assert load(tmp_path, written_out(LaboratoryFile, text)) == spec
 
 
 BENCH = "bench:\n  liquid: {particles: 4000}\n  time_scale: 30\n"

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.collections import PolyCollection
 
 from orchestrator.config.study.sections import load_study
+from orchestrator.report.style import new_figure
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta, TriedOnPours
 from orchestrator.strategies.calibration.evaluation import ScoredPair, Scores
 from orchestrator.strategies.deployment.learnt import Deployed
@@ -22,15 +24,18 @@ from orchestrator.study.cells import Cell, cells_of
 from orchestrator.study.code import code_now, told
 from orchestrator.study.folder import CellResult, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.deployments import draw_deployments
-from orchestrator.study.report.drawing import look
+from orchestrator.study.report.calibrations import draw_calibrations
+from orchestrator.study.report.deployments import draw_deployments, means
+from orchestrator.study.report.drawing import Drawn, look
 from orchestrator.study.report.effects import effect
+from orchestrator.study.report.finals import draw_finals
 from orchestrator.study.report.gather import at_pour, gather, running_least
 from orchestrator.study.report.intervals import Estimate, estimate
 from orchestrator.study.report.page import write_report
 from orchestrator.study.report.tables import pours_needed, tables
 from orchestrator.study.strategies import FinalPoured
 from sim_engine.liquid import SimulationParameters
+from tests.orchestrator.reported import strays
 from tests.orchestrator.study_files import read, written
 
 FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7", "final")
@@ -199,7 +204,7 @@ def test_no_two_arms_of_a_figure_look_alike() -> None:
     looks = [look(arm, arms) for arm in arms]
     assert len({one.colour for one in looks}) == len(arms)
     planned = [look(arm, arms) for arm in ("D1-5", "D1-10", "D1-15")]
-    assert len({one.hatch for one in planned}) == len({one.line for one in planned}) == 3, (
+    assert len({one.marker for one in planned}) == len({one.line for one in planned}) == 3, (
         "in print without colours too"
     )
     brightness = [sum(bytes.fromhex(one.colour[1:])) for one in planned]
@@ -207,8 +212,8 @@ def test_no_two_arms_of_a_figure_look_alike() -> None:
     for name in ("C4", "D2", "D3"):
         ours, theirs = look(name, [name, f"{name}-paper"]), look(f"{name}-paper", [name, f"{name}-paper"])
         assert ours.colour != theirs.colour
-        assert (theirs.line, theirs.hatch) == ("--", "//")
-    assert look("D1-5", ["D1-5", "D2"]).hatch == "", "alone it needs none"
+        assert (theirs.line, theirs.filled, theirs.marker) == ("--", False, ours.marker)
+    assert len({look(arm, ["D1-5", "D2", "D3"]).marker for arm in ("D1-5", "D2", "D3")}) == 3
 
 
 def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: StudyPlan) -> None:
@@ -225,6 +230,35 @@ def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: St
         assert list(hybrid.get_ydata()) == pytest.approx([0.4, 0.01, 0.01])
     assert "less than 0.01 %" in figure.caption
     assert [row[5] for row in figure.rows if row[2] == "D3"][1] == 0.0, "the numbers are what was measured"
+
+
+def all_drawn(study: StudyPlan) -> list[Drawn]:
+    found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
+    return [*draw_calibrations(study, found), *draw_deployments(study, found), *draw_finals(study, found)]
+
+
+def test_nothing_leaves_a_figure_no_mark_is_cut_and_no_band_fills_a_panel(study: StudyPlan) -> None:
+    for one in all_drawn(study):
+        assert strays(one.figure) == [], one.number
+        assert not [c for c in one.figure.findobj(PolyCollection) if c.get_alpha() is not None], one.number
+
+
+def test_a_panel_says_what_its_bench_is_like(study: StudyPlan) -> None:
+    for number in ("5a", "5b", ""):
+        one = next(one for one in all_drawn(study) if one.number == number)
+        titles = [" ".join(axes.get_title(loc="left").split()) for axes in one.figure.axes]
+        assert titles[0] == "small mismatch cohesion 0.03, viscosity 3, friction 0, receiver -2 mm"
+        assert titles[1] == "large mismatch cohesion 0.08, viscosity 12, friction 0.2, receiver -12 mm"
+        assert "not how hard it is to pour there" in one.caption
+
+
+def test_an_interval_that_goes_on_below_the_axis_ends_in_an_arrow(study: StudyPlan) -> None:
+    _, axes = new_figure(size=(3, 3))
+    kept = means(axes, ["a", "b"], ["D3"], lambda i, _: Estimate(5.0, (1.0, -2.0)[i], 9.0, 3), 0.01)
+    assert [row[2] for row in kept] == [[3, 5.0, 1.0, 9.0], [3, 5.0, -2.0, 9.0]], "the numbers are what was measured"
+    arrows = [line for line in axes.lines if line.get_marker() == "v"]
+    assert [[*line.get_xdata(), *line.get_ydata()] for line in arrows] == [pytest.approx([1.0, 0.01])]
+    assert axes.get_yscale() == "log"
 
 
 def test_an_arm_that_its_first_panel_lacks_is_in_the_legend(study: StudyPlan) -> None:
