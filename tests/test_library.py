@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import decant
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "library.md"
+PAGE, NOTEBOOK = ROOT / "docs" / "library.md", ROOT / "docs" / "library.ipynb"
 MOST_LINES = 10
 HEAVY = ("taichi", "ray", "rerun", "matplotlib")
 
@@ -62,6 +64,38 @@ def test_every_example_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     }
     for name in ("pour.png", "spillage.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_notebook_is_the_page_executed_with_its_pictures() -> None:
+    book, made = committed(), make_notebook().notebook()
+    assert [cell.source for cell in book.cells] == [cell.source for cell in made.cells], "run docs/make_notebook.py"
+    outputs = [output for cell in book.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert not [output for output in outputs if output.output_type == "error"]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+    assert "/" + "work/" not in NOTEBOOK.read_text(encoding="utf-8"), "a path of the machine that made it"
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    book = make_notebook().executed(tmp_path)
+    pictures = [o for cell in book.cells for o in cell.get("outputs", ()) if "image/png" in o.get("data", {})]
+    assert len(pictures) == 2
+
+
+def committed() -> Any:
+    import nbformat
+
+    return nbformat.read(NOTEBOOK, as_version=4)
+
+
+def make_notebook() -> Any:
+    spec = importlib.util.spec_from_file_location("make_notebook", ROOT / "docs" / "make_notebook.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def test_hardware_is_not_armed_from_a_program(tmp_path: Path) -> None:
