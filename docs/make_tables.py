@@ -24,17 +24,19 @@ from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_na
 from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
 from orchestrator.config.laboratory import arm_sections, cluster, operator
 from orchestrator.config.laboratory import sections as laboratory
+from orchestrator.config.laboratory.arms import ARMS
 from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.sections import Choice, Section
 from orchestrator.config.yaml.validate import sections_in
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment.objectives import Objective
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.risk import RiskSettings
 from orchestrator.strategies.deployment.trust import TrustSettings
 from orchestrator.strategies.deployment.window import WindowSettings
-from orchestrator.strategies.doors import STRATEGIES
+from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquid import SimulationParameters
 from sim_engine.validation import sensitivity
@@ -55,14 +57,14 @@ SECTIONS: dict[str, type[Section]] = {
     "prices": PricesSettings,
     "data": campaign.DataSection,
     "loss": campaign.LossSection,
-    "objective": campaign.ObjectiveSection,
+    "objective": Objective,
     "outputs": campaign.OutputsSection,
     "liquid": vessel.LiquidFile,
     "vessel": vessel.VesselFile,
     "profile": vessel.ProfileSection,
     "laboratory": laboratory.LaboratoryFile,
     "ray": cluster.RaySection,
-    "arm": arm_sections.ArmSection,
+    "arm": arm_sections.UrArmSection,
     "limits": arm_sections.LimitsSection,
     "cell": arm_sections.CellSection,
     "operator": operator.OperatorSection,
@@ -78,7 +80,7 @@ SECTIONS: dict[str, type[Section]] = {
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BalanceSection": "[balance](#bench)",
-    "ArmSection": "[arm](#arm-and-cell)",
+    **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm-and-cell)"),
     "CellSection": "[cell](#arm-and-cell)",
     "LimitsSection": "[limits](#arm-and-cell)",
     "BoxSection": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
@@ -88,14 +90,16 @@ OF_SECTIONS = {
     "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
     "MountSection": "`{tilt, turn}`, angles",
     "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
-    "BalanceDeviceSection": "[balance](balances.md#settings)",
+    "SerialSection": "[balance](balances.md#settings)",
+    "NumbersSection": "[balance](balances.md#settings)",
     "OperatorSection": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
     "PoseErrorSection": "[pose error](#bench)",
     "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
     "LossSection": "[loss](#losses)",
-    "ObjectiveSection": "[objective](#objectives)",
+    "Objective": "[objective](#objectives)",
+    **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "TrustSettings": "[trust](#trust)",
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
     "WindowSettings": "[window](#risk-and-the-safe-window)",
@@ -211,7 +215,10 @@ def section(model: type[Section]) -> str:
     for key, name in model.written_keys().items():
         info = model.model_fields[name]
         default = _default(key, info, model)
-        rows.append((f"`{key}`", _value(info.annotation, info.metadata), default, _one_line(info.description or "")))
+        value = _value(info.annotation, info.metadata)
+        if model is Objective and name == model.tag:
+            value = ", ".join(f"`{word}`" for word in OBJECTIVES.names)
+        rows.append((f"`{key}`", value, default, _one_line(info.description or "")))
     return _table(("key", "value", "unless given", "meaning"), rows)
 
 
@@ -246,6 +253,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{name: partial(section, model) for name, model in SECTIONS.items()},
     "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),
     "deployment-strategies": partial(variants, campaign.DEPLOYMENTS, campaign.DeploymentSection),
+    "objectives": partial(variants, OBJECTIVES.all, Objective),
     "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Section),
     "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Section),
 }
@@ -280,6 +288,9 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         parts = [_value(part) for part in typing.get_args(annotation) if part is not type(None)]
         sections = [part for part in parts if "or the path of its file" in part]
         return " or ".join(dict.fromkeys(sections or parts))
+    choice = next((m for m in metadata if isinstance(m, Choice)), None)
+    if choice is not None:
+        return ", ".join(f"`{word}`" for word in choice.words())
     if origin is Literal:
         return ", ".join(f"`{word}`" for word in typing.get_args(annotation))
     if origin is list:

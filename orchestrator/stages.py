@@ -16,17 +16,16 @@ from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.risk import Disturbances
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
 POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
-DEPLOYMENT, PREDICTION = "deployment:", "prediction:"
+DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "prediction:"
 """Names of a calibration's stages, and what those of receivers begin with."""
 
 POSTERIOR_DRAWS = 64
@@ -112,7 +111,10 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
 
 
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
-    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated)."""
+    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated).
+
+    Each is followed by one that pours what was recommended again, where the plan asks for that.
+    """
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
@@ -121,15 +123,21 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
         return build
 
-    return [
-        StageDefinition(
-            DEPLOYMENT + name,
-            build_for(scene),
-            order=deployment.settings.order,
-            pours=deployment.pours > 0,
-        )
-        for name, scene in _by_receiver(deployment).items()
-    ]
+    def confirm_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            recommended = learnt_by(results, DEPLOYMENT + name, Deployed).recommended
+            costing = Costing.of(deployment, scene, _theta(plan, results))
+            return Confirmation(costing, recommended, deployment.confirm, seed)
+
+        return build
+
+    stages = []
+    for name, scene in _by_receiver(deployment).items():
+        order, pours = deployment.settings.order, deployment.pours > 0
+        stages.append(StageDefinition(DEPLOYMENT + name, build_for(scene), order=order, pours=pours))
+        if deployment.confirm:
+            stages.append(StageDefinition(CONFIRMATION + name, confirm_for(name, scene), pours=True))
+    return stages
 
 
 def prediction_stages(
@@ -148,11 +156,8 @@ def prediction_stages(
             action = None if recommended is None else scene.action(dict(recommended.action_si))
             theta, known = _theta(plan, results), with_posterior(deployment, results)
             costing = Costing.of(deployment, scene, theta)
-            risk = known.settings.risk if isinstance(known.settings, D1Settings) else None
-            if risk is None:
-                return RepeatedSimulation(costing, action, seeds, seed, thetas)
-            draws = Disturbances(risk, deployment.actions, theta, seed, known.thetas).draws(seeds)
-            drawn = [draw.parameters for draw in draws] if risk.theta == "posterior" else thetas
+            draws = known.settings.draws(known, theta, seeds, seed)
+            drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
             return RepeatedSimulation(costing, action, seeds, seed, drawn, [draw.error for draw in draws])
 
         return build

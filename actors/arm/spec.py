@@ -93,6 +93,11 @@ class ArmSpec(ABC):
         """What it is set up to carry [kg]; None where nobody said."""
         return None
 
+    @property
+    def tilt_speed_limit(self) -> float | None:
+        """How fast it may turn the pourer [rad/s]; None where nobody said."""
+        return None
+
     def look(self) -> ArmLook:
         """Ask the arm everything that `decant doctor` tells of; nothing moves, nothing is set."""
         return ArmLook()
@@ -170,6 +175,11 @@ class UrArmSpec(ArmSpec):
     def payload_limit(self) -> float | None:
         """See `ArmSpec.payload_limit`."""
         return self.payload
+
+    @property
+    def tilt_speed_limit(self) -> float:
+        """See `ArmSpec.tilt_speed_limit`."""
+        return self.limits.tilt_speed
 
     @property
     def untilt_time(self) -> float:

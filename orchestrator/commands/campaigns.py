@@ -255,7 +255,7 @@ def planning_plan(
         scenes = (dataclasses.replace(scenes[0], name=f"plan:{vessel.name}", receiver=vessel),)
     changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
     settings = D1Settings.like(deployment.settings, **changes)
-    deployment = dataclasses.replace(deployment, settings=settings, scenes=scenes, thetas=thetas)
+    deployment = dataclasses.replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0)
     return dataclasses.replace(
         plan,
         name=f"{plan.name}-plan",

@@ -117,7 +117,6 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
     from actors.protocols import InvalidActionError
     from orchestrator.config.campaign.assignments import assigned_action
     from orchestrator.config.campaign.check import check_vessels
-    from orchestrator.config.yaml.errors import shown_path
 
     plan = read_campaign(path)
     scene, space = scene_to_simulate(plan, scene_name)
@@ -125,9 +124,9 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
     except ValueError as error:
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
-    problems = check_vessels(scene)
+    problems = check_vessels(scene, plan.source)
     if problems:
-        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
     planned = None

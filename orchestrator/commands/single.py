@@ -1,15 +1,17 @@
-"""`decant simulate`, `decant validate`, `decant schema`: verbs that need no laboratory."""
+"""`decant simulate`, `decant schema`: verbs that need no laboratory."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
+from orchestrator.commands.waiting import waiting_for
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -41,7 +43,7 @@ def simulate(
     from orchestrator.config.campaign.assignments import assigned_action
     from orchestrator.config.campaign.check import check_vessels
     from orchestrator.config.load import load_parameters, load_vessel
-    from orchestrator.config.yaml.errors import ConfigError, shown_path
+    from orchestrator.config.yaml.errors import ConfigError
     from sim_engine.backend import BackendError, require_backend
     from sim_engine.pour import InvalidSceneError, PourSimulator
     from sim_engine.spread import spreads
@@ -62,9 +64,9 @@ def simulate(
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
     check_output(rrd, "--rrd", ".rrd")
     check_output(png, "--png", ".png")
-    problems = check_vessels(scene)
+    problems = check_vessels(scene, plan.source)
     if problems:
-        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     record_rate = 20.0 if rrd or png else 0.0
     tasks = [PourTask(scene, action, theta, seed + i, record_rate if i == 0 else 0.0) for i in range(seeds)]
     try:
@@ -110,14 +112,16 @@ def simulate(
 
 def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:
     """One after the other; Taichi ends with them."""
-    from rich.console import Console
+    begin = time.monotonic()
+    runs: list[SimulatedPour] = []
 
-    note = "the first pour ever also compiles kernels, about 10 s"
-    runs = []
-    with stdout_for_results(), Console(stderr=True).status("") as status:
+    def doing() -> str:
+        note = "" if runs else "; the first pour ever also compiles kernels, about 10 s"
+        return f"simulating seed {len(runs) + 1} of {len(tasks)}, {time.monotonic() - begin:.0f} s so far{note}"
+
+    with stdout_for_results(), waiting_for(doing):
         try:
-            for i, task in enumerate(tasks, start=1):
-                status.update(f"simulating seed {i} of {len(tasks)} ({note}) …")
+            for task in tasks:
                 runs.append(simulator.simulate(task))
         finally:
             simulator.close()
@@ -194,49 +198,6 @@ def _show(task: PourTask, pour: SimulatedPour, rrd: Path | None, png: Path | Non
         from orchestrator.report.scene import simulation_png
 
         say(f"picture: {simulation_png(png, task, pour)}")
-
-
-def validate(paths: list[Path]) -> None:
-    """Check files; every problem of every file, exit code 2 if there is one."""
-    from orchestrator.config.campaign.check import check_campaign
-    from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-    from orchestrator.config.study.sections import load_study
-    from orchestrator.config.yaml.errors import ConfigError
-    from orchestrator.config.yaml.files import resolved
-    from orchestrator.config.yaml.kinds import kind_of
-    from orchestrator.config.yaml.source import Document
-    from orchestrator.study.cells import cells_of
-    from sim_engine.vessel.build import build_vessel
-    from sim_engine.vessel.errors import VesselError
-
-    bad = 0
-    for path in paths:
-        problems: list[str] = []
-        try:
-            kind = kind_of(Document.read(resolved(path)).data)
-            if kind == "vessel":
-                vessel = build_vessel(load_vessel(path))
-                note = f"vessel, holds {1e6 * vessel.capacity:.4g} mL to the brim"
-            elif kind == "laboratory":
-                note = f"laboratory, {load_laboratory(path).mode}"
-            elif kind == "study":
-                study = load_study(path)
-                note = f"study, {len(cells_of(study))} cells, seed {study.seed}"
-            else:
-                plan = load_campaign(path)
-                problems = [str(problem) for problem in check_campaign(plan)]
-                note = f"campaign, seed {plan.seed}"
-        except ConfigError as error:
-            problems = [str(error)]
-        except VesselError as error:
-            problems = [f"{path}: {error}"]
-        if problems:
-            bad += 1
-            say("\n".join(problems))
-        else:
-            print(f"{path}: ok ({note})")
-    if bad:
-        raise RefusalError(f"{bad} of {len(paths)} file(s) can't be used", BAD_INPUT)
 
 
 def schema(which: str) -> None:

@@ -21,7 +21,7 @@ from orchestrator.config.yaml.files import resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.sections import MADE, Section
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
@@ -111,7 +111,7 @@ def _theta_model() -> type[_ThetaBase]:
         q = parameter_quantity(name)
         loose = _LooseQuantity(q.unit, q.example, q.lower, q.upper, whole=q.whole)
         fields[name] = (Annotated[float, loose] | None, None)
-    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, **fields)
+    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, __cls_kwargs__=MADE, **fields)
     return model
 
 

@@ -9,7 +9,7 @@ from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag, create_mod
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section, Text
+from orchestrator.config.yaml.sections import MADE, Section, Text
 from orchestrator.plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquid import SimulationParameters
@@ -129,7 +129,9 @@ def _range_model(
 ) -> type[RangeSection]:
     end = Annotated[float, quantity]
     fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]")), **further}
-    model: type[RangeSection] = create_model(f"{_title(name)}Range", __base__=base, __doc__=base.__doc__, **fields)
+    model: type[RangeSection] = create_model(
+        f"{_title(name)}Range", __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 
@@ -141,7 +143,9 @@ def _action_range_model(dimension: Dimension) -> type[RangeSection]:
         key: (Annotated[float, number] | None, Field(default=None, description=_described(PriorSection, key)))
         for key, number in (("mean", quantity), ("deviation", spread))
     }
-    prior: Any = create_model(f"{_title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, **fields)
+    prior: Any = create_model(
+        f"{_title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, __cls_kwargs__=MADE, **fields
+    )
     prior.required = {"mean": quantity.example, "deviation": spread.example}
     field = (prior | None, Field(default=None, description=_described(ActionRangeSection, "prior")))
     return _range_model(name, quantity, ActionRangeSection, prior=field)
@@ -211,7 +215,9 @@ def _motion_model() -> type[MotionBase]:
         )
         for name, dimension in ACTION_DIMENSIONS.items()
     }
-    model: type[MotionBase] = create_model("Motion", __base__=MotionBase, __doc__=MotionBase.__doc__, **fields)
+    model: type[MotionBase] = create_model(
+        "Motion", __base__=MotionBase, __doc__=MotionBase.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 
@@ -245,7 +251,9 @@ def _actions_model() -> type[ActionsBase]:
         )
         for name, dimension in ACTION_DIMENSIONS.items()
     }
-    model: type[ActionsBase] = create_model("Actions", __base__=ActionsBase, __doc__=ActionsBase.__doc__, **fields)
+    model: type[ActionsBase] = create_model(
+        "Actions", __base__=ActionsBase, __doc__=ActionsBase.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 
@@ -290,7 +298,7 @@ def _parameters_model() -> type[ParametersBase]:
         ]
         fields[name] = (form | None, Field(default=None, description=info.meaning or None))
     model: type[ParametersBase] = create_model(
-        "Parameters", __base__=ParametersBase, __doc__=ParametersBase.__doc__, **fields
+        "Parameters", __base__=ParametersBase, __doc__=ParametersBase.__doc__, __cls_kwargs__=MADE, **fields
     )
     return model
 

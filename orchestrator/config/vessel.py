@@ -9,7 +9,7 @@ from pydantic import Field, create_model
 
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.quantities import Quantity, parse_quantity
-from orchestrator.config.yaml.sections import FilePath, Name, Number, Section, Text
+from orchestrator.config.yaml.sections import MADE, FilePath, Name, Number, Section, Text
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import Liquid
 from sim_engine.vessel.spec import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
@@ -77,7 +77,9 @@ def _vessel_file() -> type[VesselBase]:
         kind: (shape | None, Field(default=None, description=inspect.getdoc(shape)))
         for kind, shape in further_sources().items()
     }
-    model: type[VesselBase] = create_model("VesselFile", __base__=VesselBase, __doc__=VesselBase.__doc__, **fields)
+    model: type[VesselBase] = create_model(
+        "VesselFile", __base__=VesselBase, __doc__=VesselBase.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typing
 
+from orchestrator.strategies.deployment.objectives import Objective
 from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings, StrategySettings
 from sim_engine.doors import Door
 
@@ -11,6 +12,13 @@ from sim_engine.doors import Door
 def _strategy(loaded: object, name: str) -> type[StrategySettings]:
     if not (isinstance(loaded, type) and issubclass(loaded, CalibrationSettings | DeploymentSettings)):
         raise TypeError("should be a class derived from CalibrationSettings or DeploymentSettings")
+    _check_tag(loaded.model_fields[loaded.tag].annotation, loaded.tag, name)
+    return loaded
+
+
+def _objective(loaded: object, name: str) -> type[Objective]:
+    if not (isinstance(loaded, type) and issubclass(loaded, Objective)):
+        raise TypeError("should be a class derived from Objective")
     _check_tag(loaded.model_fields[loaded.tag].annotation, loaded.tag, name)
     return loaded
 
@@ -24,6 +32,10 @@ def _check_tag(annotation: object, tag: str, name: str) -> None:
 
 STRATEGIES: Door[type[StrategySettings]] = Door("decant.strategies", "strategy", _strategy)
 """Settings of all strategies that are installed, calibrations and deployments."""
+
+
+OBJECTIVES: Door[type[Objective]] = Door("decant.objectives", "objective", _objective)
+"""All objectives that are installed."""
 
 
 def calibrations() -> dict[str, type[CalibrationSettings]]:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from orchestrator.flights import Order
     from orchestrator.plan import CalibrationPlan, DeploymentPlan
     from orchestrator.strategies.calibration.design import MeasuredPour
+    from orchestrator.strategies.deployment.risk import Draw
     from orchestrator.strategies.protocol import Strategy
     from sim_engine.liquid import SimulationParameters
     from sim_engine.space import Space
@@ -150,6 +151,10 @@ class DeploymentSettings(StrategySettings):
     def needs_posterior(self) -> bool:
         """Whether it plans with draws of θ given the pours of a calibration."""
         return False
+
+    def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
+        """Ways in which what it recommends may go otherwise than planned, for a prediction; none: as planned."""
+        return ()
 
     @property
     def simulations(self) -> int:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign.complaints import PlacedComplaints
 from orchestrator.config.campaign.resolve_data import resolve_data
-from orchestrator.config.campaign.resolve_objectives import STOPS, resolve_objectives
+from orchestrator.config.campaign.resolve_objectives import resolve_objectives
 from orchestrator.config.campaign.scenes import SceneBuilder
 from orchestrator.config.campaign.sections import DeploymentSection, LearningSection, LossSection
 from orchestrator.config.yaml.source import Place
 from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.deployment.objectives import STOPS
 from orchestrator.strategies.settings import Premises
 from sim_engine.losses import Loss
 from sim_engine.space import Space
@@ -35,6 +36,9 @@ def resolve_deployment(
         at = place.at("pours") if "pours" in settings.model_fields_set else place
         hint = "name one with a bench" if settings.learns_on_pours else "'pours: 0' only plans"
         report.add(at, f"laboratory '{laboratory.name}' has no bench to pour on; {hint}")
+    elif section.confirm and laboratory is not None and not laboratory.pours:
+        text = f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench, or remove it"
+        report.add(place.at("confirm"), text)
     loss = section.loss or LossSection()
     if loss.retained_weight is not None and loss.name != "spilled_and_retained":
         report.add(
@@ -53,7 +57,7 @@ def resolve_deployment(
             motions,
             () if actions is None else actions.names,
             place,
-            recorded=settings.pours == 0,
+            recorded=settings.pours == 0 and not section.confirm,
         )
         scenes.append(scene)
         if scene is None:
@@ -72,6 +76,7 @@ def resolve_deployment(
         data=data,
         objectives=resolve_objectives(section, place, complete[0], actions, report),
         constraints=constraints,
+        confirm=section.confirm,
     )
 
 

@@ -14,6 +14,7 @@ from orchestrator.config.motion import Parameters as ParametersModel
 from orchestrator.config.vessel import LiquidFile, VesselFile
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import (
+    MADE,
     Count,
     FilePath,
     Name,
@@ -24,8 +25,7 @@ from orchestrator.config.yaml.sections import (
     Text,
     tagged,
 )
-from orchestrator.strategies.deployment.objectives import ObjectiveName
-from orchestrator.strategies.doors import STRATEGIES, calibrations, deployments
+from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES, calibrations, deployments
 from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings, StrategySettings
 from sim_engine.losses import LossName
 
@@ -136,25 +136,7 @@ class LossSection(Section):
     """w; 1 unless given."""
 
 
-class ObjectiveSection(Section):
-    """One of several things wanted of a pour."""
-
-    required: ClassVar[dict[str, str]] = {"name": "spillage"}
-
-    name: ObjectiveName | None = None
-    """spillage and retained: shares of the load; time: duration of the motion; target_volume: pour so much and stop."""
-
-    weight: Annotated[float, Quantity("1", "1.0", 1e-6, 1e6)] = 1.0
-    """In the weighted sum."""
-
-    scale: Annotated[float, Quantity("s", "10 s", 0.01, 3600.0)] | None = None
-    """Of time: a duration that is as bad as spilling everything; 10 s unless given."""
-
-    volume: Annotated[float, Quantity("m^3", "150 mL", 1e-7, 0.1)] | None = None
-    """Of target_volume: what should be poured."""
-
-    tolerance: Annotated[float, Quantity("m^3", "2 mL", 0.0, 0.1)] | None = None
-    """Of target_volume: by how much it may be missed; nothing unless given."""
+AnyObjective: Any = tagged(OBJECTIVES.all)
 
 
 class DeploymentSection(Section):
@@ -178,7 +160,7 @@ class DeploymentSection(Section):
     loss: LossSection | None = None
     """What is minimised."""
 
-    objectives: list[ObjectiveSection] | None = None
+    objectives: list[AnyObjective] | None = None
     """Several things wanted at once, in place of a loss."""
 
     pareto: Switch | None = None
@@ -186,6 +168,9 @@ class DeploymentSection(Section):
 
     floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
     """Share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless given."""
+
+    confirm: Count = 0
+    """Pours of the recommended action at the end, which take no part in choosing it: what to expect of it."""
 
     @property
     def settings(self) -> DeploymentSettings:
@@ -216,7 +201,7 @@ def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Section
     for name, own in settings.items():
         learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
         bases = (own, LearningSection if learns else base)
-        found[name] = create_model(f"{name}Section", __base__=bases, __doc__=own.__doc__)
+        found[name] = create_model(f"{name}Section", __base__=bases, __doc__=own.__doc__, __cls_kwargs__=MADE)
         found[name].required = own.required | base.required
     return found
 

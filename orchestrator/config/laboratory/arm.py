@@ -11,22 +11,22 @@ from actors.arm.path.kinematics import MODELS
 from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arm_sections import (
     JOINTS,
-    ArmSection,
     CellSection,
     LimitsSection,
     PlaneSection,
     PointSection,
+    UrArmSection,
 )
 from orchestrator.config.yaml.source import Place, Report
 
-__all__ = ["ArmSection", "CellSection", "resolve_arm"]
+__all__ = ["CellSection", "UrArmSection", "resolve_arm"]
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\.?")
 
 
 def resolve_arm(
-    arm: ArmSection, cell: CellSection | None, place: Place, report: Report, *, mode: str
+    arm: UrArmSection, cell: CellSection | None, place: Place, report: Report, *, mode: str
 ) -> UrArmSpec | None:
     """The arm of a laboratory's file; what is wrong goes to the report, and then there is none.
 
@@ -85,7 +85,7 @@ def resolve_arm(
     return spec if len(report.problems) == before else None
 
 
-def _check_address(arm: ArmSection, at: Place, report: Report, mode: str) -> None:
+def _check_address(arm: UrArmSection, at: Place, report: Report, mode: str) -> None:
     if mode != "hardware":
         if arm.address is not None:
             report.add(at.at("address"), "a virtual arm has no address: remove it, or write 'mode: hardware'")

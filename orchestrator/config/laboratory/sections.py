@@ -11,14 +11,15 @@ from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
 from actors.spec import LaboratorySpec
-from orchestrator.config.laboratory.arm import ArmSection, CellSection, resolve_arm
-from orchestrator.config.laboratory.balance import BalanceDeviceSection, resolve_balance
+from orchestrator.config.laboratory.arm_sections import CellSection
+from orchestrator.config.laboratory.arms import ARMS, ArmSettings
+from orchestrator.config.laboratory.balance import any_balance, resolve_balance
 from orchestrator.config.laboratory.cluster import RaySection, resolve_ray
 from orchestrator.config.laboratory.operator import OperatorSection, resolve_operator
 from orchestrator.config.motion import parameter_quantity
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Count, Name, Section, Switch
+from orchestrator.config.yaml.sections import MADE, Count, Name, Section, Switch, tagged
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import PoseError
@@ -62,7 +63,7 @@ def hidden_liquid_model() -> type[HiddenLiquidBase]:
         for name, info in SimulationParameters.info().items()
     }
     model: type[HiddenLiquidBase] = create_model(
-        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, **fields
+        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, __cls_kwargs__=MADE, **fields
     )
     return model
 
@@ -94,6 +95,12 @@ class BenchSection(Section):
     """Refilling, placing, wiping between two pours, in bench time; with an arm see 'operator'."""
 
 
+AnyArm: Any = tagged(ARMS.all, default="ur")
+"""Arms of all kinds that are installed."""
+
+AnyBalance: Any = any_balance()
+
+
 class LaboratoryFile(Section):
     """Where a campaign runs."""
 
@@ -119,13 +126,13 @@ class LaboratoryFile(Section):
     ray: RaySection | None = None
     """The Ray cluster to run on; unless given, a private Ray on this machine."""
 
-    arm: ArmSection | None = None
-    """The arm that holds the pourer, reached over its controller's own wires, virtual or not."""
+    arm: AnyArm | None = None
+    """The arm that holds the pourer, virtual or not; its `kind` is one of those that are installed."""
 
     cell: CellSection | None = None
     """What stands where around the arm."""
 
-    balance: BalanceDeviceSection | None = None
+    balance: AnyBalance | None = None
     """The balance beside the arm."""
 
     operator: OperatorSection = OperatorSection()
@@ -148,7 +155,8 @@ def resolve_laboratory(section: LaboratoryFile, place: Place, report: Report) ->
         _check_hardware(section, place, report)
     _check_wires(section, place, report)
     operator = resolve_operator(section.operator, place.at("operator"), report, mode=section.mode)
-    arm = None if section.arm is None else resolve_arm(section.arm, section.cell, place, report, mode=section.mode)
+    written: ArmSettings | None = section.arm
+    arm = None if written is None else written.resolve(section.cell, place, report, mode=section.mode)
     balance = None
     if section.arm is not None and section.balance is not None:
         balance = resolve_balance(section.balance, place.at("balance"), report, mode=section.mode)
@@ -158,7 +166,7 @@ def resolve_laboratory(section: LaboratoryFile, place: Place, report: Report) ->
         return None  # reported already, as missing
     bench = None if section.bench is None else _bench(section.bench)
     if arm is not None and bench is not None:
-        arm, balance = replace(arm, time_scale=bench.time_scale), _paced(balance, bench.time_scale)
+        arm, balance = arm.paced(bench.time_scale), _paced(balance, bench.time_scale)
     return LaboratorySpec(
         name=section.name,
         simulators=section.simulators,

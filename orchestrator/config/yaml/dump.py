@@ -12,8 +12,9 @@ from pydantic import Tag
 from orchestrator.config.yaml.files import resolved
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import IN_FILE, Mark, Section
+from orchestrator.config.yaml.sections import IN_FILE, Section
 from orchestrator.config.yaml.source import Place
+from sim_engine.marks import Mark
 
 T = TypeVar("T")
 

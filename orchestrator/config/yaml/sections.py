@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    Strict,
+    Tag,
+)
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
+
+from sim_engine.marks import Mark
 
 Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
@@ -45,10 +57,27 @@ Text = Annotated[str, Strict(), Field(min_length=1)]
 
 
 @dataclass(frozen=True)
-class Mark:
-    """Says something of a field where it is declared."""
+class Choice:
+    """One of some words that are known once a file is read, such as the names of what is installed.
 
-    meaning: str
+    Attributes:
+        words: gives them.
+    """
+
+    words: Callable[[], Sequence[str]]
+
+    def _validate(self, value: Any) -> str:
+        words = self.words()
+        if value not in words:
+            expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
+            raise PydanticKnownError("literal_error", {"expected": expected})
+        return str(value)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self._validate)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"enum": list(self.words()), "type": "string"}
 
 
 IN_FILE = Mark("a path, relative to the file that it is written in")
@@ -97,6 +126,9 @@ class Section(BaseModel):
         return getattr(self, self.written_keys()[key])
 
 
+MADE: dict[str, Any] = {"use_attribute_docstrings": False}
+"""For sections that are made from tables: no source is searched for their keys' meanings, which takes a second."""
+
 S = TypeVar("S", bound=Section)
 
 
@@ -111,6 +143,8 @@ def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
         variants: by the word that the key has; two or more.
         default: the variant that is meant where the key is missing; with none the key must be given.
     """
+    if not variants:
+        raise RuntimeError("Decant's own entry points are not registered; install it again (pip install -e .)")
     key = next(iter(variants.values())).tag
 
     def word(value: Any) -> str | None:

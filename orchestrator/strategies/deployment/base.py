@@ -98,13 +98,19 @@ class Deployment(ABC, Generic[S]):
         if not self._width_known and slots.simulations > 0:
             self._trials.width, self._width_known = slots.simulations, True
         simulations = self._trials.issue(slots.simulations)
-        pours: list[Pour] = []
-        if self._queued_pour is not None and slots.pours > 0:
-            pours, self._pouring, self._queued_pour = [self._queued_pour], self._queued_pour, None
+        pours = self._issued_pour(slots)
         if not self._finished and self._may_think and self._queued_pour is None:
             self._next(slots.simulations - len(simulations))
+            pours += self._issued_pour(slots)
         # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
         return [*self._questions.issue(), *pours, *simulations]
+
+    def _issued_pour(self, slots: Slots) -> list[Pour]:
+        """The queued pour, if there is one and the arm is free."""
+        if self._queued_pour is None or self._pouring is not None or slots.pours < 1:
+            return []
+        self._pouring, self._queued_pour = self._queued_pour, None
+        return [self._pouring]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """What came of a question, a simulation or a pour."""
@@ -166,7 +172,7 @@ class Deployment(ABC, Generic[S]):
         name, parameters = self._scene.name, self._parameters
         return tuple(Simulate(name, action, parameters, self._seeds.next(), purpose) for _ in range(repeats))
 
-    def _pour(self, suggestion: Suggestion, point: Point, prediction: Prediction | None) -> None:
+    def _pour(self, point: Point, prediction: Prediction | None) -> None:
         """Queue a pour."""
         values = self._plan.actions.decode(point)
         noise = 0.0 if prediction is None or prediction.scatter is None else prediction.scatter
@@ -192,7 +198,7 @@ class Deployment(ABC, Generic[S]):
         if suggestion.means and not self._compromise.exploring:
             noise = suggestion.noises[0] if suggestion.noises else None
             known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise))
-        self._pour(suggestion, suggestion.points[0], known)
+        self._pour(suggestion.points[0], known)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
         """Standard deviation of one observation around the surrogate [the loss' unit]: from pour to pour, or in

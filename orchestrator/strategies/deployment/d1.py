@@ -12,7 +12,7 @@ from orchestrator.config.yaml.sections import Count, PositiveCount
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.deployment.risk import RiskSettings
+from orchestrator.strategies.deployment.risk import Disturbances, Draw, RiskSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
 from orchestrator.strategies.deployment.window import SafeWindow, WindowFound, WindowSettings
 from orchestrator.strategies.progress import Progress
@@ -86,6 +86,12 @@ class D1Settings(SearchSettings):
         if self.simulations_per_iteration == 1:
             text = "one simulation of each action is made as planned, so that with 'risk' at least 2 are needed"
             complaints.add(text, "simulations_per_iteration")
+
+    def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
+        """Errors and θ that the action had to bear."""
+        if self.risk is None:
+            return ()
+        return Disturbances(self.risk, plan.actions, parameters, seed, plan.thetas).draws(count)
 
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
         """The strategy itself."""
@@ -189,7 +195,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         if self._plan.pours < 1 or suggestion.best_point is None:
             self._finish()
         else:
-            self._pour(suggestion, suggestion.best_point, self._prediction(suggestion))
+            self._pour(suggestion.best_point, self._prediction(suggestion))
 
     def _prediction(self, suggestion: Suggestion) -> Prediction | None:
         """Of the pour of what is recommended."""

@@ -61,4 +61,4 @@ class RealOnly(Deployment[D2Settings]):
         return self._problem(poured, mean=self._settings.mean)
 
     def _start(self, suggestion: Suggestion) -> None:
-        self._pour(suggestion, suggestion.points[0], None)
+        self._pour(suggestion.points[0], None)

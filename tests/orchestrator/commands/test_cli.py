@@ -388,7 +388,7 @@ def test_a_full_disk_ends_a_run_with_its_name_and_advises_no_resuming_of_what_ha
     result = invoke("run small.yaml")
     assert isinstance(result.exception, SystemExit), result.exception
     assert result.exit_code == 1
-    assert "No space left on device: 'campaign.rrd'" in result.stderr
+    assert "MB are free there. A run needs" in result.stderr
     assert "nothing had begun" in result.stderr
     assert "--resume" not in result.stderr
 
@@ -402,7 +402,7 @@ HELP = {
     "plan": ["--receiver vase.yaml", "deg/s, mm and s", "Nothing is poured"],
     "simulate": ["--set x_offset=90   # deg/s and mm", "'angular_velocity=0.7 rad/s'", "in_flight", "--seeds"],
     "validate": ["decant validate configs/campaigns/*.yaml", "units, bounds"],
-    "schema": ["decant schema vessel > vessel.json"],
+    "schema": ["decant schema result > result.json"],
 }
 
 

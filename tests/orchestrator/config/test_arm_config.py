@@ -10,7 +10,7 @@ import pytest
 
 from actors.arm.geometry import Plane, Pose
 from actors.arm.spec import UrArmSpec
-from orchestrator.config.laboratory.arm import ArmSection, CellSection, resolve_arm
+from orchestrator.config.laboratory.arm import CellSection, UrArmSection, resolve_arm
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Document, Place, Report
@@ -19,7 +19,7 @@ from tests.orchestrator.good_files import written_out
 
 
 class Laboratory(Section):
-    arm: ArmSection | None = None
+    arm: UrArmSection | None = None
     """As in a laboratory's file."""
 
     cell: CellSection | None = None
@@ -164,5 +164,5 @@ def test_keys_are_typed_in_the_sections_that_say_them():
     def sentences(model: type[Section]) -> list[str | None]:
         return [field.description for field in model.model_fields.values()]
 
-    assert all(sentences(ArmSection))
+    assert all(sentences(UrArmSection))
     assert all(sentences(CellSection))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,7 +173,7 @@ def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
     problems = check_campaign(low)
     assert len(problems) == 2
     said = problems[0].message
-    assert said.startswith("calibration: the arm can make no action that was tried; for example")
+    assert said.startswith("calibration: the arm can make none of 21 actions that were tried; for example")
     assert re.search(r"for example angular_velocity \S+ deg/s  max_angle \S+ deg: the arm can't", said)  # as searched
     assert "57.3 deg are allowed: lower max_angle, or raise arm.limits.tilt" in said
     assert problems[0].where == "calibration.actions"
@@ -186,3 +187,21 @@ def test_an_arm_that_is_set_to_carry_less_than_the_liquid_is_refused():
     (problem,) = check_campaign(weak)
     assert problem.where == "liquid.mass"
     assert "set to carry 50 g (arm.payload), less than the water alone, 200 g" in problem.message
+
+
+def test_a_receiver_turned_away_from_home_is_refused_soon_and_in_words_of_the_bench():
+    plan = load_campaign(QUICKSTART)
+    assert plan.laboratory.arm is not None
+    cell = replace(plan.laboratory.arm.cell, direction=0.0)
+    turned = replace(plan, laboratory=replace(plan.laboratory, arm=replace(plan.laboratory.arm, cell=cell)))
+    doing: list[str] = []
+    begin = time.process_time()
+    first, second = check_campaign(turned, doing=doing.append)
+    assert time.process_time() - begin < 12.0  # 70 where each action's way was worked out to its 277 s
+    for problem in (first, second):
+        assert "home holds the pourer as for a direction of 90 deg, and cell.direction is 0 deg" in problem.message
+        assert "the full pourer would be turned by 90 deg" in problem.message
+        assert "set cell.direction nearer to 90 deg" in problem.message
+        assert "s into the approach" not in problem.message
+    assert doing[0] == "calibration: 21 actions are tried, none of 1 can be made"
+    assert any(text.startswith("deployment into 'narrow': ") for text in doing)

@@ -34,7 +34,7 @@ from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.d3_free import FreeHybrid
-from orchestrator.strategies.deployment.objectives import Objective, Objectives
+from orchestrator.strategies.deployment.objectives import Objectives, Retained, Spillage
 from orchestrator.strategies.deployment.prices import PricesSettings
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement
@@ -62,7 +62,7 @@ CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
     "C3": (BayesianCalibration, {"iterations": 6, "initial": 4}),
     "C4": (ContinuousBayesianCalibration, {"simulations": 12, "initial": 6}),
 }
-BOTH = Objectives((Objective("spillage"), Objective("retained")), pareto=True)
+BOTH = Objectives((Spillage(), Retained()), pareto=True)
 RISK = plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
 FREE = {"pours": 3, "prior_simulations": 12, "per_pour": "free", "prices": PricesSettings(), "model": "scaled"}
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
