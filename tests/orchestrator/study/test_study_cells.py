@@ -16,11 +16,14 @@ from orchestrator.config.study.sections import load_study
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.errors import RunError
 from orchestrator.stages import deployment_stages
+from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.posterior import PosteriorFound, RemainingDiscrepancy
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import cells_of
+from orchestrator.study.plan import StudyPlan
 from sim_engine.vessel.build import build_vessel
 from tests.orchestrator.study_files import ROOT, STUDIES, read, small, without, written
 
@@ -118,15 +121,27 @@ def risky(folder: Path, **arm: Any) -> Path:
     return written(folder, {**data, "campaign": str(folder / "campaign.yaml")})
 
 
+def known_posterior(study: StudyPlan, thetas: tuple[dict[str, float], ...]) -> Calibrated:
+    """What a calibration would have learnt that found these θ to fit."""
+    nothing = RemainingDiscrepancy(low=0.0, median=0.0, high=0.0)
+    posterior = PosteriorFound(
+        level=0.9, mean={}, region={}, open=(), correlation=(), directions=(), remaining_discrepancy=nothing,
+        effective=3.0, thetas=thetas,
+    )  # fmt: skip
+    found = CalibratedTheta(
+        theta=study.base.parameters, searched=("cohesion",), predicted_discrepancy=0.0, predicted_deviation=0.0,
+        hyperparameters=None, map=None, posterior=posterior,
+    )  # fmt: skip
+    return Calibrated(strategy="C4", simulations=0, lost=0, undefined=0, training_pours=2, trials=(), found=found)
+
+
 def test_risk_of_the_campaign_is_that_of_d1_and_leaves_the_others_what_they_are(tmp_path: Path) -> None:
     study = load_study(risky(tmp_path))
     plans = {arm.label: arm.plan for arm in study.deployments}
     assert plans["D1-2"].risk is not None
     assert plans["D1-2"].tolerance == pytest.approx(0.02)
     assert {plans[label].risk for label in ("D2", "D3")} == {plans[label].tolerance for label in ("D2", "D3")} == {None}
-    theta = study.base.parameters.model_dump()
-    rows = [{"cohesion": 0.01 * i} for i in range(3)]
-    known = {"calibration": {"theta": theta, "posterior": {"thetas": rows}}}
+    known = {"calibration": known_posterior(study, tuple({"cohesion": 0.01 * i} for i in range(3)))}
     made = {}
     for cell in cells_of(study):
         if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":
@@ -153,11 +168,11 @@ WRONG: dict[str, tuple[Any, str]] = {
     "nothing to confirm": (lambda d: without({**d, "confirm": 1}, "deployment"), "confirm: there is no deployment"),
     "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),
     "level twice": (lambda d: {**d, "mismatch": [d["mismatch"][0]] * 2}, "mismatch[1]: a level 'small'"),
-    "not searched": (lambda d: {**d, "search": ["friction"]}, "search[0]: 'friction' is not searched"),
+    "not searched": (lambda d: {**d, "search": ["viscosity"]}, "search[0]: 'viscosity' is not searched"),
     "nothing left to search": (
         lambda d: {
             **without(d, "search"),
-            "parameters": {"particles": 500, "cohesion": "0 N/m", "viscosity": "1 1/s"},
+            "parameters": {"particles": 500, "cohesion": "0 N/m", "friction": 0.1},
         },
         "parameters: fixes all that the campaign searches",
     ),
