@@ -115,7 +115,8 @@ def play(strategy: Strategy, answer: Callable[[Request], Outcome], slots: int, l
         assert flight.outcome is not None
         del flights[flight.id]
         strategy.tell(flight.request, flight.outcome)
-        done, total = strategy.progress()
+        progress = strategy.progress()
+        done, total = progress.done, progress.total
         if done >= told + 20 or done == total > told:
             told = done
             say(f"{label}: {done}/{total} simulations, {time.monotonic() - begun:.0f} s")

@@ -82,6 +82,7 @@ OF_SECTIONS = {
     "PointSection": "`{x, y, z}`, lengths",
     "CentreSection": "`{x, y, z}`, lengths",
     "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
+    "MountSection": "`{tilt, turn}`, angles",
     "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
     "BalanceDeviceSection": "[balance](balances.md#settings)",
     "OperatorSection": "[operator](#operator)",

@@ -17,6 +17,7 @@ from actors.protocols import PourProgress
 from orchestrator.requests import Decision, Outcome, Request
 from orchestrator.results import Results
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
 from sim_engine.simulated import RecordedFrames
 
 _log = logging.getLogger(__name__)
@@ -128,10 +129,9 @@ class PourProgressed(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StrategyProgressed(Event):
-    """The strategy was told something: steps done, steps in all, and what it has learnt so far."""
+    """The strategy was told something: what of its work is done, and what it has learnt so far."""
 
-    done: int
-    total: int
+    progress: Progress
     result: Learnt
 
 

@@ -136,15 +136,15 @@ class ProgressDisplay:
         if now - self._last_line < INTERVAL:
             return
         stage = self._tally.stages.get(event.stage)
-        if stage is None or stage.total == 0:
+        if stage is None or stage.progress.total == 0:
             return
         self._last_line = now
-        remaining = stage.remaining(event.time)
-        eta = f"  about {_duration(remaining)} left" if remaining is not None else ""
+        left = self._tally.forecast.left(event.time)
+        eta = f"  about {_duration(left)} left in all" if left is not None else ""
         # Lines come at moments when something has just ended; who is busy at that moment says nothing about the pool.
         load = self._tally.load()
         pool = f"pool {100 * load:.0f} % busy · " if load is not None else ""
-        self._print(f"{stage.name} {stage.done}/{stage.total}  {pool}{self._tally.counts_line()}{eta}")
+        self._print(f"{stage.name}: {stage.progress}  {pool}{self._tally.counts_line()}{eta}")
 
     def _print(self, text: str, look: str = "") -> None:
         from rich.text import Text
@@ -165,7 +165,9 @@ class ProgressDisplay:
             if pour is not None and not pour.result:
                 rows.append(Text(tally.pour_line() or "", style="bold"))
                 rows.append(self._pour_bar())
-            rows.append(Text(f"  {tally.pool_line()}", style="dim"))
+            left = tally.forecast.left(time.time())
+            eta = f" · about {_duration(left)} left in all" if left is not None else ""
+            rows.append(Text(f"  {tally.pool_line()}{eta}", style="dim"))
             return Group(*rows)
 
     def _stages(self) -> RenderableType:
@@ -175,15 +177,28 @@ class ProgressDisplay:
 
         table = Table.grid(padding=(0, 2))
         for stage in self._tally.stages.values():
-            waiting = stage.opened_at is None and stage.total == 0
-            done = stage.closed_at is not None
+            progress = stage.progress
+            waiting = stage.opened_at is None and progress.total == 0
+            total = max(progress.total, 1)
+            done = total if stage.closed_at is not None else progress.done
             table.add_row(
                 Text(stage.name, style="dim" if waiting else ""),
-                ProgressBar(total=max(stage.total, 1), completed=max(stage.total, 1) if done else stage.done, width=30),
-                Text(f"{stage.done}/{stage.total}" if stage.total else "", justify="right"),
-                Text(_stage_note(stage), style="dim"),
+                ProgressBar(total=total, completed=done, width=30),
+                Text(str(progress)),
+                Text(self._stage_note(stage), style="dim"),
             )
         return table
+
+    def _stage_note(self, stage: StageTally) -> str:
+        if stage.closed_at is not None:
+            return "done"
+        now = time.time()
+        left = self._tally.forecast.stage_left(stage.name, now)
+        about = "" if left is None else f"about {_duration(left)}"
+        if stage.opened_at is None:
+            return about or "waiting"
+        spent = _duration(now - stage.opened_at)
+        return f"{spent}, {about} left" if about else spent
 
     def _pour_bar(self) -> RenderableType:
         from rich.progress_bar import ProgressBar
@@ -209,17 +224,6 @@ class ProgressDisplay:
             Text("   ".join(note)),
         )
         return table
-
-
-def _stage_note(stage: StageTally) -> str:
-    if stage.closed_at is not None:
-        return "done"
-    if stage.opened_at is None:
-        return "" if stage.total else "waiting"
-    now = time.time()
-    remaining = stage.remaining(now)
-    spent = _duration(now - stage.opened_at)
-    return spent if remaining is None else f"{spent}, about {_duration(remaining)} left"
 
 
 def _duration(seconds: float) -> str:

@@ -298,9 +298,8 @@ class StageScheduler:
         if not urgent and time.monotonic() - self._reported < _REPORT_INTERVAL:
             return
         self._reported = time.monotonic()
-        done, total = self._strategy.progress()
         result = self._strategy.result()
-        self._watchers.emit(StrategyProgressed(stage=self._stage, done=done, total=total, result=result))
+        self._watchers.emit(StrategyProgressed(stage=self._stage, progress=self._strategy.progress(), result=result))
 
     def _append(self, kind: Kind, body: dict[str, Any]) -> None:
         self._journal.append(kind, body, stage=self._stage)

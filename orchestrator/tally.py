@@ -17,11 +17,14 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.forecast import Forecast
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_name
 from orchestrator.report.units import LossUnit, is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
+from orchestrator.strategies.progress import Progress
+from orchestrator.work import particles_of, work_of
 
 CHECKPOINT_WORDS = {
     "operator": "waiting for the operator",
@@ -41,24 +44,14 @@ class StageTally:
     """Progress of one stage.
 
     Attributes:
-        done, total: steps.
+        progress: as the strategy told it last.
         opened_at, closed_at: times of these events; a replayed opening has none.
-        replayed: steps that an earlier run had done.
     """
 
     name: str
-    done: int = 0
-    total: int = 0
+    progress: Progress = field(default_factory=Progress)
     opened_at: float | None = None
     closed_at: float | None = None
-    replayed: int = 0
-
-    def remaining(self, now: float) -> float | None:
-        """Estimated seconds to its end at the pace so far; None before there is a pace."""
-        fresh = self.done - self.replayed
-        if self.opened_at is None or self.closed_at is not None or fresh <= 0 or self.total <= 0:
-            return None
-        return (now - self.opened_at) / fresh * max(self.total - self.done, 0)
 
 
 @dataclass
@@ -97,6 +90,7 @@ class Tally:
         simulation_seconds: wall seconds that finished simulations took, all together (replayed ones not counted).
         timed_simulations: how many these were.
         best: by scene.
+        forecast: of the time that is left.
     """
 
     plan: CampaignPlan
@@ -112,18 +106,25 @@ class Tally:
     pour: PourTally | None = None
     best: dict[str, Best] = field(default_factory=dict)
 
+    forecast: Forecast = field(init=False)
+
     _busy_seconds: float = 0.0
     _load_from: float | None = None
     _load_to: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.forecast = Forecast(self.plan.parallel_simulations, particles_of(self.plan))
 
     def __call__(self, event: Event) -> None:
         """Count an event."""
         if not event.replayed:
             self._pass_time(event.time)
+        self.forecast(event)
         match event:
             case CampaignOpened():
                 self.mode, self.simulators = event.mode, event.simulators
                 self.stages = {name: StageTally(name) for name in event.stages}
+                self.forecast.begin(event.simulators, work_of(self.plan, event.stages))
             case CampaignStateChanged():
                 self.state = event.after
             case CampaignClosed():
@@ -136,12 +137,9 @@ class Tally:
                 self._stage(event.stage).closed_at = event.time
             case StrategyProgressed():
                 stage = self._stage(event.stage)
-                stage.done, stage.total = event.done, event.total
-                if event.replayed:
-                    stage.replayed = event.done
-                elif stage.opened_at is None:
+                stage.progress = event.progress
+                if not event.replayed and stage.opened_at is None:
                     stage.opened_at = event.time
-                    stage.replayed = event.done
             case RequestStarted():
                 self._started(event)
             case RequestFinished():

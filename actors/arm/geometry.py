@@ -1,7 +1,8 @@
 """Where things stand around an arm, and what it may do there. Plain values.
 
-Frames. *Base*: of the robot, as its controller has it. *Flange*: where tools are screwed on. *TCP*: tool centre point,
-as set on the controller. *Pourer*: of the vessel that pours, underside at z = 0, axis along z. *World*: of pours
+Frames. *Base*: of the robot, as its controller has it. *Room*: origin where the base's is, z up; the same as the base
+for an arm that stands on a table and isn't turned (`Mount`). *Flange*: where tools are screwed on. *TCP*: tool centre
+point, as set on the controller. *Pourer*: of the vessel that pours, underside at z = 0, axis along z. *World*: of pours
 (`sim_engine.motion`): origin below the receiver's middle, z up, the liquid goes towards +x.
 """
 
@@ -37,8 +38,27 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class Mount:
+    """How the robot is screwed down: it is turned about its own z axis, then leant about the room's x axis.
+
+    Attributes:
+        tilt: 0 on a table, 90° on a wall, 180° on a ceiling [rad].
+        turn: [rad].
+    """
+
+    tilt: float = 0.0
+    turn: float = 0.0
+
+    @property
+    def up(self) -> Vector:
+        """Where up is, in the base's frame; of length 1."""
+        lean = math.sin(self.tilt)
+        return (lean * math.sin(self.turn), lean * math.cos(self.turn), math.cos(self.tilt))
+
+
+@dataclass(frozen=True)
 class Plane:
-    """A half-space that the arm has to stay in: normal · point ≥ offset, in the base's frame.
+    """A half-space that the arm has to stay in: normal · point ≥ offset, in the room's frame.
 
     Attributes:
         normal: towards the allowed side, of length 1.
@@ -54,7 +74,7 @@ class ArmLimits:
     """What the arm may do here. Hard: checked before a pour is planned, and again by what moves the arm.
 
     Attributes:
-        box_low, box_high: corners of the box, in the base's frame, that tool and pourer stay in [m].
+        box_low, box_high: corners of the box, in the room's frame, that tool and pourer stay in [m].
         planes: half-spaces for the same.
         joint_speed: of any joint [rad/s].
         tool_speed: of the TCP, and of any point of the pourer [m/s].
@@ -80,9 +100,9 @@ class Cell:
     """What stands where around the arm.
 
     Attributes:
-        receiver: where the receiver's underside stands, middle, in the base's frame [m].
-        direction: that the liquid is poured in, seen from above: 0 along the base's x, turning towards y [rad].
-        table: height of the surface that nothing may go below, in the base's frame [m].
+        receiver: where the receiver's underside stands, middle, in the room's frame [m].
+        direction: that the liquid is poured in, seen from above: 0 along the room's x, turning towards y [rad].
+        table: height of the surface that nothing may go below, in the room's frame [m].
     """
 
     receiver: Vector

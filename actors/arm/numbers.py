@@ -306,7 +306,9 @@ class NumbersArm:
         Returns:
             Time reached [s]: `duration`, or less if the arm was stopped.
         """
-        with self._working:
+        if not self._working.acquire(blocking=False):
+            raise ArmRefusedError("the arm is busy; another motion has to wait")
+        try:
             self._consent()
             self._pace.restart()
             reached = 0.0
@@ -321,6 +323,8 @@ class NumbersArm:
             share = reached / duration if duration > 0.0 else 1.0
             self._tell(ArmState(False, self._pace.interrupted, reached, share, "idle", tilt))
             return reached
+        finally:
+            self._working.release()
 
     def _read_back(self, motion: PourMotion, executed: _Executed, reached: float) -> ExecutedMotion:
         times = np.arange(0.0, reached, 1.0 / SAMPLE_RATE)

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from actors.arm.geometry import ArmLimits, Cell, Joints, Pose, Vector
+from actors.arm.geometry import ArmLimits, Cell, Joints, Mount, Pose, Vector
 from actors.arm.look import ArmLook
 from sim_engine.action import Action
 from sim_engine.task import Scene
@@ -107,6 +107,7 @@ class UrArmSpec(ArmSpec):
         cell: what stands where.
         home: joints where it waits, out of people's way, the pourer upright [rad].
         address: of the controller; '' for a virtual one, which is started and has its address filled in.
+        mount: how the robot is screwed down.
         tool: TCP in the flange's frame.
         payload: of gripper and filled pourer [kg].
         payload_centre: in the flange's frame [m].
@@ -124,6 +125,7 @@ class UrArmSpec(ArmSpec):
     cell: Cell
     home: Joints
     address: str = ""
+    mount: Mount = field(default_factory=Mount)
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0
     payload_centre: Vector = (0.0, 0.0, 0.0)

@@ -46,7 +46,9 @@ class UrStandIn:
         arm = self._spec
         tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
         centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
-        program = f"def install():\n  set_tcp(p[{tool}])\n  set_payload({arm.payload!r}, [{centre}])\nend\n"
+        up = ", ".join(f"{9.82 * value!r}" for value in arm.mount.up)
+        lines = [f"set_gravity([{up}])", f"set_tcp(p[{tool}])", f"set_payload({arm.payload!r}, [{centre}])"]
+        program = "\n  ".join(["def install():", *lines]) + "\nend\n"
         with socket.create_connection((self._controller.address, SCRIPTS), timeout=5.0) as connection:
             connection.sendall(program.encode("ascii"))
             time.sleep(0.3)

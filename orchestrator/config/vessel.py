@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+import inspect
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, create_model
 
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.quantities import Quantity, format_quantity, parse_quantity
 from orchestrator.config.yaml.sections import Name, Number, Section, Text
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import Liquid
-from sim_engine.vessel.spec import LengthUnit, MeshShape, ProfileShape, VesselSpec
+from sim_engine.vessel.spec import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 
@@ -43,8 +44,8 @@ class ProfileSection(Section):
     """Thickness of the floor, downwards."""
 
 
-class VesselFile(Section):
-    """A vessel: a profile of [r, z] points, or a mesh of its solid."""
+class VesselBase(Section):
+    """A vessel: a profile of [r, z] points, a mesh of its solid, or what an installed package knows."""
 
     required: ClassVar[dict[str, str]] = {"name": "beaker"}
 
@@ -62,6 +63,25 @@ class VesselFile(Section):
 
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Axis of the mesh that points out of the opening; z unless given."""
+
+
+def further_sources() -> dict[str, type[Section]]:
+    """Sources of vessels that packages add, by the key that they have in a vessel's file."""
+    own = VesselBase.model_fields.keys()
+    return {kind: shape for kind, shape in VESSELS.all.items() if kind not in own and issubclass(shape, Section)}
+
+
+def _vessel_file() -> type[VesselBase]:
+    """The section with one key per source of vessels."""
+    fields: Any = {
+        kind: (shape | None, Field(default=None, description=inspect.getdoc(shape)))
+        for kind, shape in further_sources().items()
+    }
+    model: type[VesselBase] = create_model("VesselFile", __base__=VesselBase, __doc__=VesselBase.__doc__, **fields)
+    return model
+
+
+VesselFile: Any = _vessel_file()
 
 
 class LiquidFile(Section):
@@ -87,12 +107,16 @@ class LiquidFile(Section):
     `viscosity`."""
 
 
-def resolve_vessel(section: VesselFile, place: Place, report: Report) -> VesselSpec | None:
+def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselSpec | None:
     """The vessel of a file; problems go to the report, and then the answer is None."""
     before = len(report.problems)
-    shape: ProfileShape | MeshShape | None = None
-    if section.profile is not None and section.mesh is not None:
-        report.add(place.at("mesh"), "the vessel has a profile already; keep one of 'profile' and 'mesh'", key=True)
+    shape: Shape | None = None
+    kinds = ("profile", "mesh", *further_sources())
+    given = [key for key in kinds if section.value(key) is not None]
+    if len(given) > 1:
+        first = given[0]
+        text = f"the vessel has a {first} already; keep one of '{first}' and '{given[1]}'"
+        report.add(place.at(given[1]), text, key=True)
     elif section.profile is not None:
         for key in ("unit", "up"):
             if section.value(key) is not None:
@@ -100,8 +124,12 @@ def resolve_vessel(section: VesselFile, place: Place, report: Report) -> VesselS
         shape = _profile(section.profile, place.at("profile"), report)
     elif section.mesh is not None:
         shape = _mesh(section, place, report)
-    elif not any(report.is_broken(place.at(key)) for key in ("profile", "mesh")):
-        report.add(place, "has no shape; add 'profile:' with [r, z] points, or 'mesh:' with the path of a file")
+    elif given:
+        shape = section.value(given[0])
+    elif not any(report.is_broken(place.at(key)) for key in kinds):
+        others = "".join(f", or '{key}:'" for key in kinds[2:])
+        text = f"has no shape; add 'profile:' with [r, z] points, or 'mesh:' with the path of a file{others}"
+        report.add(place, text)
     if shape is None or section.name is None or len(report.problems) > before:
         return None
     return VesselSpec(name=section.name, shape=shape)
@@ -141,7 +169,7 @@ def _profile(section: ProfileSection, place: Place, report: Report) -> ProfileSh
     )
 
 
-def _mesh(section: VesselFile, place: Place, report: Report) -> MeshShape | None:
+def _mesh(section: VesselBase, place: Place, report: Report) -> MeshShape | None:
     path = resolved(place.directory / str(section.mesh))
     if path.suffix.lower() not in MESH_SUFFIXES:
         report.add(place.at("mesh"), f"{path.suffix or 'a file without suffix'} is no mesh; use STL, OBJ, PLY or GLB")
@@ -170,6 +198,7 @@ def vessel_as_file(spec: VesselSpec) -> dict[str, object]:
     if isinstance(spec.shape, MeshShape):
         mesh: dict[str, object] = {"name": spec.name, "mesh": str(spec.shape.path), "up": spec.shape.up}
         return mesh if spec.shape.unit is None else mesh | {"unit": spec.shape.unit}
+    assert isinstance(spec.shape, ProfileShape)
     return {
         "name": spec.name,
         "profile": {

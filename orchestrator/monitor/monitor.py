@@ -179,7 +179,7 @@ class _Translator:
                     self._about["pour"] = now
                     self._page()
             case StrategyProgressed():
-                self._about[f"progress of {event.stage}"] = f"{event.done} of {event.total}"
+                self._about[f"progress of {event.stage}"] = str(event.progress)
                 self._page()
             case DecisionMade():
                 self._say(event.decision.text, source=event.stage)

@@ -107,14 +107,12 @@ def _near(axes: Axes, stretches: list[Stretch], world: Frames, table: float, pou
 
 def _cell(axes: Axes, pour: Stretch, spec: UrArmSpec, world: Frames, seen: tuple[int, int]) -> None:
     """The box that the arm has to stay in, and the arm at the pour's beginning and at its largest tilt."""
-    from actors.arm.path.kinematics import link_points
-
     corners = np.array(list(itertools.product(*zip(spec.limits.box_low, spec.limits.box_high, strict=True))))
     _outline(axes, world.apply(corners)[:, list(seen)], label="box of the laboratory's file")
     largest = int(np.argmax(pour.tilts))
     for index, colour, name in ((0, style.PALE, "arm, upright"), (largest, style.FALLING, "arm, largest tilt")):
         foot = np.zeros((1, 3))
-        links = np.concatenate([foot, link_points(pour.joints[index], pour.model), pour.tool[index : index + 1]])
+        links = np.concatenate([foot, pour.links[index]])
         points = 1e3 * world.apply(links)[:, list(seen)]
         axes.plot(
             *points.T,

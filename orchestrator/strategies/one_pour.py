@@ -6,6 +6,7 @@ from typing import Literal
 
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.learnt import Learnt, Part
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
 from sim_engine.losses import normalised_spillage
@@ -87,9 +88,9 @@ class OnePour:
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Pours done, pours in all."""
-        return int(self.finished), 1
+        return Progress(pours=int(self.finished), of_pours=1)
 
     def result(self) -> OnePoured:
         """What was weighed, or why there is nothing."""

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from orchestrator.requests import Outcome, Request, Slots
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
 
 
 @runtime_checkable
@@ -33,8 +34,8 @@ class Strategy(Protocol):
         """What came of a request."""
         ...
 
-    def progress(self) -> tuple[int, int]:
-        """Steps done and steps in all, for a progress bar."""
+    def progress(self) -> Progress:
+        """What is done and what there is to do in all."""
         ...
 
     def result(self) -> Learnt:

@@ -9,6 +9,7 @@ from typing import Literal
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
@@ -123,10 +124,10 @@ class RepeatedSimulation:
         else:
             self._lost += 1
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations answered, simulations in all."""
         answered = len(self._losses) + self._lost
-        return answered, answered + len(self._open) + len(self._unissued)
+        return Progress(answered, answered + len(self._open) + len(self._unissued))
 
     def result(self) -> Foreseen:
         """Mean and standard deviation over the seeds answered so far."""
@@ -136,7 +137,7 @@ class RepeatedSimulation:
             over_seeds["loss"] = loss
         return Foreseen(
             scene=self._costing.scene.name,
-            simulations=self.progress()[0],
+            simulations=self.progress().simulations,
             simulations_lost=self._lost,
             thetas=self._thetas,
             touching=self._touching,

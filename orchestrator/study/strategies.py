@@ -10,6 +10,7 @@ from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Si
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.one_pour import OnePour
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
@@ -108,9 +109,9 @@ class SimulatedTable:
                 lost = getattr(outcome, "reason", "") or "invalid outcome"
                 self._rows.append(TableRow(theta=theta, action=action, lost=lost))
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations answered, simulations in all."""
-        return len(self._rows), self._total
+        return Progress(len(self._rows), self._total)
 
     def result(self) -> Tabled:
         """One row for each simulation, once all are there: watchers are told how many until then."""
@@ -157,7 +158,7 @@ class AnsweredByTable:
         """Passed on."""
         self._inner.tell(request, outcome)
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """The strategy's."""
         return self._inner.progress()
 
@@ -243,9 +244,9 @@ class FinalPour:
             case Failed(kind, reason):
                 self._made = self._lost(f"{kind}: {reason}")
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Pours done, pours in all."""
-        return int(self.finished), 1
+        return Progress(pours=int(self.finished), of_pours=1)
 
     def result(self) -> FinalPoured:
         """What came of it; as lost, until something has."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sim_engine.vessel import profile as profiles
 from sim_engine.vessel.sdf import MARGIN, SignedDistanceGrid, choose_spacing
-from sim_engine.vessel.spec import MeshShape, ProfileShape, VesselSpec
+from sim_engine.vessel.spec import ProfileShape, VesselSpec
 from sim_engine.vessel.vessel import Vessel
 
 Floats = NDArray[np.float64]
@@ -17,7 +17,7 @@ DIRECTIONS = 72
 
 
 def build_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
-    """Build a vessel from a profile or a mesh file.
+    """Build a vessel from its shape.
 
     Args:
         spec: the vessel's name and shape.
@@ -29,13 +29,15 @@ def build_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
 
     Raises:
         VesselError: the shape is no vessel; the message says why and what would be right.
-        OSError: the mesh file can't be read.
+        OSError: a file of it can't be read.
     """
-    if isinstance(spec.shape, MeshShape):
-        from sim_engine.vessel.mesh import build_mesh_vessel
-
-        return build_mesh_vessel(spec, use_cache=use_cache)
-    return _build_profile(spec, spec.shape)
+    outline = spec.shape.outline()
+    if outline is not None:
+        return _build_profile(spec, outline)
+    vessel = spec.shape.build(spec, use_cache=use_cache)
+    if not isinstance(vessel, Vessel):
+        raise TypeError(f"'{spec.shape.kind}' should build a Vessel, not {type(vessel).__name__}")
+    return vessel
 
 
 def _build_profile(spec: VesselSpec, shape: ProfileShape) -> Vessel:

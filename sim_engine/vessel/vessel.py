@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sim_engine.vessel import profile as profiles
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.sdf import SignedDistanceGrid
-from sim_engine.vessel.spec import ProfileShape, VesselSpec
+from sim_engine.vessel.spec import VesselSpec
 from sim_engine.vessel.surface import sample_surface
 
 Floats = NDArray[np.float64]
@@ -122,7 +122,7 @@ def lattice(
     """Lattice points inside a cavity.
 
     Args:
-        spec: for profile vessels, whose cavity is known exactly.
+        spec: for surfaces of revolution, whose cavity is known exactly.
         grid: for the others.
         inner_floor: [m].
         rim_height: [m].
@@ -142,8 +142,9 @@ def lattice(
     z = np.asarray(inner_floor + (np.arange(layers) + 0.5) * thickness, dtype=np.float64)
     half = np.ceil(np.abs([low[:2], high[:2]]).max(axis=0) / step) + 1.0
     x, y = ((np.arange(-n, n) + 0.5) * step for n in half)
-    if isinstance(spec.shape, ProfileShape):
-        inner = np.array(spec.shape.inner) + np.array([0.0, inner_floor])
+    outline = spec.shape.outline()
+    if outline is not None:
+        inner = np.array(outline.inner) + np.array([0.0, inner_floor])
         polygon = np.vstack([inner, [0.0, inner[-1, 1]]])
         inside = profiles.contains(polygon, np.hypot(x[:, None], y)[..., None], z)
         i, j, k = np.nonzero(inside)

@@ -12,6 +12,7 @@ from actors.arm.actor import DeviceArm
 from actors.arm.errors import ArmNotReleasedError, ArmStoppedError
 from actors.arm.numbers import POSITION_NOISE, Grip, NumbersArm, NumbersPath, NumbersSpec
 from actors.bench.planning import plan_pour
+from actors.contracts.arm import ArmBench, ArmContract
 from actors.device import LocalDevice, RayDevice
 
 
@@ -126,3 +127,11 @@ def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
     assert list(dict.fromkeys(s.phase for s in moving)) == ["tilt", "hold", "return"]
     for state in moving:
         assert state.tilt == pytest.approx(float(motion.tilt(np.array([state.time]))[0]), abs=1e-6)
+
+
+class TestArmOfNumbers(ArmContract):
+    @pytest.fixture
+    def bench(self, path):
+        arm = NumbersArm(NumbersSpec(2.0))
+        yield ArmBench(arm, path, 2.0, jog=("z", 0.005, 0.02))
+        arm.close()

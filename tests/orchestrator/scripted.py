@@ -11,6 +11,7 @@ from orchestrator.requests import Outcome, Pour, Request, Simulate, Slots
 from orchestrator.stages import StageDefinition
 from orchestrator.states import State, check_transition
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
 from tests.orchestrator.toy import SCENE, SPACE, THETA, ToyLaboratory, run_toy
 
 
@@ -62,8 +63,8 @@ class Script:
     def tell(self, request: Request, outcome: Outcome) -> None:
         self.told.append((request, outcome))
 
-    def progress(self) -> tuple[int, int]:
-        return len(self.told), self.count
+    def progress(self) -> Progress:
+        return Progress(len(self.told), self.count)
 
     def result(self) -> Scripted:
         return Scripted(told=tuple(type(outcome).__name__ for _, outcome in self.told))

@@ -20,6 +20,7 @@ from orchestrator.stages import deployment_stages, prediction_stages
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from orchestrator.tally import Tally
@@ -60,7 +61,7 @@ def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> Non
     assert found["spilled"].deviation == pytest.approx(statistics.stdev(spilled))
     assert found["spilled"].count == 5
     assert found["loss"].mean == pytest.approx(200.0 * statistics.mean(spilled))
-    assert strategy.progress() == (5, 5)
+    assert strategy.progress() == Progress(5, 5)
     assert Play(narrow_cup)(repeated()).simulations == Play(narrow_cup)(repeated()).simulations
     assert Play(narrow_cup)(repeated(seed=4)).simulations != played.simulations
 

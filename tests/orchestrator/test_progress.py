@@ -21,7 +21,8 @@ from orchestrator.events import (
 )
 from orchestrator.progress import ProgressDisplay
 from orchestrator.requests import Failed, Pour, Poured, Simulate
-from orchestrator.tally import StageTally, Tally
+from orchestrator.strategies.progress import Progress
+from orchestrator.tally import Tally
 from sim_engine.outcome import PourMeasurement
 from tests.orchestrator import watched
 
@@ -60,7 +61,7 @@ def test_log_without_terminal_has_at_most_one_progress_line_in_two_seconds() -> 
     display(StageOpened(stage="calibration", index=1, count=1))
     for step in range(100):
         now = 0.1 * step
-        display(StrategyProgressed(stage="calibration", done=step, total=100, result=watched.LEARNT))
+        display(StrategyProgressed(stage="calibration", progress=Progress(step, 100), result=watched.LEARNT))
     assert len([line for line in written(plain).splitlines() if "/100" in line]) == 5  # at 0, 2, 4, 6 and 8 s
 
 
@@ -80,7 +81,7 @@ def test_plain_lines_say_how_busy_the_pool_was_not_who_is_idle_at_the_moment_a_r
         display(replace(finished, time=end, id=key, frames=None))
     for time_now, done in ((10.0, 2), (14.0, 3)):
         now = time_now
-        display(StrategyProgressed(time=now, stage="calibration", done=done, total=8, result=watched.LEARNT))
+        display(StrategyProgressed(time=now, stage="calibration", progress=Progress(done, 8), result=watched.LEARNT))
     lines = [line for line in written(plain).splitlines() if "/8" in line]
     assert "pool 70 % busy · 2 simulations" in lines[0]
     assert "pool 0 % busy · 2 simulations" in lines[1]
@@ -121,17 +122,23 @@ def test_text_that_looks_like_markup_is_shown_as_it_is() -> None:
     assert written(plain).strip() == "balance [/dev/ttyUSB0] is silent"
 
 
-def test_time_left_is_estimated_from_this_runs_pace_not_from_replayed_steps() -> None:
-    tally = Tally(watched.campaign())
-    tally(StageOpened(time=0.0, stage="calibration", index=1, count=1))
-    tally(StrategyProgressed(time=5.0, stage="calibration", done=80, total=100, result=watched.LEARNT, replayed=True))
-    tally(StrategyProgressed(time=10.0, stage="calibration", done=85, total=100, result=watched.LEARNT))
-    stage = tally.stages["calibration"]
-    assert stage.remaining(10.0) == pytest.approx(15 * 10.0 / 5)
-
-
-def test_no_time_left_is_promised_before_anything_is_done() -> None:
-    assert StageTally("calibration", 0, 100, opened_at=0.0).remaining(50.0) is None
+def test_pours_and_simulations_are_told_apart_with_the_time_left_in_all() -> None:
+    plan, plain = watched.campaign(), console(terminal=False)
+    display = ProgressDisplay(plan, console=plain)
+    display(
+        CampaignOpened(
+            time=0.0, name="x", run_directory=watched.Path("x"), stages=("narrow cup",), mode="virtual", simulators=2
+        )
+    )
+    display(StageOpened(time=0.0, stage="narrow cup", index=1, count=1))
+    done = Progress(simulations=14, of_simulations=40, pours=6, of_pours=6)
+    display(StrategyProgressed(time=9.0, stage="narrow cup", progress=done, result=watched.LEARNT))
+    (line,) = [line for line in written(plain).splitlines() if "/40" in line]
+    assert line.startswith("narrow cup: 6/6 pours · 14/40 simulations")
+    assert line.endswith(" left in all")
+    screen = console(terminal=False)
+    screen.print(display._render())
+    assert "6/6 pours · 14/40 simulations" in written(screen)
 
 
 def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> None:

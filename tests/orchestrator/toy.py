@@ -38,6 +38,7 @@ from orchestrator.requests import (
 from orchestrator.results import Results, learnt_by
 from orchestrator.stages import StageDefinition
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.progress import Progress
 from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
@@ -271,8 +272,8 @@ class ToyStrategy:
         del self._waiting[request]
         self._told_pours += isinstance(request, Pour)
 
-    def progress(self) -> tuple[int, int]:
-        return self._told_pours, self._pours
+    def progress(self) -> Progress:
+        return Progress(pours=self._told_pours, of_pours=self._pours)
 
     def result(self) -> Toyed:
         return Toyed(spillages=tuple(self.spillages), simulations=self._asked_simulations)

@@ -42,6 +42,7 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import Foreseen
 from sim_engine.action import DEG, Action
@@ -150,7 +151,7 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
             seconds=2.0,
             frames=frames(),
         )
-        yield StrategyProgressed(time=now, stage="calibration", done=number, total=2, result=LEARNT)
+        yield StrategyProgressed(time=now, stage="calibration", progress=Progress(number, 2), result=LEARNT)
     # As C4 does it: observations carry the action behind θ.
     question = SuggestProblem(THETA, Data(((0.2, 0.3, 0.5, 0.5), (0.7, 0.3, 0.1, 0.9)), (0.2, 0.05)), map_resolution=9)
     yield _answered("calibration", 3, question, now)
@@ -171,7 +172,9 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
         points = tuple((0.1 * i, 0.5) for i in range(1, number + 1))
         question = SuggestProblem(ACTIONS, Data(points, tuple(0.1 for _ in points)), map_resolution=9)
         yield _answered("narrow cup", 10 * number + 1, question, now)
-        yield StrategyProgressed(time=now, stage="narrow cup", done=number, total=pours, result=LEARNT)
+        yield StrategyProgressed(
+            time=now, stage="narrow cup", progress=Progress(pours=number, of_pours=pours), result=LEARNT
+        )
     yield LogLine(time=now, level="warning", text="the balance drifts")
     yield StageClosed(time=now, stage="narrow cup", result=LEARNT)
     yield CampaignClosed(time=now, state="finished", results={})

@@ -64,7 +64,8 @@ def check_clearance(stretch: Stretch, until: float, pourer: Vessel, receiver: Ve
 def check_reach(unreached: Stretch) -> str:
     """What to say about a stretch of which some poses can't be reached in the posture of home."""
     home = posture(np.array(unreached.spec.home), unreached.model)
-    beyond = beyond_reach(unreached.flange.rotation, unreached.flange.position, unreached.model)
+    assert unreached.unreached is not None
+    beyond = beyond_reach(unreached.unreached.rotation, unreached.unreached.position, unreached.model)
     worst = _first_worst(np.abs(beyond[:, home]))
     # a way that can't be made has no pace yet
     when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)

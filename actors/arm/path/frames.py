@@ -57,11 +57,13 @@ class CellFrames:
     """What stays where it is during a pour.
 
     Attributes:
-        world: in the base's frame.
+        base: in the room's frame.
+        world: in the room's frame.
         tool: TCP in the flange's frame.
         pourer: in the flange's frame.
     """
 
+    base: Frames
     world: Frames
     tool: Frames
     pourer: Frames
@@ -72,8 +74,12 @@ def cell_frames(spec: UrArmSpec) -> CellFrames:
     """The fixed frames of a cell."""
     turn = Rotation.from_euler("z", spec.cell.direction).as_matrix()
     tool = frame_of(spec.tool)
+    mount = Rotation.from_euler("zx", [spec.mount.turn, spec.mount.tilt]).as_matrix()
     return CellFrames(
-        Frames(np.asarray(turn, dtype=float), np.array(spec.cell.receiver)), tool, tool @ frame_of(spec.grip)
+        Frames(np.asarray(mount, dtype=float), np.zeros(3)),
+        Frames(np.asarray(turn, dtype=float), np.array(spec.cell.receiver)),
+        tool,
+        tool @ frame_of(spec.grip),
     )
 
 
@@ -85,12 +91,17 @@ def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Frames:
         spec: of the arm and its cell.
     """
     cell = cell_frames(spec)
-    return cell.world @ Frames(rotations(poses), poses[:, :3]) @ cell.pourer.inverse
+    return cell.base.inverse @ cell.world @ Frames(rotations(poses), poses[:, :3]) @ cell.pourer.inverse
 
 
 def pourer_frames(joints: FloatArray, spec: UrArmSpec) -> Frames:
-    """Where the pourer is in the base's frame for joints (T, 6) [rad]."""
-    return Frames(*forward(joints, MODELS[spec.model])) @ cell_frames(spec).pourer
+    """Where the pourer is in the room's frame for joints (T, 6) [rad]."""
+    return flange_frames(joints, spec) @ cell_frames(spec).pourer
+
+
+def flange_frames(joints: FloatArray, spec: UrArmSpec) -> Frames:
+    """Where the flange is in the room's frame for joints (T, 6) [rad]."""
+    return cell_frames(spec).base @ Frames(*forward(joints, MODELS[spec.model]))
 
 
 def quaternions(rotation: FloatArray) -> FloatArray:
@@ -120,5 +131,5 @@ def pourer_motion(joints: FloatArray, times: FloatArray, spec: UrArmSpec, *, gri
     grip = cell.tool.inverse @ cell.pourer
     slipped = grip.rotation @ Rotation.from_euler("y", grip_tilt).as_matrix() @ grip.rotation.T
     held = cell.tool @ Frames(slipped, np.zeros(3)) @ grip
-    frames = cell.world.inverse @ Frames(*forward(joints, MODELS[spec.model])) @ held
+    frames = cell.world.inverse @ flange_frames(joints, spec) @ held
     return SampledMotion(times, np.concatenate([frames.position, quaternions(frames.rotation)], axis=-1))

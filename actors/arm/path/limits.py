@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from actors.arm.path.frames import cell_frames, flange_poses, pourer_frames
-from actors.arm.path.kinematics import MODELS, beyond_reach, forward, inverse, singularities
+from actors.arm.path.frames import cell_frames, flange_frames, flange_poses, pourer_frames
+from actors.arm.path.kinematics import MODELS, beyond_reach, inverse, singularities
 from actors.arm.spec import UrArmSpec
 from sim_engine.vessel.sdf import MARGIN
 
@@ -97,9 +97,9 @@ def _home(spec: UrArmSpec) -> list[str]:
     if lean > UPRIGHT:
         problems.append(
             f"home: the pourer leans {math.degrees(lean):.1f} deg there; it waits full, at most "
-            f"{math.degrees(UPRIGHT):.0f} deg are allowed. Are 'tool' and 'grip' right?"
+            f"{math.degrees(UPRIGHT):.0f} deg are allowed. Are 'tool', 'grip' and 'mount' right?"
         )
-    tool = forward(q, model)[1] + forward(q, model)[0] @ cell_frames(spec).tool.position
+    tool = flange_frames(q, spec).apply(cell_frames(spec).tool.position)
     for name, point in (("the tool", tool[0]), ("the pourer", pourer.position[0])):
         problems += [f"home: {name} is {text}" for text in outside(point, spec)]
     margins = singularities(q, model)[0]
@@ -113,7 +113,7 @@ def _home(spec: UrArmSpec) -> list[str]:
 
 
 def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSpec) -> list[str]:
-    """Where a point of the base's frame, shape (3,) [m], is not where it may be: box, planes, table."""
+    """Where a point of the room's frame, shape (3,) [m], is not where it may be: box, planes, table."""
     texts = []
     for axis, value, low, high in zip("xyz", point, spec.limits.box_low, spec.limits.box_high, strict=True):
         if not low <= value <= high:

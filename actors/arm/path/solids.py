@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from actors.arm.path.frames import cell_frames
-from actors.arm.path.kinematics import link_points
 from actors.arm.path.stretch import Stretch
 from sim_engine.contact import clearance, thinned, way_of
 from sim_engine.vessel.sdf import MARGIN
@@ -82,7 +81,7 @@ def nearest_to_receiver(stretch: Stretch, until: float, pourer: Vessel, receiver
 
 def nearest_links(stretch: Stretch, receiver: Vessel) -> tuple[Nearest, Nearest]:
     """Where a link of the arm comes nearest to the table, and to the receiver as a cylinder."""
-    points = np.concatenate([link_points(stretch.joints, stretch.model), stretch.tool[:, None]], axis=1)
+    points = stretch.links
     world = cell_frames(stretch.spec).world.inverse
     table, cup = [], []
     along = np.linspace(0.0, 1.0, 13)[:, None]

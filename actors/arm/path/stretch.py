@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.joint_path import JointPath
-from actors.arm.path.frames import Frames, cell_frames, flange_poses, quaternions
-from actors.arm.path.kinematics import MODELS, RobotModel, forward, singularities
+from actors.arm.path.frames import Frames, cell_frames, flange_frames, flange_poses, quaternions
+from actors.arm.path.kinematics import MODELS, RobotModel, link_points, singularities
 from actors.arm.spec import UrArmSpec
 
 FloatArray = NDArray[np.float64]
@@ -27,7 +27,7 @@ class Stretch:
         joints: (N, 6) [rad]; of no meaning where `unreached`.
         spec: of the arm and its cell.
         phases: of a pour: name, start and end [s]; empty otherwise.
-        unreached: flange of poses that the arm can't take, for what can be said about those all the same.
+        unreached: flange in the base's frame, for poses that the arm can't take: some can be said of them all the same.
     """
 
     name: str
@@ -48,6 +48,13 @@ class Stretch:
         """Poses of the pourer in the world (N, 7) of which some can't be reached."""
         return cls(name, times, np.zeros((len(times), 6)), spec, phases, flange_poses(poses, spec))
 
+    @cached_property
+    def links(self) -> FloatArray:
+        """Points along the arm, see `link_points`, and its TCP; room frame, shape (N, 9, 3) [m]."""
+        points = link_points(self.joints, self.model)
+        room = cell_frames(self.spec).base.apply(points.reshape(-1, 3)).reshape(points.shape)
+        return np.concatenate([room, self.tool[:, None]], axis=1)
+
     @property
     def model(self) -> RobotModel:
         """The robot."""
@@ -55,17 +62,18 @@ class Stretch:
 
     @cached_property
     def flange(self) -> Frames:
-        """Base frame."""
-        return self.unreached or Frames(*forward(self.joints, self.model))
+        """Room frame."""
+        base = cell_frames(self.spec).base
+        return flange_frames(self.joints, self.spec) if self.unreached is None else base @ self.unreached
 
     @cached_property
     def tool(self) -> FloatArray:
-        """TCP, base frame, shape (N, 3) [m]."""
+        """TCP, room frame, shape (N, 3) [m]."""
         return self.flange.apply(cell_frames(self.spec).tool.position)
 
     @cached_property
     def pourer(self) -> Frames:
-        """Base frame."""
+        """Room frame."""
         return self.flange @ cell_frames(self.spec).pourer
 
     @cached_property

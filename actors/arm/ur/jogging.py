@@ -9,7 +9,7 @@ import numpy as np
 from actors.arm.errors import ArmRefusedError
 from actors.arm.geometry import Joints
 from actors.arm.joint_path import FloatArray, JointPath
-from actors.arm.path.frames import cell_frames
+from actors.arm.path.frames import cell_frames, flange_frames
 from actors.arm.path.kinematics import MODELS, forward, inverse
 from actors.arm.path.limits import outside
 from actors.arm.spec import UrArmSpec
@@ -93,10 +93,10 @@ def _check(spec: UrArmSpec, points: FloatArray) -> None:
     for number, (positions, most) in enumerate(zip(points.T, model.joint_range, strict=True), 1):
         if np.abs(positions).max() > most:
             raise ArmRefusedError(f"joint {number} would leave its range")
-    rotation, position = forward(points[[0, -1]], model)
+    flange = flange_frames(points[[0, -1]], spec)
     frames = {"tool": cell_frames(spec).tool.position, "pourer": cell_frames(spec).pourer.position}
     for thing, place in frames.items():
-        begin, end = position + rotation @ place
+        begin, end = flange.apply(place)
         # Who stands outside may come back in: only what a step makes worse is refused.
         if np.any(_beyond(end, spec) > np.maximum(_beyond(begin, spec), 0.0) + 1e-9):
             raise ArmRefusedError(f"the {thing} would be {', '.join(outside(end, spec))}")

@@ -19,6 +19,9 @@ TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
 PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
 """Likewise of the payload [kg] and its centre [m]."""
 
+MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
+"""How far up may be from where the file says [rad]: the tool's accelerometer is no level. [m/s²]"""
+
 HOME_TOLERANCE = math.radians(1.0)
 
 ANSWERS = "is this a UR controller? If it is, and has booted, it hangs: restart it"
@@ -104,6 +107,8 @@ def judge(
             home_check(spec, found.state),
         ]
         checks += _limits(spec, found.state)
+    if found.state is not None and found.exchange is not None:
+        checks.append(_mount(spec, found.state, found.exchange))
     if found.exchange is not None:
         checks += [_payload(spec, found.exchange), _network(found.exchange)]
     return checks
@@ -266,6 +271,31 @@ def _tool(spec: UrArmSpec, state: RobotState) -> Check:
         f"TCP on the controller {_point(there)}, in the file {_point(spec.tool)}: {1e3 * away:.1f} mm and "
         f"{math.degrees(turned):.1f} deg apart",
         "set the TCP in the installation on the teach pendant, or correct 'tool' in the file: they have to agree",
+    )
+
+
+def _mount(spec: UrArmSpec, state: RobotState, exchange: Exchange) -> Check:
+    """Whether up is where the file says: the tool feels it."""
+    from scipy.spatial.transform import Rotation
+
+    felt = exchange.acceleration
+    strength = math.hypot(*felt) if felt is not None else 0.0
+    if felt is None or not state.pose or not 0.5 * GRAVITY < strength < 1.5 * GRAVITY:
+        return Check(
+            "mount", "warn", "where up is, the tool doesn't tell", "compare 'mount' with the teach pendant yourself"
+        )
+    up = Rotation.from_rotvec(state.pose[3:]).apply([a / strength for a in felt])
+    away = math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(up, spec.mount.up, strict=True)))))
+    tilt = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
+    if away <= MOUNT_TOLERANCE:
+        return Check("mount", "ok", f"tilted by {tilt:.0f} deg, as the file says")
+    turn = math.degrees(math.atan2(float(up[0]), float(up[1])))
+    return Check(
+        "mount",
+        "fail",
+        f"the tool feels up {math.degrees(away):.0f} deg away from where the file has it: tilt {tilt:.0f} deg, turn "
+        f"{turn:.0f} deg would agree with it",
+        "correct 'mount' in the file and the mounting in the installation on the teach pendant: pours would go astray",
     )
 
 

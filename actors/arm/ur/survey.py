@@ -72,6 +72,11 @@ class Exchange:
     wanted: float
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
+    @property
+    def acceleration(self) -> tuple[float, ...] | None:
+        """What the tool feels, in its own frame [m/s²]: upwards at rest; None if the controller doesn't tell."""
+        return self.values.get("actual_tool_accelerometer")
+
 
 def port_problem(address: str, port: int, patience: float = 2.0) -> str | None:
     """Why a port can't be reached; None if it is open."""
@@ -183,7 +188,7 @@ def _exchange(talk: _Rtde, rate: float, seconds: float) -> Exchange:
         asked = time.monotonic()
         version = struct.unpack(">4I", talk.ask(rtde.GET_URCONTROL_VERSION)[:16])
         trips.append(time.monotonic() - asked)
-    names = ("timestamp", "payload", "payload_cog")
+    names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer")
     known = _known(talk, names, rate)
     if talk.ask(rtde.START) != b"\x01":
         raise OSError("it doesn't begin to send")

@@ -7,7 +7,7 @@ import math
 import re
 from typing import Any
 
-from actors.arm.geometry import ArmLimits, Cell, Plane, Pose, Vector
+from actors.arm.geometry import ArmLimits, Cell, Mount, Plane, Pose, Vector
 from actors.arm.path.kinematics import MODELS
 from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arm_sections import (
@@ -65,6 +65,7 @@ def resolve_arm(
         cell=Cell(receiver=receiver, direction=cell.direction, table=cell.table),
         home=(home[0], home[1], home[2], home[3], home[4], home[5]),
         address=arm.address or "",
+        mount=Mount(arm.mount.tilt, arm.mount.turn),
         tool=Pose(**arm.tool.model_dump()),
         payload=arm.payload,
         payload_centre=(arm.payload_centre.x, arm.payload_centre.y, arm.payload_centre.z),
@@ -154,6 +155,10 @@ def arm_as_file(spec: UrArmSpec) -> dict[str, Any]:
     arm: dict[str, Any] = {
         "model": spec.model,
         **({"address": spec.address} if spec.address else {}),
+        "mount": {
+            "tilt": format_quantity(spec.mount.tilt, "rad", "deg"),
+            "turn": format_quantity(spec.mount.turn, "rad", "deg"),
+        },
         "tool": _pose_as_file(spec.tool),
         "payload": format_quantity(spec.payload, "kg", "kg"),
         "payload_centre": _point_as_file(spec.payload_centre),

@@ -27,15 +27,15 @@ Acceleration = Annotated[float, Quantity("rad/s^2", "80 deg/s^2", 0.0, math.radi
 
 
 class PointSection(Section):
-    """A point in the base's frame, as the teach pendant shows it."""
+    """A point in the room's frame: the base's, as the teach pendant shows it, for an arm that stands on a table."""
 
     required: ClassVar[dict[str, str]] = {"x": "650 mm", "y": "0 mm", "z": "80 mm"}
 
     x: Length | None = None
-    """Of the base's frame."""
+    """Of the room's frame."""
 
     y: Length | None = None
-    """Of the base's frame."""
+    """Of the room's frame."""
 
     z: Length | None = None
     """Upwards from where the robot is screwed down."""
@@ -76,6 +76,16 @@ class PoseSection(Section):
     """Of the rotation vector."""
 
 
+class MountSection(Section):
+    """How the robot is screwed down: turned about its own z axis, then leant about the room's x axis."""
+
+    tilt: Annotated[float, Quantity("rad", "90 deg", -math.pi, math.pi)] = 0.0
+    """0 on a table, 90 deg on a wall, 180 deg on a ceiling."""
+
+    turn: Annotated[float, Quantity("rad", "90 deg", -math.pi, math.pi)] = 0.0
+    """About its own z axis."""
+
+
 class JointsSection(Section):
     """The six joints, as the teach pendant names and shows them."""
 
@@ -101,7 +111,7 @@ class JointsSection(Section):
 
 
 class BoxSection(Section):
-    """A box along the base's axes."""
+    """A box along the room's axes."""
 
     required: ClassVar[dict[str, str]] = {
         "low": "{x: 300 mm, y: -500 mm, z: 0 mm}",
@@ -121,7 +131,7 @@ class PlaneSection(Section):
     required: ClassVar[dict[str, str]] = {"normal": "[0, 1, 0]", "offset": "-400 mm"}
 
     normal: tuple[Number, Number, Number] | None = None
-    """Direction towards the allowed side, in the base's frame; its length does not matter."""
+    """Direction towards the allowed side, in the room's frame; its length does not matter."""
 
     offset: Length | None = None
     """Of the plane from the base, along the normal."""
@@ -175,6 +185,9 @@ class ArmSection(Section):
     address: Text | None = None
     """Of its controller in the network; a virtual laboratory starts its own."""
 
+    mount: MountSection = MountSection()
+    """How the robot is screwed down; unless given, it stands on a table."""
+
     tool: PoseSection | None = None
     """Tool centre point in the flange's frame, as set on the teach pendant."""
 
@@ -218,10 +231,10 @@ class CellSection(Section):
     }
 
     receiver: PointSection | None = None
-    """Where the middle of the receiver's underside stands, in the base's frame."""
+    """Where the middle of the receiver's underside stands, in the room's frame."""
 
     direction: Angle | None = None
-    """That the liquid is poured in, seen from above: 0 along the base's x, 90 deg along its y."""
+    """That the liquid is poured in, seen from above: 0 along the room's x, 90 deg along its y."""
 
     table: Length = 0.0
-    """Height of the surface that nothing may go below, in the base's frame."""
+    """Height of the surface that nothing may go below, in the room's frame."""

@@ -15,6 +15,7 @@ from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.posterior import PosteriorFound
 from orchestrator.strategies.display import DisplayedMap, displayed_map
 from orchestrator.strategies.learnt import Learnt, Part
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
@@ -238,9 +239,9 @@ class Calibration(ABC):
     def _budget(self) -> int:
         """Simulations in all."""
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations answered, simulations in all."""
-        return self._trials.answered, self._budget
+        return Progress(self._trials.answered, self._budget)
 
     @abstractmethod
     def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:

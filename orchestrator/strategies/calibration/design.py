@@ -15,6 +15,7 @@ from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Reque
 from orchestrator.strategies.calibration.prior import region_of
 from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.learnt import Learnt, Part
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from sim_engine.action import Action, described
@@ -264,9 +265,9 @@ class DesignedPours:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
         self._current += 1
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Pours done, pours in all."""
-        return self._current, len(self._planned)
+        return Progress(pours=self._current, of_pours=len(self._planned))
 
     def result(self) -> DesignPoured:
         """The pours so far, in the order made."""

@@ -14,6 +14,7 @@ from pydantic import Field
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.learnt import Learnt, Part
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from sim_engine.liquid import SimulationParameters
@@ -152,9 +153,9 @@ class Evaluation:
         else:
             case.reason = getattr(outcome, "reason", "") or "invalid outcome"
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations answered, simulations in all."""
-        return sum(case.answered for case in self._cases), len(self._cases)
+        return Progress(sum(case.answered for case in self._cases), len(self._cases))
 
     def discrepancy(self, theta: str, split: str) -> float | None:
         """Mean |r − c_s| of a θ over a split's pours; None where nothing is defined."""

@@ -8,6 +8,7 @@ from orchestrator.requests import Decision, Outcome, Request, Simulate, Slots
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, Scores
+from orchestrator.strategies.progress import Progress
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
 
@@ -89,10 +90,9 @@ class Scorecard:
             raise ValueError(f"this simulation was not asked for: {request}")
         part.tell(request, outcome)
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations answered, simulations in all."""
-        numbers = [part.progress() for part in self._parts]
-        return sum(done for done, _ in numbers), sum(total for _, total in numbers)
+        return sum((part.progress() for part in self._parts), Progress())
 
     def result(self) -> Scores:
         """Mean |r − c_s| by label and split, the random θ's median by split, and the rivals without a simulator."""

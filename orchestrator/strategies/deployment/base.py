@@ -31,6 +31,7 @@ from orchestrator.strategies.deployment.pours import Foretold, PourTrial, former
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
 from orchestrator.strategies.display import displayed_action, displayed_map
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
@@ -319,9 +320,9 @@ class Deployment(ABC):
             return None
         return self._plan.actions.decode(self._final.best_point)
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Steps done, steps in all."""
-        return min(self._counted, self._plan.pours), self._plan.pours
+        return Progress(pours=min(self._counted, self._plan.pours), of_pours=self._plan.pours)
 
     def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
         """How far the first pours bore out what was predicted."""

@@ -12,6 +12,7 @@ from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
 from orchestrator.strategies.deployment.window import SafeWindow, WindowFound
+from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial
 from sim_engine.action import Action, described
@@ -178,13 +179,13 @@ class OneShotPlanning(Deployment):
         of_means = super()._scatter(suggestion, noise)
         return None if of_means is None else of_means * math.sqrt(max(self._plan.simulations_per_iteration, 1))
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations and pours done, and in all."""
         repeats = max(self._plan.simulations_per_iteration, 1)
         pours = 1 if self._plan.pours else 0
         answered = self._trials.answered - repeats * self._unspent
         checks = 0 if self._window is None else sum(len(t.requests) for t in self._trials.all[len(self._searched) :])
-        return answered + self._counted, max(self._plan.iterations, 1) * repeats + checks + pours
+        return Progress(answered, max(self._plan.iterations, 1) * repeats + checks, self._counted, pours)
 
     def _spillage(self, point: Point) -> Spread | None:
         """These seeds took part in choosing the action; `orchestrator.strategies.repeats` has fresh ones."""

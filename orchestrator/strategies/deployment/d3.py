@@ -11,6 +11,7 @@ from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
 from orchestrator.strategies.deployment.pours import Foretold, PourTrial
 from orchestrator.strategies.deployment.trust import Compared, TrustCheck
+from orchestrator.strategies.progress import Progress
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
@@ -165,11 +166,11 @@ class Hybrid(Deployment):
     def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
         return super()._trusted(weighed) if self._check is None else self._check.result()
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
         simulations = self._plan.prior_simulations + self._plan.pours * (self._plan.per_pour or 0)
         answered = self._trials.answered - self._unspent
         done = min(answered, simulations) if self._plan.per_pour is None else answered
         if self._followed == "D2":  # those that will not be made any more
             simulations = done
-        return done + min(self._counted, self._plan.pours), simulations + self._plan.pours
+        return Progress(done, simulations, min(self._counted, self._plan.pours), self._plan.pours)

@@ -12,6 +12,7 @@ from orchestrator.strategies.deployment.base import MAP_RESOLUTION
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.prices import Prices
 from orchestrator.strategies.deployment.thinning import thinned
+from orchestrator.strategies.progress import Progress
 from sim_engine.action import described
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
@@ -261,9 +262,9 @@ class FreeHybrid(Hybrid):
         text = f"{what}  {described(values)}  {self._comparison(one, pour)}"
         self.decisions.append(Decision(text, {"simulation_value": one, "pour_value": pour}))
 
-    def progress(self) -> tuple[int, int]:
+    def progress(self) -> Progress:
         """As D3; simulations that were not worth their time count as made."""
         simulations = self._plan.prior_simulations
         begun = self._awaited is not None or bool(self._pours)
         done = simulations if begun else min(self._trials.answered, simulations)
-        return done + min(self._counted, self._plan.pours), simulations + self._plan.pours
+        return Progress(done, simulations, min(self._counted, self._plan.pours), self._plan.pours)

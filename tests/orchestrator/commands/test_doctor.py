@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import time
 from collections.abc import Iterator
 from math import radians
 from pathlib import Path
@@ -232,3 +233,23 @@ def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_chang
         require_accepted("22C99AA2", "DEADBEEF", "robot")
     with pytest.raises(NotAcceptedError, match="tells no safety checksum"):
         require_accepted("22C99AA2", None, "robot")
+
+
+@pytest.mark.parametrize(("up", "state"), [("0, 9.82, 0", "fail"), ("0, 0.5, 9.8", "ok")])
+def test_a_robot_that_hangs_where_the_file_has_it_stand_is_told(
+    laboratory: Path, controller: VirtualController, up: str, state: str
+) -> None:
+    """What the tool feels tells where up is."""
+    with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
+        connection.sendall(f"def hang():\n set_gravity([{up}])\nend\n".encode())
+        time.sleep(0.3)
+    try:
+        found = checked(laboratory)["mount"]
+    finally:
+        with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
+            connection.sendall(b"def stand():\n set_gravity([0, 0, 9.82])\nend\n")
+            time.sleep(0.3)
+    assert found["state"] == state, found
+    if state == "fail":
+        assert "tilt 90 deg, turn 0 deg would agree" in found["found"]
+        assert "mount" in found["advice"]

@@ -10,6 +10,7 @@ from orchestrator.strategies.calibration.c2 import StratifiedSampling
 from orchestrator.strategies.calibration.c3 import BayesianCalibration
 from orchestrator.strategies.calibration.design import DesignedPours
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
+from orchestrator.strategies.progress import Progress
 from tests.orchestrator.play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play, calibration_plan, outcome_of
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
 
@@ -56,7 +57,7 @@ def test_every_theta_is_simulated_once_on_each_training_pour_with_the_pours_own_
     train = {p.action for p in measured() if p.split == "train"}
     assert len(train) == 10
     assert len(played.simulations) == 10 * thetas
-    assert strategy.progress() == (10 * thetas, 10 * thetas)
+    assert strategy.progress() == Progress(10 * thetas, 10 * thetas)
     by_action = {action: {r.seed for r in played.simulations if r.action == action} for action in train}
     assert all(len(seeds) == 1 for seeds in by_action.values())
     assert len(set.union(*by_action.values())) == 10

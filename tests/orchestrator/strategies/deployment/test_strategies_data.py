@@ -22,6 +22,7 @@ from orchestrator.requests import Suggest
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.progress import Progress
 from sim_engine.action import DEG
 from tests.orchestrator.play import THETA, Play
 from tests.orchestrator.toy import ToyLaboratory, run_toy
@@ -120,7 +121,7 @@ def test_former_pours_count_only_where_it_is_said(tmp_path: Path) -> None:
     none = strategy(deployment(tmp_path, some.replace("pours: 7", "pours: 3")))
     assert Play(narrow_cup)(none).pours == []
     assert none.best_values is not None, "something was known all the same"
-    assert none.progress() == (3, 3)
+    assert none.progress() == Progress(pours=3, of_pours=3)
 
 
 def test_a_hybrid_pours_first_where_the_former_pours_and_the_simulations_say(tmp_path: Path) -> None:

@@ -1,0 +1,197 @@
+"""How long a campaign still takes: from the plan's own times, and what pours and simulations have taken so far.
+
+A pour and a simulation are priced apart. What has not been seen yet in this run is priced by the plan: a pour by the
+times of operator and motion, a simulation by its particles. What a stage has done itself counts more than what others
+have. Simulations beside a pour cost nothing while they take no longer than it does.
+
+Limitations: a person's pace is not known before the first pour; other programs' load is taken to stay as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import median_low
+
+from orchestrator.events import (
+    Event,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.requests import Failed, Pour, Simulate
+from orchestrator.strategies.progress import Progress
+
+PRICE = 1.2e-3
+"""Of a simulated pour on one core, per particle, before one has been seen [s]."""
+
+THOUGHT = 0.2
+"""Of what lies between two pours beside them: a question to the optimiser, the journal [s]."""
+
+ENOUGH = 4
+"""Simulations of a stage after which its own pace is believed."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a stage is expected to do, before it says so itself.
+
+    Attributes:
+        simulations, pours: in all.
+        beside: of the simulations, that run beside each pour.
+        particles: of a simulation in the mean; 0: those of θ*.
+        pour_time: of one pour, as planned [s of the clock].
+    """
+
+    simulations: int = 0
+    pours: int = 0
+    beside: int = 0
+    particles: float = 0.0
+    pour_time: float = 0.0
+
+
+@dataclass
+class _Stage:
+    """What was seen of a stage. Times in seconds of the clock.
+
+    Attributes:
+        waits: from each simulation's answer to the next one's, where no pour has been made yet; the first from the
+            stage's opening.
+        particles: of these simulations.
+        answered: when the last one was answered.
+        cycles: from each pour's begin (the first) or the one before's end to its end.
+    """
+
+    work: Work
+    progress: Progress
+    closed: bool = False
+    waits: list[float] = field(default_factory=list)
+    particles: list[int] = field(default_factory=list)
+    answered: float = 0.0
+    cycles: list[float] = field(default_factory=list)
+    cycle_from: float | None = None
+
+    @property
+    def simulations_alone(self) -> int:
+        """Simulations that still have to be waited for before the next pour, or in a stage without pours."""
+        if self.cycle_from is not None:
+            return 0
+        return max(self.progress.simulations_left - self.work.beside * self.progress.pours_left, 0)
+
+
+class Forecast:
+    """Counts a campaign's events, and says what is left.
+
+    Args:
+        slots: simulations that can run at a time.
+        particles: of θ before anything is calibrated.
+    """
+
+    def __init__(self, slots: int, particles: float) -> None:
+        self._slots = max(slots, 1)
+        self._particles = particles
+        self._stages: dict[str, _Stage] = {}
+        self._current: _Stage | None = None
+        self._pours: list[float] = []
+
+    def begin(self, simulators: int, works: Mapping[str, Work]) -> None:
+        """A run begins with so many simulators, and with stages that are expected to do this."""
+        self._slots = max(min(self._slots, simulators), 1)
+        self._stages = {name: _Stage(work, _all_of(work)) for name, work in works.items()}
+
+    def __call__(self, event: Event) -> None:
+        """Count an event."""
+        if event.replayed:
+            if isinstance(event, StrategyProgressed) and event.stage in self._stages:
+                self._stages[event.stage].progress = event.progress
+            elif isinstance(event, StageClosed) and event.stage in self._stages:
+                self._close(event)
+            return
+        match event:
+            case StageOpened() if event.stage in self._stages:
+                self._current = self._stages[event.stage]
+                self._current.answered = event.time
+            case StageClosed() if event.stage in self._stages:
+                self._close(event)
+            case StrategyProgressed() if event.stage in self._stages:
+                self._stages[event.stage].progress = event.progress
+            case RequestStarted(request=Pour()) if self._current is not None:
+                if self._current.cycle_from is None:
+                    self._current.cycle_from = event.time
+            case RequestFinished():
+                self._finished(event)
+
+    def _finished(self, event: RequestFinished) -> None:
+        stage = self._current
+        match event.request:
+            case Pour() if stage is not None:
+                refused = isinstance(event.outcome, Failed) and event.outcome.kind == "invalid_action"
+                if stage.cycle_from is not None and not refused:
+                    stage.cycles.append(event.time - stage.cycle_from)
+                    self._pours.append(event.seconds)
+                    stage.cycle_from = event.time
+            case Simulate() as request if stage is not None and stage.cycle_from is None:
+                stage.waits.append(event.time - stage.answered)
+                stage.particles.append(request.parameters.particles)
+                stage.answered = event.time
+
+    def _close(self, event: StageClosed) -> None:
+        self._stages[event.stage].closed = True
+        self._current = None
+        found = getattr(event.result, "found", None)
+        if (theta := getattr(found, "theta", None)) is not None:
+            self._particles = theta.particles
+
+    def stage_left(self, name: str, now: float) -> float | None:
+        """Seconds to a stage's end; None for one that is not known."""
+        stage = self._stages.get(name)
+        if stage is None:
+            return None
+        if stage.closed:
+            return 0.0
+        pours = stage.progress.pours_left
+        left = stage.simulations_alone * self._price(stage) + pours * self._cycle(stage)
+        if pours and stage.cycle_from is not None:
+            left -= min(now - stage.cycle_from, 0.9 * self._cycle(stage))
+        elif stage is self._current and stage.simulations_alone:
+            left -= min(max(now - stage.answered, 0.0), 0.9 * self._price(stage))
+        return max(left, 0.0)
+
+    def left(self, now: float) -> float | None:
+        """Seconds to the campaign's end; None before it has begun."""
+        if not self._stages:
+            return None
+        return sum(self.stage_left(name, now) or 0.0 for name in self._stages)
+
+    def _price(self, stage: _Stage) -> float:
+        """Seconds from one simulation's answer to the next one's, where no pour is made."""
+        if len(stage.waits) >= ENOUGH:
+            return _usual(stage.waits)
+        particles = stage.work.particles or self._particles
+        others = [other for other in self._stages.values() if len(other.waits) >= ENOUGH]
+        if not others:
+            return PRICE / self._slots * particles
+        return _usual(others[-1].waits) / _mean(others[-1].particles) * particles
+
+    def _cycle(self, stage: _Stage) -> float:
+        """Seconds from the end of a pour to the end of the next."""
+        if len(stage.cycles) >= 2:
+            return _usual(stage.cycles)
+        # the plan's own time counts as a pour that was seen: the first one may have started the simulator of a bench
+        pour = median_low([stage.work.pour_time, *self._pours])
+        return max(pour, stage.work.beside * self._price(stage)) + THOUGHT
+
+
+def _all_of(work: Work) -> Progress:
+    return Progress(0, work.simulations, 0, work.pours)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _usual(values: Sequence[float]) -> float:
+    """Mean without the largest one, which may have started a process and compiled what it runs."""
+    return _mean(sorted(values)[:-1])

@@ -1,0 +1,145 @@
+"""What is told of the time that is left comes true."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import pytest
+
+from actors.bench.spec import VirtualBenchSpec
+from actors.spec import LaboratorySpec
+from orchestrator.events import Event, RequestFinished, RequestStarted, StageClosed, StageOpened, StrategyProgressed
+from orchestrator.forecast import Forecast, Work
+from orchestrator.requests import Failed, Pour, Simulate, Simulated
+from orchestrator.strategies.progress import Progress
+from orchestrator.work import pour_time, work_of
+from sim_engine.liquid import SimulationParameters
+from tests.orchestrator import watched
+from tests.orchestrator.toy import SCENE, SPACE, toy_plan
+
+THETA = SimulationParameters(particles=1000)
+ACTION = SCENE.action(SPACE.decode([0.5, 0.5]))
+
+# The quickstart's shape, with the times [s] of a run on two cores: each pour, and from each simulation's answer to the
+# next one's; the first of either also starts simulators.
+POURS = (34.3, 9.2, 4.2, 3.8, 7.7, 6.9, 8.4, 9.9, 5.1, 12.2)
+CALIBRATION = (9.2, *(0.8 for _ in range(23)))
+EVALUATION = tuple(0.68 for _ in range(25))
+PRIOR = tuple(0.74 for _ in range(16))
+CYCLES = (5.7, 6.6, 6.9, 5.2, 6.8, 5.7)
+WORK = {
+    "pours": Work(pours=10, pour_time=8.5),
+    "calibration": Work(24, particles=900.0),
+    "evaluation": Work(25),
+    "deployment": Work(40, 6, beside=4, pour_time=8.5),
+}
+
+
+@dataclass
+class Timeline:
+    """A campaign's events with made-up times."""
+
+    now: float = 1000.0
+    ids: int = 0
+
+    def _answered(self, stage: str, request: Simulate | Pour, seconds: float) -> Iterator[Event]:
+        self.ids += 1
+        yield RequestStarted(time=self.now, stage=stage, id=self.ids, request=request)
+        self.now += seconds
+        outcome = Simulated(watched.outcome()) if isinstance(request, Simulate) else Failed("pour_failed", "slipped")
+        yield RequestFinished(
+            time=self.now, stage=stage, id=self.ids, request=request, outcome=outcome, seconds=seconds
+        )
+
+    def stage(
+        self, name: str, simulations: tuple[float, ...] = (), pours: tuple[float, ...] = (), beside: int = 0
+    ) -> Iterator[Event]:
+        """Simulations, then pours with some simulations beside each."""
+        yield StageOpened(time=self.now, stage=name, index=1, count=1)
+        done = Progress(0, len(simulations) + beside * len(pours), 0, len(pours))
+        for seconds in simulations:
+            yield from self._answered(name, Simulate("cup", ACTION, THETA, 1), seconds)
+            done = replace(done, simulations=done.simulations + 1)
+            yield StrategyProgressed(time=self.now, stage=name, progress=done, result=watched.LEARNT)
+        for number, seconds in enumerate(pours, start=1):
+            yield from self._answered(name, Pour("cup", ACTION, number, 1), seconds)
+            done = replace(done, simulations=done.simulations + beside, pours=number)
+            yield StrategyProgressed(time=self.now, stage=name, progress=done, result=watched.LEARNT)
+        yield StageClosed(time=self.now, stage=name, result=watched.LEARNT)
+
+    def campaign(self) -> Iterator[Event]:
+        """All four stages."""
+        yield from self.stage("pours", pours=POURS)
+        yield from self.stage("calibration", CALIBRATION)
+        yield from self.stage("evaluation", EVALUATION)
+        yield from self.stage("deployment", PRIOR, CYCLES, beside=4)
+
+
+def begun() -> Forecast:
+    forecast = Forecast(slots=2, particles=900.0)
+    forecast.begin(2, WORK)
+    return forecast
+
+
+def test_the_end_that_is_foretold_comes_true_within_a_fifth_from_the_beginning_on() -> None:
+    timeline, forecast = Timeline(), begun()
+    begin, ends = timeline.now, []
+    for event in timeline.campaign():
+        forecast(event)
+        left = forecast.left(event.time)
+        assert left is not None
+        ends.append(event.time - begin + left)
+    whole = timeline.now - begin
+    assert forecast.left(timeline.now) == 0.0
+    off = [abs(end - whole) / whole for end in ends]
+    assert max(off) < 0.2
+    assert whole == pytest.approx(sum((*POURS, *CALIBRATION, *EVALUATION, *PRIOR, *CYCLES)))
+
+
+def test_the_time_left_falls_while_a_pour_or_a_simulation_takes_its_time() -> None:
+    timeline, forecast = Timeline(), begun()
+    events = timeline.campaign()
+    for event in events:
+        forecast(event)
+        if isinstance(event, RequestStarted) and (event.stage, event.id) in {("pours", 5), ("calibration", 20)}:
+            lefts = [forecast.left(event.time + 0.5 * k) or 0.0 for k in range(4)]
+            assert all(later <= sooner for sooner, later in pairwise(lefts)), event.stage
+            assert lefts[0] - lefts[2] == pytest.approx(1.0 if event.stage == "pours" else 0.9 * 0.8, abs=0.1)
+
+
+def test_simulations_beside_a_pour_cost_time_only_where_they_outlast_it() -> None:
+    one = Forecast(slots=1, particles=1000.0)
+    one.begin(1, {"deployment": Work(0, 10, beside=0, pour_time=90.0)})
+    few = Forecast(slots=1, particles=1000.0)
+    few.begin(1, {"deployment": Work(200, 10, beside=20, pour_time=90.0)})
+    many = Forecast(slots=1, particles=1000.0)
+    many.begin(1, {"deployment": Work(2000, 10, beside=200, pour_time=90.0)})
+    assert few.left(0.0) == one.left(0.0) == pytest.approx(902.0)
+    assert (many.left(0.0) or 0.0) > 1.5 * 902.0
+
+
+def test_what_an_earlier_run_has_done_is_not_left_any_more() -> None:
+    timeline, forecast = Timeline(), begun()
+    untouched = forecast.left(timeline.now)
+    for event in timeline.stage("pours", pours=POURS):
+        forecast(replace(event, replayed=True))
+    assert forecast.left(timeline.now) == pytest.approx((untouched or 0.0) - 10 * 8.7)
+
+
+def test_a_person_s_pour_takes_the_time_that_was_set_for_it_and_a_fast_bench_a_part_of_it() -> None:
+    plan = toy_plan(watched.Path("x"))
+    assert work_of(plan, ["deployment:cup", "no stage of it"]) == {
+        "deployment:cup": Work(37 + 2 * 3, 3, 2, pour_time=0.0),
+        "no stage of it": Work(),
+    }
+    campaign = watched.campaign()
+    assert campaign.deployment is not None
+    bench = VirtualBenchSpec(SimulationParameters(particles=4000))
+    scene, actions = campaign.deployment.scenes[0], campaign.deployment.actions
+    slow = pour_time(LaboratorySpec("slow", bench=replace(bench, time_scale=1.0)), scene, actions)
+    fast = pour_time(LaboratorySpec("fast", bench=replace(bench, time_scale=10.0)), scene, actions)
+    liquid = 1.2e-3 * bench.liquid.particles
+    assert bench.operator_time + 15.0 < slow - liquid < bench.operator_time + 45.0
+    assert fast - liquid == pytest.approx((slow - liquid) / 10.0)
