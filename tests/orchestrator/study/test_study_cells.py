@@ -172,7 +172,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "nothing left to search": (
         lambda d: {
             **without(d, "search"),
-            "parameters": {"particles": 500, "cohesion": "0 N/m", "friction": 0.1},
+            "parameters": {"particles": 500, "cohesion": "0 N/m", "friction": 0.1, "wall_distance": 0.5},
         },
         "parameters: fixes all that the campaign searches",
     ),
