@@ -42,6 +42,10 @@ class InvalidActionError(LaboratoryError):
     """The vessels would touch, or the motion can't be made: refused before anything moved or was simulated."""
 
 
+class UnreachablePlaceError(InvalidActionError):
+    """The arm can't get to where a pour begins, whatever would be poured there."""
+
+
 class SimulationError(LaboratoryError):
     """A simulation gave no result (diverged, or its worker died more often than it may)."""
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from actors.arm.spec import ArmSpec
 from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
+from sim_engine.marks import FREE
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,8 @@ class RaySpec:
 class LaboratorySpec:
     """Where a campaign runs.
 
+    What belongs to the machine, or to who stands beside it, decides nothing of a campaign.
+
     Attributes:
         simulators: size of the pool; 0: one per core, of this machine or of the cluster.
         bench: what is hidden on a virtual bench; None on hardware, and where the laboratory can't pour.
@@ -42,16 +46,16 @@ class LaboratorySpec:
     """
 
     name: str
-    simulators: int = 0
+    simulators: Annotated[int, FREE] = 0
     bench: VirtualBenchSpec | None = None
     mode: str = "virtual"
-    in_process: bool = False
-    object_store_mb: int = 160
-    ray: RaySpec | None = None
+    in_process: Annotated[bool, FREE] = False
+    object_store_mb: Annotated[int, FREE] = 160
+    ray: Annotated[RaySpec | None, FREE] = None
     arm: ArmSpec | None = None
     balance: BalanceSpec | None = None
-    operator: OperatorSpec = field(default_factory=lambda: OperatorSpec(answers="virtual"))
-    accepted_checksum: str = ""
+    operator: Annotated[OperatorSpec, FREE] = field(default_factory=lambda: OperatorSpec(answers="virtual"))
+    accepted_checksum: Annotated[str, FREE] = ""
 
     @property
     def pours(self) -> bool:

@@ -335,14 +335,15 @@ def job(calibration: CalibrationPlan, options: argparse.Namespace, which: str) -
     kind, number, seed = which.split()
     if kind == "fold":
         fold = dealt(calibration.records.pours if calibration.records else (), options.folds)[int(number)]
-        changed = replace(without(calibration, fold), simulations=options.fold_simulations)
+        changed = without(calibration, fold).with_settings(simulations=options.fold_simulations)
         return Job(changed, int(seed), f"fold {int(number) + 1} of {options.folds}", ("test",))
     names, known = wanted_sets(options)[int(number)]
     if names:
-        changed = replace(searching(calibration, names, options.particles, known), simulations=options.simulations)
+        changed = searching(calibration, names, options.particles, known)
+        changed = changed.with_settings(simulations=options.simulations)
     else:
         fixed = {"particles": float(options.particles), **calibration.fixed_parameters}
-        changed = replace(calibration, fixed_parameters=fixed, simulations=0)
+        changed = replace(calibration, fixed_parameters=fixed).with_settings(simulations=0)
     return Job(changed, int(seed), f"{set_name(names, known)}, seed {seed}", SPLITS)
 
 

@@ -34,7 +34,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from calibration_power import CAMPAIGN, SPLITS, Answers, Kept, known_values, play, recorded, searching
 from machine import describe, run_self, say, show
@@ -43,11 +43,13 @@ from optimisers import interval
 from orchestrator.config.load import load_campaign
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CalibrationName, CalibrationPlan, CampaignPlan
+from orchestrator.plan import CalibrationPlan, CampaignPlan
 from orchestrator.results import learnt_by
 from orchestrator.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
 from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.strategies.calibration.evaluation import Evaluation, random_parameters
+from orchestrator.strategies.calibration.settings import DesignSettings
+from orchestrator.strategies.doors import calibrations
 from sim_engine.liquid import SimulationParameters
 
 PAPER = ("C1=2800", "C2=504", "C3=1652", "C4=108")
@@ -69,6 +71,16 @@ class Row:
     budget: int = 0
 
 
+class Complaints:
+    """Notes that something is wrong."""
+
+    any = False
+
+    def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
+        """Something is."""
+        self.any = True
+
+
 def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
     """The calibration by another strategy: as many θ as the budget allows.
 
@@ -76,18 +88,16 @@ def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
         SystemExit: it allows none.
     """
     pours = sum(scored.pour.split == TRAINED_ON and scored.pour.spillage is not None for scored in recorded(plan))
-    names, thetas = plan.parameters.names, row.budget // pours
-    changed = replace(plan, strategy=cast("CalibrationName", row.name), simulations=row.budget)
-    if row.name == "C4":
-        return replace(changed, initial=min(plan.initial, row.budget))
-    per_axis = 1
-    while (per_axis + 1) ** len(names) <= thetas:
-        per_axis += 1
-    if thetas < 1 or (row.name == "C1" and per_axis < 2):
+    kind, names = calibrations()[row.name], plan.parameters.names
+    settings = kind.like(plan.settings, simulations=row.budget)
+    if (initial := getattr(settings, "initial", None)) is not None:
+        trials = row.budget if row.name == "C4" else max(row.budget // pours, 1)
+        settings = settings.model_copy(update={"initial": min(initial, trials)})
+    complaints = Complaints()
+    settled = settings.settled(names, pours, complaints)
+    if settled is None or complaints.any:
         raise SystemExit(f"--rows {row.name}={row.budget}: too few for {len(names)} parameters and {pours} pours")
-    if row.name == "C1":
-        return replace(changed, grid=dict.fromkeys(names, per_axis), simulations=pours * per_axis ** len(names))
-    return replace(changed, thetas=thetas, initial=min(plan.initial, thetas), simulations=pours * thetas)
+    return replace(plan, settings=settled)
 
 
 def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
@@ -143,7 +153,8 @@ def table_row(row: Row, calibration: CalibrationPlan | None, found: Sequence[Map
     """Means over the seeds with intervals over the pours, each seed beside them, and quartiles of the unseen."""
     shown: dict[str, Any] = {"strategy": row.name, "simulations": max(one["simulations"] for one in found)}
     if calibration is not None and row.name in ("C1", "C2", "C3"):
-        shown["thetas"] = calibration.thetas or next(iter(calibration.grid.values())) ** len(calibration.grid)
+        assert isinstance(calibration.settings, DesignSettings)
+        shown["thetas"] = calibration.settings.thetas
     for split in SPLITS:
         values = [one["discrepancy"][split] for one in found if one["discrepancy"][split] is not None]
         shown[split] = round(statistics.mean(values), 4) if values else None

@@ -11,7 +11,6 @@ real strategy, scheduler, journal and optimiser, in one process, on a clock that
 
     D2      pours alone
     fixed   D3 with 37 simulations and 2 beside each pour (the paper's form)
-    plain   D3 with 37 simulations, and beside pours as many as there is time for, by lower confidence bounds
     priced  D3 with `per_pour: free`: simulations by what they are worth, before the first pour at most 37
     longer  the same, with at most 200 before the first pour
     tireless  as priced, but the pool never rests
@@ -42,8 +41,12 @@ from actors.spec import LaboratorySpec
 from orchestrator.campaign import run_campaign
 from orchestrator.events import DecisionMade, Event
 from orchestrator.occupancy import RESTS, Occupancy
-from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan, PricesPlan, TrustPlan
+from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.strategies.deployment.d2 import D2Settings
+from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.deployment.trust import TrustSettings
 from sim_engine.action import DEG
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
@@ -71,23 +74,20 @@ SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
     **WORLDS,
     "shifted by 0.04": lambda world, u, sign: world.true(u + 0.04 * sign),
 }
-TRUST = TrustPlan()
+TRUST = TrustSettings()
 
 
 def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
     """What is compared."""
-    free = DeploymentPlan(
-        "D3", (SCENE,), space, Loss(), pours=asked.pours, prior_simulations=asked.prior, per_pour=None, model="scaled"
-    )
-    free = replace(free, trust=None if asked.no_trust else TRUST)
-    prices = PricesPlan(pour=asked.pour)
+    trust = "always" if asked.no_trust else TRUST
+    settings = D3Settings(pours=asked.pours, prior_simulations=asked.prior, per_pour="free", trust=trust)
+    free, prices = DeploymentPlan(settings, (SCENE,), space, Loss()), PricesSettings(pour=asked.pour)
     return {
-        "D2": replace(free, strategy="D2", per_pour=0, model="residual", trust=None),
-        "fixed": replace(free, per_pour=2),
-        "plain": free,
-        "priced": replace(free, prices=prices),
-        "longer": replace(free, prices=prices, prior_simulations=200),
-        "tireless": replace(free, prices=replace(prices, worth=0.0)),
+        "D2": replace(free, settings=D2Settings(pours=asked.pours)),
+        "fixed": free.with_settings(per_pour=2),
+        "priced": free.with_settings(prices=prices),
+        "longer": free.with_settings(prices=prices, prior_simulations=200),
+        "tireless": free.with_settings(prices=PricesSettings(pour=asked.pour, worth=0.0)),
     }
 
 
@@ -240,7 +240,7 @@ def rows_of(asked: argparse.Namespace) -> list[dict[str, Any]]:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = ["D2", "fixed", "plain", "priced", "longer", "tireless"]
+    names = ["D2", "fixed", "priced", "longer", "tireless"]
     parser.add_argument("--worlds", nargs="+", choices=list(SIMULATORS), default=["right", "shifted by 0.08"])
     parser.add_argument("--problem", choices=["spill2", "narrow2", "spill4"], default="spill2")
     parser.add_argument("--arms", nargs="+", choices=names, default=["D2", "fixed", "priced"])

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dyna import AFTER, TRUST, Bench, interval
+from dyna import AFTER, Bench, interval
 from machine import describe, pin, say, show
 from skipping_clock import run
 
@@ -30,8 +30,11 @@ from actors.protocols import InvalidActionError, ProgressCallback
 from orchestrator.campaign import run_campaign
 from orchestrator.config.study.sections import load_study
 from orchestrator.occupancy import Occupancy
-from orchestrator.plan import DeploymentPlan, OutputPlan, PricesPlan
+from orchestrator.plan import DeploymentPlan, OutputPlan
+from orchestrator.strategies.deployment.d2 import D2Settings
+from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.study.plan import StudyPlan
 from sim_engine.errors import InvalidSceneError
@@ -120,13 +123,13 @@ class _Apart:
 
 def arms(asked: argparse.Namespace, base: DeploymentPlan) -> dict[str, DeploymentPlan]:
     """What is compared; see `dyna.py`."""
-    free = replace(base, pours=asked.pours, per_pour=None, model="scaled", refusals="avoid", trust=TRUST)
-    prices = PricesPlan(pour=asked.pour)
+    free = replace(base, settings=D3Settings.like(base.settings, pours=asked.pours, per_pour="free"))
+    prices = PricesSettings(pour=asked.pour)
     return {
-        "D2": replace(free, strategy="D2", per_pour=0, model="residual", trust=None),
-        "fixed": replace(free, per_pour=2),
-        "priced": replace(free, prices=prices),
-        "tireless": replace(free, prices=replace(prices, worth=0.0)),
+        "D2": replace(free, settings=D2Settings.like(free.settings)),
+        "fixed": free.with_settings(per_pour=2),
+        "priced": free.with_settings(prices=prices),
+        "tireless": free.with_settings(prices=PricesSettings(pour=asked.pour, worth=0.0)),
     }
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,14 @@ from numpy.typing import NDArray
 
 from actors.optimizer.core.propose import propose
 from orchestrator.config.load import load_campaign, load_vessel
-from orchestrator.plan import DeploymentPlan, RiskPlan
+from orchestrator.config.pose import PoseNoiseSection
+from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.learnt import Recommended
+from orchestrator.strategies.deployment.risk import RiskSettings
 from sim_engine.action import DEG, described
 from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import InvalidSceneError, PourSimulator
@@ -39,10 +41,11 @@ Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 ERRORS = PoseError(x=3e-3, y=3e-3, tilt=0.5 * DEG, speed_factor=0.02)
-WAYS: dict[str, RiskPlan | None] = {
+DEVIATIONS = PoseNoiseSection(**asdict(ERRORS))
+WAYS: dict[str, RiskSettings | None] = {
     "D1 as planned": None,
-    "D1, expected": RiskPlan("expected", pose_error=ERRORS),
-    "D1, CVaR 90 %": RiskPlan("cvar", 0.9, ERRORS),
+    "D1, expected": RiskSettings(pose_error=DEVIATIONS),
+    "D1, CVaR 90 %": RiskSettings(measure="cvar", level=0.9, pose_error=DEVIATIONS),
 }
 RESAMPLED = 4000
 
@@ -142,7 +145,8 @@ def deployment(receiver: Path, particles: int) -> tuple[DeploymentPlan, Scene, S
     vessel = load_vessel(receiver)
     scene = replace(plan.deployment.scenes[0], receiver=vessel, name=vessel.name)
     theta = plan.parameters.model_copy(update={"particles": particles})
-    return replace(plan.deployment, strategy="D1", scenes=(scene,), pours=0), scene, theta
+    settings = D1Settings.like(plan.deployment.settings, pours=0)
+    return replace(plan.deployment, settings=settings, scenes=(scene,)), scene, theta
 
 
 def main() -> None:
@@ -158,11 +162,11 @@ def main() -> None:
     asked = parser.parse_args()
     pin(None)
     base, scene, theta = deployment(asked.receiver, asked.particles)
-    base = replace(base, iterations=asked.iterations, simulations_per_iteration=asked.per_iteration)
+    base = base.with_settings(iterations=asked.iterations, simulations_per_iteration=asked.per_iteration)
     bench, costing = Bench(scene), Costing.of(base, scene, theta)
     rows, actions, every = [], [], {}
     for way, risk in WAYS.items():
-        plan = replace(base, risk=risk)
+        plan = base.with_settings(risk=risk)
         losses = []
         for seed in range(asked.plans):
             strategy = OneShotPlanning if risk is None else RobustPlanning

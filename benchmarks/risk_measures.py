@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -24,11 +25,13 @@ from scipy.stats import qmc
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.optimizer.core.propose import propose
 from actors.optimizer.core.risk import conditional_value_at_risk, tail_weights
-from orchestrator.plan import DeploymentPlan, RiskPlan
+from orchestrator.config.pose import PoseNoiseSection
+from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.learnt import Recommended
+from orchestrator.strategies.deployment.risk import RiskSettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
@@ -43,6 +46,7 @@ SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0
 BEAKER, CUP = (cylinder(name, inner_radius=0.04, inner_height=0.1) for name in ("beaker", "cup"))
 SCENE = Scene("toy", BEAKER, CUP, Liquid(mass=0.2), fixed={"height": 0.05})
 ERRORS = PoseError(x=3e-3, y=2e-3, tilt=1 * DEG, speed_factor=0.05)
+DEVIATIONS = PoseNoiseSection(**asdict(ERRORS))
 
 
 def cup(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
@@ -146,18 +150,11 @@ def main() -> None:
     for name in asked.toys:
         for level in (0.0, 0.9):
             least = float(truth(TOYS[name], level, grid).min())
-            risk = RiskPlan("cvar" if level else "expected", level or 0.9, ERRORS)
+            risk = RiskSettings(measure="cvar" if level else "expected", level=level or None, pose_error=DEVIATIONS)
             for way, (strategy, each) in WAYS.items():
-                plan = DeploymentPlan(
-                    "D1",
-                    (SCENE,),
-                    SPACE,
-                    Loss(),
-                    pours=0,
-                    iterations=asked.simulations // each,
-                    simulations_per_iteration=each,
-                    risk=risk,
-                )
+                iterations = asked.simulations // each
+                settings = D1Settings(pours=0, iterations=iterations, simulations_per_iteration=each, risk=risk)
+                plan = DeploymentPlan(settings, (SCENE,), SPACE, Loss())
                 chosen = [
                     SPACE.encode(play(strategy(plan, SCENE, SimulationParameters(), seed), TOYS[name]).action_si)
                     for seed in range(asked.seeds)

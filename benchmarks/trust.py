@@ -23,12 +23,12 @@ from machine import describe, pin, say, show
 from optimiser_problems import BY_NAME, Floats, World
 
 from actors.optimizer.core.propose import propose
-from orchestrator.plan import DeploymentPlan, TrustPlan
+from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.deployment.base import Deployment
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.trust import Compared
+from orchestrator.strategies.deployment.d2 import D2Settings, RealOnly
+from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
+from orchestrator.strategies.deployment.trust import Compared, TrustSettings
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
@@ -40,7 +40,7 @@ SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
     "twice": lambda world, u, _: min(2.0 * world.true(u), 1.0),
     "promises everything": lambda world, u, _: 0.0,
 }
-ARMS: dict[str, TrustPlan | None] = {"D3": TrustPlan(), "D3, no alarm": None, "D2": None}
+ARMS: dict[str, TrustSettings | str] = {"D3": TrustSettings(), "D3, no alarm": "always"}
 
 
 class Numbers:
@@ -51,7 +51,7 @@ class Numbers:
         self._sign = np.random.default_rng([world.seed, 999]).choice([-1.0, 1.0], SPACE.dimension)
         self.poured: list[float] = []
 
-    def play(self, strategy: Deployment) -> None:
+    def play(self, strategy: Deployment[Any]) -> None:
         """From the first question to the last answer."""
         waiting: list[Request] = []
         while not strategy.finished:
@@ -80,11 +80,10 @@ def campaign(arm: str, simulator: str, seed: int, asked: argparse.Namespace) -> 
     """One campaign; losses without noise."""
     world = World(BY_NAME[asked.problem], seed)
     kind = RealOnly if arm == "D2" else Hybrid
-    plan = DeploymentPlan(
-        "D2" if arm == "D2" else "D3", (SCENE,), SPACE, Loss(), pours=asked.pours, prior_simulations=asked.simulations,
-        per_pour=0 if arm == "D2" else 2, model="residual" if arm == "D2" else asked.model, trust=ARMS[arm],
-        refusals="avoid",
+    settings = D2Settings(pours=asked.pours) if arm == "D2" else D3Settings(
+        pours=asked.pours, prior_simulations=asked.simulations, model=asked.model, trust=ARMS[arm]
     )  # fmt: skip
+    plan = DeploymentPlan(settings, (SCENE,), SPACE, Loss())
     strategy, numbers = kind(plan, SCENE, SimulationParameters(), seed), Numbers(world, simulator)
     numbers.play(strategy)
     best = strategy.best_values

@@ -11,6 +11,8 @@ import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
 
+from sphinx.application import Sphinx
+
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
@@ -41,3 +43,14 @@ html_theme = "furo"
 html_title = "Decant"
 html_show_sphinx = False
 html_extra_path = ["site"]
+
+
+def setup(app: Sphinx) -> None:
+    """Bars in docstrings are magnitudes, |r − c_s|, and not substitutions."""
+    app.connect("autodoc-process-docstring", _bars_as_they_are)
+
+
+def _bars_as_they_are(
+    _app: object, _what: str, _name: str, _object: object, _options: object, lines: list[str]
+) -> None:
+    lines[:] = [line.replace("|", "\\|") for line in lines]

@@ -10,7 +10,7 @@ import itertools
 import re
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -18,17 +18,25 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.config import vessel
+from orchestrator.config import pose, vessel
 from orchestrator.config.campaign import sections as campaign
 from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
 from orchestrator.config.laboratory import arm_sections, cluster, operator
 from orchestrator.config.laboratory import sections as laboratory
+from orchestrator.config.laboratory.arms import ARMS
 from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.sections import Choice, Section
+from orchestrator.config.yaml.validate import sections_in
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment.objectives import Objective
+from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.deployment.risk import RiskSettings
+from orchestrator.strategies.deployment.trust import TrustSettings
+from orchestrator.strategies.deployment.window import WindowSettings
+from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquid import SimulationParameters
 from sim_engine.validation import sensitivity
@@ -43,38 +51,36 @@ SECTIONS: dict[str, type[Section]] = {
     "pours": campaign.PoursSection,
     "transfer": campaign.TransferSection,
     "deployment": campaign.DeploymentSection,
-    "trust": campaign.TrustSection,
-    "risk": campaign.RiskSection,
-    "window": campaign.WindowSection,
-    "prices": campaign.PricesSection,
+    "trust": TrustSettings,
+    "risk": RiskSettings,
+    "window": WindowSettings,
+    "prices": PricesSettings,
     "data": campaign.DataSection,
     "loss": campaign.LossSection,
-    "objective": campaign.ObjectiveSection,
+    "objective": Objective,
     "outputs": campaign.OutputsSection,
     "liquid": vessel.LiquidFile,
     "vessel": vessel.VesselFile,
     "profile": vessel.ProfileSection,
     "laboratory": laboratory.LaboratoryFile,
     "ray": cluster.RaySection,
-    "arm": arm_sections.ArmSection,
+    "arm": arm_sections.UrArmSection,
     "limits": arm_sections.LimitsSection,
     "cell": arm_sections.CellSection,
     "operator": operator.OperatorSection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
-    "pose-error": laboratory.PoseErrorSection,
+    "pose-error": pose.PoseErrorSection,
     "study": study.StudyFile,
     "level": study.LevelSection,
     "compared-calibrations": study.CalibrationsSection,
-    "compared-calibration": study.CalibrationArmSection,
     "compared-deployments": study.DeploymentsSection,
-    "compared-deployment": study.DeploymentArmSection,
 }
 
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BalanceSection": "[balance](#bench)",
-    "ArmSection": "[arm](#arm-and-cell)",
+    **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm-and-cell)"),
     "CellSection": "[cell](#arm-and-cell)",
     "LimitsSection": "[limits](#arm-and-cell)",
     "BoxSection": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
@@ -84,18 +90,20 @@ OF_SECTIONS = {
     "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
     "MountSection": "`{tilt, turn}`, angles",
     "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
-    "BalanceDeviceSection": "[balance](balances.md#settings)",
+    "SerialSection": "[balance](balances.md#settings)",
+    "NumbersSection": "[balance](balances.md#settings)",
     "OperatorSection": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
     "PoseErrorSection": "[pose error](#bench)",
     "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
     "LossSection": "[loss](#losses)",
-    "ObjectiveSection": "[objective](#objectives)",
-    "TrustSection": "[trust](#trust)",
-    "RiskSection": "[risk](#risk-and-the-safe-window)",
-    "WindowSection": "[window](#risk-and-the-safe-window)",
-    "PricesSection": "[prices](#prices)",
+    "Objective": "[objective](#objectives)",
+    **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
+    "TrustSettings": "[trust](#trust)",
+    "RiskSettings": "[risk](#risk-and-the-safe-window)",
+    "WindowSettings": "[window](#risk-and-the-safe-window)",
+    "PricesSettings": "[prices](#prices)",
     "DataSection": "[data](#existing-data)",
     "ProfileSection": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
@@ -109,8 +117,9 @@ OF_SECTIONS = {
         model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"
         for model in (study.CalibrationsSection, study.DeploymentsSection)
     },
-    "CalibrationArmSection": "[mapping](#studies)",
-    "DeploymentArmSection": "[mapping](#studies)",
+    **{f"{name}ArmSection": "[mapping](#studies)" for name in STRATEGIES.names},
+    **{model.__name__: "[calibration](#calibration)" for model in campaign.CALIBRATIONS.values()},
+    **{model.__name__: "[deployment](#deployment)" for model in campaign.DEPLOYMENTS.values()},
 }
 
 
@@ -206,8 +215,32 @@ def section(model: type[Section]) -> str:
     for key, name in model.written_keys().items():
         info = model.model_fields[name]
         default = _default(key, info, model)
-        rows.append((f"`{key}`", _value(info.annotation, info.metadata), default, _one_line(info.description or "")))
+        value = _value(info.annotation, info.metadata)
+        if model is Objective and name == model.tag:
+            value = ", ".join(f"`{word}`" for word in OBJECTIVES.names)
+        rows.append((f"`{key}`", value, default, _one_line(info.description or "")))
     return _table(("key", "value", "unless given", "meaning"), rows)
+
+
+def variants(models: Mapping[str, type[Section]], common: type[Section]) -> str:
+    """Keys of a tagged union that not all sections of its kind have, each with the variants that have it."""
+    owners: dict[tuple[str, ...], list[str]] = {}
+    tag = next(iter(models.values())).tag
+    for name, model in models.items():
+        for key, field in model.written_keys().items():
+            info = model.model_fields[field]
+            if field in common.model_fields or field == tag:
+                continue
+            described = _value(info.annotation, info.metadata), _default(key, info, model)
+            owners.setdefault((f"`{key}`", *described, _one_line(info.description or "")), []).append(name)
+    rows = [("all" if len(names) == len(models) else ", ".join(names), *row) for row, names in owners.items()]
+    return _table(("of", "key", "value", "unless given", "meaning"), rows)
+
+
+def _arms(model: type[Section]) -> dict[str, type[Section]]:
+    """Sections of the arms of a study, by the strategy that each is of."""
+    found = [s for info in model.model_fields.values() for s in sections_in(info.annotation)]
+    return {section.variant: section for section in found}
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -218,6 +251,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "columns": columns,
     "states": states,
     **{name: partial(section, model) for name, model in SECTIONS.items()},
+    "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),
+    "deployment-strategies": partial(variants, campaign.DEPLOYMENTS, campaign.DeploymentSection),
+    "objectives": partial(variants, OBJECTIVES.all, Objective),
+    "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Section),
+    "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Section),
 }
 
 
@@ -250,6 +288,9 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         parts = [_value(part) for part in typing.get_args(annotation) if part is not type(None)]
         sections = [part for part in parts if "or the path of its file" in part]
         return " or ".join(dict.fromkeys(sections or parts))
+    choice = next((m for m in metadata if isinstance(m, Choice)), None)
+    if choice is not None:
+        return ", ".join(f"`{word}`" for word in choice.words())
     if origin is Literal:
         return ", ".join(f"`{word}`" for word in typing.get_args(annotation))
     if origin is list:

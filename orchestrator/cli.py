@@ -251,9 +251,9 @@ def validate(
     ],
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and that some action can be poured."""
-    from orchestrator.commands import single
+    from orchestrator.commands import validate as verb
 
-    call(single.validate, files)
+    call(verb.validate, files)
 
 
 @app.command(
@@ -289,6 +289,17 @@ app.command(
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
     )
 )(bench_verbs.pour)
+
+
+@app.command(epilog=examples("decant plugins", "decant plugins --json"))
+def plugins(as_json: Json = False) -> None:
+    """List what installed packages add: strategies, objectives, balances, arms and sources of vessels.
+
+    Exit code 1 if a package registers something that can't be used; it is named with its package and the reason.
+    """
+    from orchestrator.commands import plugins as verb
+
+    call(verb.plugins, as_json=as_json)
 
 
 @app.command(

@@ -31,7 +31,7 @@ THOUGHT = 0.2
 """Of what lies between two pours beside them: a question to the optimiser, the journal [s]."""
 
 ENOUGH = 4
-"""Simulations of a stage after which its own pace is believed."""
+"""Simulations of a stage after which its pace counts; what is expected of it still counts as so many."""
 
 
 @dataclass(frozen=True)
@@ -167,10 +167,16 @@ class Forecast:
 
     def _price(self, stage: _Stage) -> float:
         """Seconds from one simulation's answer to the next one's, where no pour is made."""
-        if len(stage.waits) >= ENOUGH:
-            return _usual(stage.waits)
+        expected = self._expected(stage)
+        if len(stage.waits) < ENOUGH:
+            return expected
+        waits = sorted(stage.waits)[:-1]
+        return (sum(waits) + ENOUGH * expected) / (len(waits) + ENOUGH)
+
+    def _expected(self, stage: _Stage) -> float:
+        """The same, from what was seen of other stages."""
         particles = stage.work.particles or self._particles
-        others = [other for other in self._stages.values() if len(other.waits) >= ENOUGH]
+        others = [other for other in self._stages.values() if other is not stage and len(other.waits) >= ENOUGH]
         if not others:
             return PRICE / self._slots * particles
         return _usual(others[-1].waits) / _mean(others[-1].particles) * particles

@@ -28,7 +28,7 @@ from orchestrator.errors import RunError
 from orchestrator.reserve import MB, Reserve, free_space
 from orchestrator.states import State
 
-FORMAT = 1
+FORMAT = 2
 """Version of the tables and of the entries' bodies. A journal of another version is refused, never guessed at."""
 
 JOURNAL_NAME = "journal.sqlite"

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from orchestrator.codec import digest, to_json
+from orchestrator.codec import digest
 from orchestrator.fingerprint import fingerprint
 from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader
 from orchestrator.plan import CampaignPlan
@@ -52,8 +52,7 @@ def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
 
 def write_provenance(directory: Path, plan: CampaignPlan) -> None:
     """Keep with the run what is needed to reproduce it: resolved.json (the plan) and versions.json."""
-    resolved = plan.resolved or to_json(plan, CampaignPlan)
-    _write_json(directory / "resolved.json", resolved)
+    _write_json(directory / "resolved.json", plan.resolved)
     _write_json(directory / "versions.json", {"campaign": str(plan.source), "seed": plan.seed, **versions()})
 
 

@@ -12,39 +12,21 @@ from orchestrator.errors import RunError
 from orchestrator.flights import Order
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
 from orchestrator.results import Results, learnt_by
-from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta, Calibration
-from orchestrator.strategies.calibration.c1 import UniformGrid
-from orchestrator.strategies.calibration.c2 import StratifiedSampling
-from orchestrator.strategies.calibration.c3 import BayesianCalibration
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
-from orchestrator.strategies.deployment.base import Deployment
+from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d1_risk import RobustPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.d3_free import FreeHybrid
 from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.risk import Disturbances
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
 POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
-DEPLOYMENT, PREDICTION = "deployment:", "prediction:"
+DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "prediction:"
 """Names of a calibration's stages, and what those of receivers begin with."""
-
-_CALIBRATIONS: dict[str, type[Calibration]] = {
-    "C1": UniformGrid,
-    "C2": StratifiedSampling,
-    "C3": BayesianCalibration,
-    "C4": ContinuousBayesianCalibration,
-}
-_DEPLOYMENTS: dict[str, type[Deployment]] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 
 POSTERIOR_DRAWS = 64
 """θ of a posterior that a deployment under risk draws from."""
@@ -117,7 +99,7 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
 
     def calibration(results: Results, seed: int) -> Strategy:
         pours = [scored.pour for scored in measured_pours(plan, results)]
-        return _CALIBRATIONS[plan.strategy](plan, pours, seed)
+        return plan.settings.build(plan, pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
         theta = calibrated_theta(results).theta
@@ -132,33 +114,31 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
     """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated).
 
-    Raises:
-        RunError: D2 or D3 are asked to plan under risk, or for a safe window.
+    Each is followed by one that pours what was recommended again, where the plan asks for that.
     """
-    for key, asked in (("risk", deployment.risk), ("window", deployment.tolerance)):
-        if asked is not None and deployment.strategy != "D1":
-            raise RunError(f"deployment.{key}: belongs to D1, not to {deployment.strategy}; remove it")
-    # Only where simulations go on for as long as a pour takes does the clock decide what is asked for.
-    free = deployment.strategy == "D3" and deployment.per_pour is None
-    strategy = FreeHybrid if free and deployment.prices is not None else _DEPLOYMENTS[deployment.strategy]
-    if deployment.risk is not None:
-        strategy = RobustPlanning
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            return strategy(with_posterior(deployment, results), scene, _theta(plan, results), seed)
+            known = with_posterior(deployment, results)
+            return known.settings.build(known, scene, _theta(plan, results), seed)
 
         return build
 
-    return [
-        StageDefinition(
-            DEPLOYMENT + name,
-            build_for(scene),
-            order="completion" if free else "logical",
-            pours=deployment.pours > 0,
-        )
-        for name, scene in _by_receiver(deployment).items()
-    ]
+    def confirm_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            recommended = learnt_by(results, DEPLOYMENT + name, Deployed).recommended
+            costing = Costing.of(deployment, scene, _theta(plan, results))
+            return Confirmation(costing, recommended, deployment.confirm, seed)
+
+        return build
+
+    stages = []
+    for name, scene in _by_receiver(deployment).items():
+        order, pours = deployment.settings.order, deployment.pours > 0
+        stages.append(StageDefinition(DEPLOYMENT + name, build_for(scene), order=order, pours=pours))
+        if deployment.confirm:
+            stages.append(StageDefinition(CONFIRMATION + name, confirm_for(name, scene), pours=True))
+    return stages
 
 
 def prediction_stages(
@@ -175,12 +155,10 @@ def prediction_stages(
         def build(results: Results, seed: int) -> Strategy:
             recommended = learnt_by(results, DEPLOYMENT + name, Deployed).recommended
             action = None if recommended is None else scene.action(dict(recommended.action_si))
-            theta, risk = _theta(plan, results), with_posterior(deployment, results).risk
+            theta, known = _theta(plan, results), with_posterior(deployment, results)
             costing = Costing.of(deployment, scene, theta)
-            if risk is None:
-                return RepeatedSimulation(costing, action, seeds, seed, thetas)
-            draws = Disturbances(risk, deployment.actions, theta, seed).draws(seeds)
-            drawn = [draw.parameters for draw in draws] if risk.theta == "posterior" else thetas
+            draws = known.settings.draws(known, theta, seeds, seed)
+            drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
             return RepeatedSimulation(costing, action, seeds, seed, drawn, [draw.error for draw in draws])
 
         return build
@@ -191,13 +169,12 @@ def prediction_stages(
 
 
 def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
-    """The deployment with the draws of θ that its risk asks for, from the calibration before it.
+    """The deployment with the draws of θ that its settings ask for, from the calibration before it.
 
     Raises:
         RunError: it has none.
     """
-    risk = deployment.risk
-    if risk is None or risk.theta == "best" or risk.thetas:
+    if not deployment.settings.needs_posterior or deployment.thetas:
         return deployment
     found = calibrated_theta(results) if CALIBRATION in results else None
     if found is None or found.posterior is None or not found.posterior.thetas:
@@ -205,7 +182,7 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     rows = found.posterior.thetas
     kept = rows[:: max(len(rows) // POSTERIOR_DRAWS, 1)]
     thetas = tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
-    return replace(deployment, risk=replace(risk, thetas=thetas))
+    return replace(deployment, thetas=thetas)
 
 
 def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:

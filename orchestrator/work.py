@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from actors.spec import LaboratorySpec
 from orchestrator.forecast import PRICE, Work
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
-from orchestrator.stages import CALIBRATION, DEPLOYMENT, EVALUATION, POURS
+from orchestrator.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, EVALUATION, POURS
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.space import Space
 from sim_engine.task import Scene
@@ -35,9 +35,10 @@ def _work(plan: CampaignPlan, name: str) -> Work:
             return Work(calibration.simulations, particles=particles_of(plan))
         if name == EVALUATION:
             return Work(_scored(calibration))
-    if deployment is not None and name.startswith(DEPLOYMENT):
+    if deployment is not None and name.startswith((DEPLOYMENT, CONFIRMATION)):
         pour = pour_time(plan.laboratory, deployment.scenes[0], deployment.actions)
-        return _deployed(deployment, pour)
+        confirming = name.startswith(CONFIRMATION)
+        return Work(pours=deployment.confirm, pour_time=pour) if confirming else _deployed(deployment, pour)
     return Work()
 
 
@@ -61,14 +62,9 @@ def particles_of(plan: CampaignPlan) -> float:
 
 
 def _deployed(plan: DeploymentPlan, pour: float) -> Work:
-    match plan.strategy:
-        case "D1":
-            simulations = max(plan.iterations, 1) * max(plan.simulations_per_iteration, 1)
-            return Work(simulations, min(plan.pours, 1), pour_time=pour)
-        case "D2":
-            return Work(0, plan.pours, pour_time=pour)
-    beside = plan.per_pour or 0
-    return Work(plan.prior_simulations + beside * plan.pours, plan.pours, beside, pour_time=pour)
+    settings = plan.settings
+    pours = plan.pours if settings.learns_on_pours else min(plan.pours, 1)
+    return Work(settings.simulations, pours, settings.simulations_beside, pour_time=pour)
 
 
 def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float:

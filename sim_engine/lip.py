@@ -97,6 +97,8 @@ class FlowCourse:
         velocity, film: at the lip [m/s], [m].
         stream_velocity, diameter: of the stream at the receiver's rim [m/s], [m].
         covered: whether liquid covers the whole opening.
+        lip: x of the lip in the world [m].
+        fall: from the lip to the level of the receiver's rim, at least 0 [m].
     """
 
     volume: Floats
@@ -105,6 +107,16 @@ class FlowCourse:
     stream_velocity: Floats
     diameter: Floats
     covered: Which
+    lip: Floats
+    fall: Floats
+
+    def landing(self) -> float:
+        """Where the middle of the stream passes the level of the receiver's rim, x in the world [m].
+
+        A free jet that leaves horizontally with the mean velocity at the lip; in simulated pours into a narrow cup
+        what is received falls to nothing within 15 mm of where this leaves the opening.
+        """
+        return self.quantile(self.lip + self.velocity * np.sqrt(2.0 * self.fall / GRAVITY), 0.5)
 
     def share(self, where: Which) -> float:
         """Part of what is poured for which something holds."""
@@ -157,7 +169,7 @@ def flow_course(motion: Motion, volume: float, pourer: Vessel, receiver: Vessel)
     leaving = left > 0.0
     if not leaving.any():
         return None
-    fall = _fall(motion, flow, pourer, receiver)[leaving]
+    lip, fall = (along[leaving] for along in _lip(motion, flow, pourer, receiver))
     outflow = flow.outflow[leaving]
     opening = _wetted(pourer.opening_radius, flow.heads[leaving], flow.tilts[leaving])
     velocity = opening.ideal_flow / opening.area
@@ -169,15 +181,18 @@ def flow_course(motion: Motion, volume: float, pourer: Vessel, receiver: Vessel)
         stream_velocity=falling,
         diameter=np.sqrt(4.0 * outflow / (math.pi * falling)),
         covered=opening.covered,
+        lip=lip,
+        fall=fall,
     )
 
 
-def _fall(motion: Motion, flow: LipFlow, pourer: Vessel, receiver: Vessel) -> Floats:
-    """Height of the lip above the receiver's rim, at least 0, shape (T,) [m]."""
+def _lip(motion: Motion, flow: LipFlow, pourer: Vessel, receiver: Vessel) -> tuple[Floats, Floats]:
+    """The lip's x in the world and its height above the receiver's rim, at least 0, both of shape (T,) [m]."""
     x, _, z = pourer.lip_point(0.0)
-    tilt = motion.tilt(flow.times)
-    lip = motion.sample(flow.times)[:, 2] - x * np.sin(tilt) + z * np.cos(tilt)
-    return np.asarray(np.maximum(lip - receiver.rim_height, 0.0))
+    tilt, poses = motion.tilt(flow.times), motion.sample(flow.times)
+    along = poses[:, 0] + x * np.cos(tilt) + z * np.sin(tilt)
+    up = poses[:, 2] - x * np.sin(tilt) + z * np.cos(tilt)
+    return along, np.maximum(up - receiver.rim_height, 0.0)
 
 
 @dataclass(frozen=True)

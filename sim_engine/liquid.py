@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from sim_engine.marks import FREE
 
 LARGEST_LIP_DROP = 1.0
 
@@ -41,13 +43,17 @@ class Liquid(BaseModel):
     name: str = "water"
     mass: float = Field(gt=0.0, le=20.0)
     density: float = Field(default=998.0, gt=100.0, lt=20_000.0)
-    surface_tension: float = Field(default=0.0728, ge=1e-3, le=1.0)
-    dynamic_viscosity: float = Field(default=1.0e-3, ge=1e-5, le=1e3)
+    surface_tension: Annotated[float, FREE] = Field(default=0.0728, ge=1e-3, le=1.0)
+    dynamic_viscosity: Annotated[float, FREE] = Field(default=1.0e-3, ge=1e-5, le=1e3)
 
     @property
     def volume(self) -> float:
         """Loaded volume [m³]."""
         return self.mass / self.density
+
+    def millilitres(self, mass: float) -> float:
+        """Volume of some of it, as people read it [mL]; mass in [kg]."""
+        return 1e6 * mass / self.density
 
 
 class SimulationParameters(BaseModel):

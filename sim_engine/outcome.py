@@ -122,6 +122,11 @@ class PourMeasurement:
     notes: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def delivered(self) -> float:
+        """Mass that must be in the receiver: what is neither left in the pourer nor beside the receiver [kg]."""
+        return max(self.loaded - self.retained - self.spilled, 0.0)
+
+    @property
     def fractions(self) -> Fractions:
         """Poured, spilled, retained as fractions of the load."""
         return Fractions(1.0 - self.retained / self.loaded, self.spilled / self.loaded, self.retained / self.loaded)

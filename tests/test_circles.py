@@ -9,6 +9,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 FLOORS = ("sim_engine", "actors", "orchestrator")
 
+SETTINGS = ("spec.py", "settings.py")
+MAKERS = ("build", "driver", "stand_in", "look", "plan")
+"""Methods of settings that make what they are settings of."""
+
 
 def modules() -> dict[str, Path]:
     files = [path for floor in FLOORS for path in (ROOT / floor).rglob("*.py")]
@@ -18,14 +22,15 @@ def modules() -> dict[str, Path]:
 def needed(name: str, path: Path, known: dict[str, Path]) -> set[str]:
     """Modules that one imports, wherever in its text: also for types only, also within functions.
 
-    Settings may name the driver that they are for, where it is made (`spec.py`).
+    Settings know what is made of them: where they make it, and what it is made with, they may name it.
     """
     found: set[str] = set()
     tree = ast.parse(path.read_text())
-    if path.name == "spec.py":
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef):
-                node.body = [line for line in node.body if not isinstance(line, ast.Import | ast.ImportFrom)]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and (node.name in MAKERS or path.name in SETTINGS):
+            node.body = [line for line in node.body if not isinstance(line, ast.Import | ast.ImportFrom)]
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and path.name in SETTINGS:
+            node.body = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}

@@ -187,7 +187,7 @@ def test_quickstart_is_what_the_guide_says() -> None:
     said = (
         f"{calibration.pour_count} pours to calibrate on, {calibration.simulations} simulations to calibrate with, "
         f"then {deployment.pours} pours into a {deployment.scenes[0].receiver.name} cup on a prior of "
-        f"{deployment.prior_simulations} simulations"
+        f"{deployment.settings.simulations_before} simulations"
     )
     assert said in " ".join(text_of(ROOT / "docs" / "user-guide.md").split())
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from actors.arm.geometry import ArmLimits, Cell, Joints, Mount, Pose, Vector
 from actors.arm.look import ArmLook
 from sim_engine.action import Action
+from sim_engine.marks import FREE
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
@@ -92,6 +93,11 @@ class ArmSpec(ABC):
         """What it is set up to carry [kg]; None where nobody said."""
         return None
 
+    @property
+    def tilt_speed_limit(self) -> float | None:
+        """How fast it may turn the pourer [rad/s]; None where nobody said."""
+        return None
+
     def look(self) -> ArmLook:
         """Ask the arm everything that `decant doctor` tells of; nothing moves, nothing is set."""
         return ArmLook()
@@ -124,7 +130,7 @@ class UrArmSpec(ArmSpec):
     limits: ArmLimits
     cell: Cell
     home: Joints
-    address: str = ""
+    address: Annotated[str, FREE] = ""
     mount: Mount = field(default_factory=Mount)
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0
@@ -169,6 +175,11 @@ class UrArmSpec(ArmSpec):
     def payload_limit(self) -> float | None:
         """See `ArmSpec.payload_limit`."""
         return self.payload
+
+    @property
+    def tilt_speed_limit(self) -> float:
+        """See `ArmSpec.tilt_speed_limit`."""
+        return self.limits.tilt_speed
 
     @property
     def untilt_time(self) -> float:

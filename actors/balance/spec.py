@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.doors import dialects
@@ -16,6 +16,7 @@ from actors.balance.virtual_balance import PATIENCE, BalanceSettings, VirtualBal
 from actors.balance.virtual_serial.scale import ScaleSettings
 from actors.checks import Check
 from actors.protocols import LaboratoryError
+from sim_engine.marks import FREE
 
 AUTO = "auto"
 """Dialect that is found out."""
@@ -182,17 +183,17 @@ class SerialBalanceSpec(BalanceDevice):
 
     kind: ClassVar[str] = "serial"
 
-    port: str
+    port: Annotated[str, FREE]
     dialect: str = AUTO
-    baud: int | None = None
-    format: str | None = None
-    handshake: Handshake = "none"
+    baud: Annotated[int | None, FREE] = None
+    format: Annotated[str | None, FREE] = None
+    handshake: Annotated[Handshake, FREE] = "none"
     settling: SettlingRule = field(default_factory=SettlingRule)
     step: float | None = None
     repeatability: float = 0.0
     interval: float = 0.15
     answer_time: float = 1.0
-    reconnect_time: float = 20.0
+    reconnect_time: Annotated[float, FREE] = 20.0
     time_scale: float = 1.0
     virtual: ScaleSettings | None = None
 

@@ -108,16 +108,21 @@ def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) 
 
 def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
     """How many pours the stages may ask for."""
+    from orchestrator.stages import CONFIRMATION
+
     calibrating, deploying = _pouring(stages)
     count = plan.calibration.pour_count if plan.calibration is not None and calibrating else 0
-    return count + (plan.deployment.pours * deploying if plan.deployment is not None else 0)
+    if plan.deployment is None:
+        return count
+    confirming = sum(stage.name.startswith(CONFIRMATION) for stage in stages)
+    return count + plan.deployment.pours * deploying + plan.deployment.confirm * confirming
 
 
 def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
     """Whether the calibration's pours are among the stages, and how many deployments that pour."""
-    from orchestrator.stages import DEPLOYMENT
+    from orchestrator.stages import CONFIRMATION, DEPLOYMENT
 
-    names = [stage.name for stage in stages if stage.pours]
+    names = [stage.name for stage in stages if stage.pours and not stage.name.startswith(CONFIRMATION)]
     deploying = sum(name.startswith(DEPLOYMENT) for name in names)
     return deploying < len(names), deploying
 

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from sim_engine.liquid import SimulationParameters
 
 
+_TOLD = {"prediction", "predicted_delivered_g", "predicted_delivered_ml", "risk", "window", "not_covered"}
+"""Of a receiver's summary: what a plan for it tells beside the action."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """What `run` and `calibrate` are told on the command line beside their campaign."""
@@ -57,21 +61,25 @@ def _check_posterior(plan: CampaignPlan) -> None:
     Raises:
         RefusalError: it makes none (exit code 2).
     """
-    risk = None if plan.deployment is None else plan.deployment.risk
-    if risk is None or risk.theta == "best":
+    from orchestrator.strategies.doors import calibrations
+
+    if plan.deployment is None or not plan.deployment.settings.needs_posterior:
         return
-    if plan.calibration is None or plan.calibration.strategy != "C4":
-        has = "has no calibration" if plan.calibration is None else f"calibrates with {plan.calibration.strategy}"
+    if plan.calibration is None or not plan.calibration.settings.makes_posterior:
+        known = [name for name, settings in calibrations().items() if settings().makes_posterior]
+        has = "has no calibration"
+        if plan.calibration is not None and plan.calibration.strategy not in known:
+            has = f"calibrates with {plan.calibration.strategy}"
+        elif plan.calibration is not None:
+            raise RefusalError(
+                f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which no surrogate makes that "
+                "takes actions for noise; write 'calibration: {averaging: context}', or 'theta: best'",
+                BAD_INPUT,
+            )
         raise RefusalError(
-            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which only C4 makes, and this "
-            f"campaign {has}; calibrate with C4, write 'theta: best', or use decant plan --parameters with the "
-            "theta.json of a calibration",
-            BAD_INPUT,
-        )
-    if plan.calibration.averaging == "noise":
-        raise RefusalError(
-            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which no surrogate makes that takes "
-            "actions for noise; write 'calibration: {averaging: context}', or 'theta: best'",
+            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which only {' and '.join(known)} "
+            f"makes, and this campaign {has}; calibrate with {known[0]}, write 'theta: best', or use decant plan "
+            "--parameters with the theta.json of a calibration",
             BAD_INPUT,
         )
 
@@ -183,7 +191,7 @@ def plan_pour(
                 "predicted_spillage_deviation": None if spillage is None else spillage.deviation,
                 "predicted_deviation": recommended.predicted_deviation,
                 "loss": plan.deployment.loss_name,
-                **told.model_dump(mode="json", include={"prediction", "risk", "window", "not_covered"}),
+                **told.model_dump(mode="json", include=_TOLD),
             }
         )
     theta = plan.parameters.model_dump()
@@ -219,10 +227,12 @@ def planning_plan(
     from orchestrator.config.load import load_parameters, load_posterior, load_vessel
     from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.stages import POSTERIOR_DRAWS
+    from orchestrator.strategies.deployment.d1 import D1Settings
 
     deployment, theta = plan.deployment, plan.parameters
-    risk = None if deployment is None else deployment.risk
-    if risk is not None and risk.theta == "posterior" and parameters is None:
+    posterior = deployment is not None and deployment.settings.needs_posterior
+    thetas: tuple[SimulationParameters, ...] = ()
+    if posterior and parameters is None:
         raise RefusalError(
             f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration "
             "by C4",
@@ -231,8 +241,8 @@ def planning_plan(
     try:
         if parameters is not None:
             theta = load_parameters(parameters, plan.parameters)
-            if risk is not None and risk.theta == "posterior":
-                risk = dataclasses.replace(risk, thetas=load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters))
+            if posterior:
+                thetas = load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters)
         vessel = load_vessel(receiver) if receiver is not None else None
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
@@ -244,14 +254,9 @@ def planning_plan(
     scenes = deployment.scenes
     if vessel is not None:
         scenes = (dataclasses.replace(scenes[0], name=f"plan:{vessel.name}", receiver=vessel),)
-    deployment = dataclasses.replace(
-        deployment,
-        strategy="D1",
-        scenes=scenes,
-        pours=0,
-        risk=risk,
-        iterations=iterations if iterations is not None else deployment.iterations,
-    )
+    changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
+    settings = D1Settings.like(deployment.settings, **changes)
+    deployment = dataclasses.replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0)
     return dataclasses.replace(
         plan,
         name=f"{plan.name}-plan",
@@ -279,8 +284,6 @@ def _run(
         check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(plan, chosen, in_process=options.in_process)
     directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
-    if options.resume:
-        plan = _as_begun(plan, directory)
     flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
     flag += " --arm" if plan.laboratory.mode == "hardware" else ""
     again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
@@ -297,27 +300,6 @@ def _run(
     if finished.published.theta is not None:
         say(f"θ* is in {finished.published.theta}; use it with --parameters")
     return finished
-
-
-def _as_begun(plan: CampaignPlan, directory: Path) -> CampaignPlan:
-    """An older run goes on as it began; a journal that can't be read is told of by whoever goes on with it."""
-    from orchestrator.errors import RunError
-    from orchestrator.fingerprint import as_begun
-    from orchestrator.journal import JOURNAL_NAME, JournalReader
-
-    try:
-        with JournalReader(directory / JOURNAL_NAME) as journal:
-            begun = journal.header.fingerprint
-    except (RunError, OSError):
-        return plan
-    older = as_begun(plan, begun)
-    if older is not plan:
-        before, today = older.deployment, plan.deployment
-        names = ("model", "trust", "noise", "refusals")
-        changed = [name for name in names if getattr(before, name) != getattr(today, name)]
-        told = ", ".join(f"{name} {getattr(before, name) or 'off'}" for name in changed)
-        say(f"this run is older than some settings of its deployment, and goes on as it began: {told}")
-    return older
 
 
 def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:

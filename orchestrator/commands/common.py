@@ -10,7 +10,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, INTERRUPTED, RefusalError, say, stdout_for_results
+from orchestrator.commands.speaking import (
+    BAD_INPUT,
+    FAILED,
+    INTERRUPTED,
+    RefusalError,
+    mention,
+    say,
+    stdout_for_results,
+)
+from orchestrator.commands.waiting import Waiting
 
 if TYPE_CHECKING:
     from actors.protocols import Laboratory
@@ -43,7 +52,13 @@ def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> No
     """
     from orchestrator.config.campaign.check import check_campaign
 
-    problems = check_campaign(plan, as_written=as_written)
+    warned: list[str] = []
+    with Waiting() as doing:
+        problems = check_campaign(
+            plan, as_written=as_written, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing
+        )
+    for text in dict.fromkeys(warned):
+        mention(text)
     if problems:
         raise RefusalError("\n".join(str(problem) for problem in problems), BAD_INPUT)
 

@@ -13,6 +13,7 @@ from actors.checks import Check
 from orchestrator.commands.doctor_balance import look_at_balance
 from orchestrator.commands.hands_on import reached
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
+from orchestrator.plugins import broken
 from orchestrator.safety import SafetyRecordError, read_record, record_path, write_record
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
             record = _accept(path, look)
         checks = look.checks(record, accept=f"decant doctor {path} --accept-safety", virtual=virtual)
         checks += look_at_balance(ready.balance, tare=tare)
+    checks += [Check("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
     failed = [check for check in checks if check.state == "fail"]
     if as_json:
         table = [dataclasses.asdict(check) for check in checks]

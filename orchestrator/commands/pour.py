@@ -117,7 +117,6 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
     from actors.protocols import InvalidActionError
     from orchestrator.config.campaign.assignments import assigned_action
     from orchestrator.config.campaign.check import check_vessels
-    from orchestrator.config.yaml.errors import shown_path
 
     plan = read_campaign(path)
     scene, space = scene_to_simulate(plan, scene_name)
@@ -125,9 +124,9 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
     except ValueError as error:
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
-    problems = check_vessels(scene)
+    problems = check_vessels(scene, plan.source)
     if problems:
-        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
     planned = None
@@ -264,7 +263,7 @@ def _only(chosen: Chosen) -> CampaignPlan:
     """The campaign without everything that this pour isn't of."""
     plan = chosen.plan
     if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
-        deployment = dataclasses.replace(plan.deployment, scenes=(chosen.scene,), pours=1)
+        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(chosen.scene,))
         return dataclasses.replace(plan, calibration=None, deployment=deployment)
     return dataclasses.replace(plan, deployment=None)
 
@@ -279,4 +278,4 @@ def told(weighed: WeighedPour) -> str:
     )
     parts = {"loaded": weighed.loaded, "spilled": weighed.spilled, "retained": weighed.retained}
     masses = ", ".join(f"{name} {1e3 * mass:.1f} g" for name, mass in parts.items())
-    return f"{masses}; {r}"
+    return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"

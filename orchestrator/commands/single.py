@@ -1,4 +1,4 @@
-"""`decant simulate`, `decant validate`, `decant schema`: verbs that need no laboratory."""
+"""`decant simulate`, `decant schema`: verbs that need no laboratory."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def simulate(
     from orchestrator.config.campaign.assignments import assigned_action
     from orchestrator.config.campaign.check import check_vessels
     from orchestrator.config.load import load_parameters, load_vessel
-    from orchestrator.config.yaml.errors import ConfigError, shown_path
+    from orchestrator.config.yaml.errors import ConfigError
     from sim_engine.backend import BackendError, require_backend
     from sim_engine.pour import InvalidSceneError, PourSimulator
     from sim_engine.spread import spreads
@@ -62,9 +62,9 @@ def simulate(
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
     check_output(rrd, "--rrd", ".rrd")
     check_output(png, "--png", ".png")
-    problems = check_vessels(scene)
+    problems = check_vessels(scene, plan.source)
     if problems:
-        raise RefusalError("\n".join(f"{shown_path(plan.source)}: {problem}" for problem in problems), BAD_INPUT)
+        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     record_rate = 20.0 if rrd or png else 0.0
     tasks = [PourTask(scene, action, theta, seed + i, record_rate if i == 0 else 0.0) for i in range(seeds)]
     try:
@@ -82,6 +82,8 @@ def simulate(
     if rrd is not None or png is not None:
         _show(tasks[0], runs[0], rrd, png)
     over_seeds = spreads(outcomes)
+    received = over_seeds.get("received")
+    delivered = None if received is None else received.mean * scene.liquid.mass
     if as_json:
         prediction = {name: spread.as_json() for name, spread in over_seeds.items()}
         print_json(
@@ -90,6 +92,8 @@ def simulate(
                 "action": action.values(),
                 "theta": theta.model_dump(),
                 "scene": scene.name,
+                "delivered_g": None if delivered is None else 1e3 * delivered,
+                "delivered_ml": None if delivered is None else scene.liquid.millilitres(delivered),
                 "prediction": {**prediction, "seeds": [task.seed for task in tasks]},
                 "regimes": None if regime is None else regime.as_json(),
                 "not_covered": [] if regime is None else [one.as_json() for one in regime.not_covered],
@@ -97,7 +101,8 @@ def simulate(
         )
     else:
         say(f"{scene.name}: {action.display()}")
-        print(told(outcomes, over_seeds))
+        amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
+        print(told(outcomes, over_seeds, amount))
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)
@@ -119,13 +124,20 @@ def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[Simulate
     return runs
 
 
-def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, Spread]) -> str:
-    """The outcomes in one line: mean ± standard deviation of the seeds."""
+def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, Spread], delivered: str = "") -> str:
+    """The outcomes in one line: mean ± standard deviation of the seeds.
+
+    Args:
+        outcomes: one for each seed.
+        over_seeds: their means and deviations.
+        delivered: how much is in the receiver, in the mean; '' if nobody knows.
+    """
     from sim_engine.spread import FRACTIONS
 
     first = outcomes[0]
     shown = {name: over_seeds[name].percent(2 if name == "escaped" else 1) for name in FRACTIONS if name in over_seeds}
     fractions = "  ".join(f"{name.replace('_', ' ')} {text}" for name, text in shown.items())
+    fractions += f"  delivered {delivered}" if delivered else ""
     valid = sum(outcome.invalid is None for outcome in outcomes)
     seeds = (
         "1 seed, so no spread; --seeds 5 would tell it" if valid == 1 else f"mean ± standard deviation, {valid} seeds"
@@ -182,49 +194,6 @@ def _show(task: PourTask, pour: SimulatedPour, rrd: Path | None, png: Path | Non
         from orchestrator.report.scene import simulation_png
 
         say(f"picture: {simulation_png(png, task, pour)}")
-
-
-def validate(paths: list[Path]) -> None:
-    """Check files; every problem of every file, exit code 2 if there is one."""
-    from orchestrator.config.campaign.check import check_campaign
-    from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-    from orchestrator.config.study.sections import load_study
-    from orchestrator.config.yaml.errors import ConfigError
-    from orchestrator.config.yaml.files import resolved
-    from orchestrator.config.yaml.kinds import kind_of
-    from orchestrator.config.yaml.source import Document
-    from orchestrator.study.cells import cells_of
-    from sim_engine.vessel.build import build_vessel
-    from sim_engine.vessel.errors import VesselError
-
-    bad = 0
-    for path in paths:
-        problems: list[str] = []
-        try:
-            kind = kind_of(Document.read(resolved(path)).data)
-            if kind == "vessel":
-                vessel = build_vessel(load_vessel(path))
-                note = f"vessel, holds {1e6 * vessel.capacity:.4g} mL to the brim"
-            elif kind == "laboratory":
-                note = f"laboratory, {load_laboratory(path).mode}"
-            elif kind == "study":
-                study = load_study(path)
-                note = f"study, {len(cells_of(study))} cells, seed {study.seed}"
-            else:
-                plan = load_campaign(path)
-                problems = [str(problem) for problem in check_campaign(plan)]
-                note = f"campaign, seed {plan.seed}"
-        except ConfigError as error:
-            problems = [str(error)]
-        except VesselError as error:
-            problems = [f"{path}: {error}"]
-        if problems:
-            bad += 1
-            say("\n".join(problems))
-        else:
-            print(f"{path}: ok ({note})")
-    if bad:
-        raise RefusalError(f"{bad} of {len(paths)} file(s) can't be used", BAD_INPUT)
 
 
 def schema(which: str) -> None:

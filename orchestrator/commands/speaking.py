@@ -29,6 +29,26 @@ def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+_quiet = False
+
+
+def hush(quiet: bool) -> None:
+    """From now on `mention` says nothing; questions, warnings of what moves, and errors are still told."""
+    global _quiet
+    _quiet = _quiet or quiet
+
+
+def is_quiet() -> bool:
+    """Whether only results and what has to be known are wanted."""
+    return _quiet
+
+
+def mention(text: str) -> None:
+    """A line for people who want to know what goes on: left out with `--quiet`."""
+    if not _quiet:
+        say(text)
+
+
 def print_json(data: dict[str, Any]) -> None:
     """One line of JSON on stdout. Numbers that JSON has no word for become null."""
     print(json.dumps(_plain(data), ensure_ascii=False), flush=True)

@@ -62,10 +62,9 @@ def read_study(path: Path) -> StudyPlan:
     from orchestrator.commands.common import check_campaign_can_run
     from orchestrator.config.study.sections import load_study
     from orchestrator.config.yaml.errors import ConfigError
-    from orchestrator.study.folder import as_begun
 
     try:
-        plan = as_begun(load_study(path))
+        plan = load_study(path)
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
     deployment = plan.deployments[0].plan if plan.deployments else None

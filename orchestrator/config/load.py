@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from bisect import bisect_right
 from itertools import accumulate
@@ -13,7 +12,6 @@ from pydantic import create_model
 
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign.resolve import resolve_campaign
-from orchestrator.config.campaign.resolved import campaign_as_file
 from orchestrator.config.campaign.sections import CampaignFile
 from orchestrator.config.laboratory.sections import LaboratoryFile, resolve_laboratory
 from orchestrator.config.motion import parameter_quantity
@@ -23,7 +21,7 @@ from orchestrator.config.yaml.files import resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.sections import MADE, Section
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
@@ -51,7 +49,7 @@ def load_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
     plan = None if section is None else resolve_campaign(section, place, report)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"
-    return dataclasses.replace(plan, resolved=campaign_as_file(plan))
+    return plan
 
 
 def load_vessel(path: Path) -> VesselSpec:
@@ -104,7 +102,7 @@ def _theta_model() -> type[_ThetaBase]:
         q = parameter_quantity(name)
         loose = _LooseQuantity(q.unit, q.example, q.lower, q.upper, whole=q.whole)
         fields[name] = (Annotated[float, loose] | None, None)
-    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, **fields)
+    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, __cls_kwargs__=MADE, **fields)
     return model
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag, create_model, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from actors.optimizer.core.problem import Linear
-from orchestrator.config.campaign.constraints import constraint_as_file
-from orchestrator.config.yaml.quantities import Quantity, format_quantity
-from orchestrator.config.yaml.sections import Section, Text
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import MADE, Section, Text
 from orchestrator.plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquid import SimulationParameters
@@ -132,7 +129,9 @@ def _range_model(
 ) -> type[RangeSection]:
     end = Annotated[float, quantity]
     fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]")), **further}
-    model: type[RangeSection] = create_model(f"{_title(name)}Range", __base__=base, __doc__=base.__doc__, **fields)
+    model: type[RangeSection] = create_model(
+        f"{_title(name)}Range", __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 
@@ -144,7 +143,9 @@ def _action_range_model(dimension: Dimension) -> type[RangeSection]:
         key: (Annotated[float, number] | None, Field(default=None, description=_described(PriorSection, key)))
         for key, number in (("mean", quantity), ("deviation", spread))
     }
-    prior: Any = create_model(f"{_title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, **fields)
+    prior: Any = create_model(
+        f"{_title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, __cls_kwargs__=MADE, **fields
+    )
     prior.required = {"mean": quantity.example, "deviation": spread.example}
     field = (prior | None, Field(default=None, description=_described(ActionRangeSection, "prior")))
     return _range_model(name, quantity, ActionRangeSection, prior=field)
@@ -214,7 +215,9 @@ def _motion_model() -> type[MotionBase]:
         )
         for name, dimension in ACTION_DIMENSIONS.items()
     }
-    model: type[MotionBase] = create_model("Motion", __base__=MotionBase, __doc__=MotionBase.__doc__, **fields)
+    model: type[MotionBase] = create_model(
+        "Motion", __base__=MotionBase, __doc__=MotionBase.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 
@@ -248,7 +251,9 @@ def _actions_model() -> type[ActionsBase]:
         )
         for name, dimension in ACTION_DIMENSIONS.items()
     }
-    model: type[ActionsBase] = create_model("Actions", __base__=ActionsBase, __doc__=ActionsBase.__doc__, **fields)
+    model: type[ActionsBase] = create_model(
+        "Actions", __base__=ActionsBase, __doc__=ActionsBase.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 
@@ -272,6 +277,11 @@ class ParametersBase(Section):
             if isinstance(section := self.value(name), RangeSection) and section.range is not None
         }
 
+    def completed(self) -> Self:
+        """With the defaults of parameters that are not named."""
+        given = {name: value for name in self.written_keys() if (value := self.value(name)) is not None}
+        return self.model_copy(update=SimulationParameters().model_dump() | given)
+
     def in_force(self) -> dict[str, float]:
         """What is named, SI: a value as it is, and of a range the default or what is nearest to it."""
         default = SimulationParameters().model_dump()
@@ -288,7 +298,7 @@ def _parameters_model() -> type[ParametersBase]:
         ]
         fields[name] = (form | None, Field(default=None, description=info.meaning or None))
     model: type[ParametersBase] = create_model(
-        "Parameters", __base__=ParametersBase, __doc__=ParametersBase.__doc__, **fields
+        "Parameters", __base__=ParametersBase, __doc__=ParametersBase.__doc__, __cls_kwargs__=MADE, **fields
     )
     return model
 
@@ -296,53 +306,3 @@ def _parameters_model() -> type[ParametersBase]:
 Motion = _motion_model()
 Actions = _actions_model()
 Parameters = _parameters_model()
-
-
-def fixed_as_file(fixed: Mapping[str, float | None], pivot: Pivot, hold_cap: float) -> dict[str, object]:
-    """A `motion:` section, JSON-ready."""
-    section: dict[str, object] = {
-        "pivot": "lip"
-        if pivot.kind == "lip"
-        else {"x": format_quantity(pivot.x, "m", "mm"), "z": format_quantity(pivot.z, "m", "mm")},
-        "hold_cap": format_quantity(hold_cap, "s", "s"),
-    }
-    for name, value in fixed.items():
-        dimension = ACTION_DIMENSIONS[name]
-        section[name] = (
-            dimension.switched_off if value is None else format_quantity(value, dimension.unit, dimension.display_unit)
-        )
-    return section
-
-
-def actions_as_file(
-    space: Space, constraints: Sequence[Linear], prior: Sequence[NormalPrior] = ()
-) -> dict[str, object]:
-    """An `actions:` section, JSON-ready."""
-    section: dict[str, Any] = space_as_file(space)
-    for one in prior:
-        unit, display = ACTION_DIMENSIONS[one.name].unit, ACTION_DIMENSIONS[one.name].display_unit
-        numbers = {"mean": one.mean, "deviation": one.deviation}
-        section[one.name]["prior"] = {key: format_quantity(v, unit, display) for key, v in numbers.items()}
-    return section | {"constraints": [constraint_as_file(c) for c in constraints]} if constraints else section
-
-
-def space_as_file(space: Space) -> dict[str, object]:
-    """A `parameters:` section, or an `actions:` section without constraints, JSON-ready."""
-    info = SimulationParameters.info()
-    section: dict[str, object] = {}
-    for axis in space.axes:
-        if axis.name in ACTION_DIMENSIONS:
-            dimension = ACTION_DIMENSIONS[axis.name]
-            unit, display = dimension.unit, dimension.display_unit
-        else:
-            unit = display = info[axis.name].unit
-        ends = [value_as_file(value, unit, display, whole=axis.integer) for value in (axis.lower, axis.upper)]
-        section[axis.name] = {"range": ends, "scale": axis.scale}
-    return section
-
-
-def value_as_file(value: float, unit: str, display: str, *, whole: bool = False) -> object:
-    """A value as a file would have it: a plain number where it has no unit."""
-    if unit == "1":
-        return round(value) if whole or math.isclose(value, round(value), abs_tol=0.0) else value
-    return format_quantity(value, unit, display)

@@ -8,8 +8,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, create_model
 
 from orchestrator.config.yaml.files import missing_file, resolved
-from orchestrator.config.yaml.quantities import Quantity, format_quantity, parse_quantity
-from orchestrator.config.yaml.sections import Name, Number, Section, Text
+from orchestrator.config.yaml.quantities import Quantity, parse_quantity
+from orchestrator.config.yaml.sections import MADE, FilePath, Name, Number, Section, Text
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import Liquid
 from sim_engine.vessel.spec import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
@@ -55,7 +55,7 @@ class VesselBase(Section):
     profile: ProfileSection | None = None
     """A surface of revolution; or give `mesh`."""
 
-    mesh: Text | None = None
+    mesh: FilePath | None = None
     """A closed mesh of the vessel's solid: path of an STL, OBJ, PLY or GLB file; or give `profile`."""
 
     unit: LengthUnit | None = None
@@ -77,7 +77,9 @@ def _vessel_file() -> type[VesselBase]:
         kind: (shape | None, Field(default=None, description=inspect.getdoc(shape)))
         for kind, shape in further_sources().items()
     }
-    model: type[VesselBase] = create_model("VesselFile", __base__=VesselBase, __doc__=VesselBase.__doc__, **fields)
+    model: type[VesselBase] = create_model(
+        "VesselFile", __base__=VesselBase, __doc__=VesselBase.__doc__, __cls_kwargs__=MADE, **fields
+    )
     return model
 
 
@@ -191,31 +193,3 @@ def resolve_liquid(section: LiquidFile) -> Liquid | None:
         surface_tension=section.surface_tension,
         dynamic_viscosity=section.dynamic_viscosity,
     )
-
-
-def vessel_as_file(spec: VesselSpec) -> dict[str, object]:
-    """The vessel as a file would have it, JSON-ready, mesh paths absolute."""
-    if isinstance(spec.shape, MeshShape):
-        mesh: dict[str, object] = {"name": spec.name, "mesh": str(spec.shape.path), "up": spec.shape.up}
-        return mesh if spec.shape.unit is None else mesh | {"unit": spec.shape.unit}
-    assert isinstance(spec.shape, ProfileShape)
-    return {
-        "name": spec.name,
-        "profile": {
-            "unit": "m",
-            "inner": [list(point) for point in spec.shape.inner],
-            "wall": format_quantity(spec.shape.wall, "m", "mm"),
-            "floor": format_quantity(spec.shape.floor, "m", "mm"),
-        },
-    }
-
-
-def liquid_as_file(liquid: Liquid) -> dict[str, object]:
-    """The liquid as a file would have it, JSON-ready."""
-    return {
-        "name": liquid.name,
-        "mass": format_quantity(liquid.mass, "kg", "g"),
-        "density": format_quantity(liquid.density, "kg/m^3", "kg/m^3"),
-        "surface_tension": format_quantity(liquid.surface_tension, "N/m", "mN/m"),
-        "dynamic_viscosity": format_quantity(liquid.dynamic_viscosity, "Pa*s", "mPa*s"),
-    }

@@ -18,6 +18,7 @@ from orchestrator.results import Results
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.display import DisplayedMap
 from orchestrator.strategies.learnt import Learnt
@@ -53,6 +54,11 @@ def evaluation_of(results: Results) -> Scores | None:
 def deployments_of(results: Results) -> dict[str, Deployed]:
     """What the deployments learnt, by scene."""
     return {result.scene: result for result in all_of(results, Deployed)}
+
+
+def confirmations_of(results: Results) -> dict[str, Confirmed]:
+    """What came of pouring the recommended actions again, by scene."""
+    return {result.scene: result for result in all_of(results, Confirmed)}
 
 
 def predictions_of(results: Results) -> dict[str, Foreseen]:

@@ -15,6 +15,7 @@ from orchestrator.report.names import receiver_names
 from orchestrator.report.results import (
     SPLITS,
     calibrated_label,
+    confirmations_of,
     deployments_of,
     evaluation_of,
     predictions_of,
@@ -24,12 +25,13 @@ from orchestrator.results import AnyResult, Results
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.posterior import PosteriorSummary
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed, FrontAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
 from orchestrator.strategies.learnt import Learnt, Part
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.regimes import NotCovered
 from sim_engine.spread import Spread
 
@@ -109,6 +111,9 @@ class ReceiverSummary(Part):
     """Those that were weighed."""
 
     failed_pours: int
+    failures: tuple[str, ...]
+    """Why these failed, in the order made: 'pour 2: the gripper slipped'."""
+
     refused_pours: int
     simulations: int
     first_loss: float | None
@@ -117,6 +122,12 @@ class ReceiverSummary(Part):
     best_spillage: float | None
     best_pour: int | None
     """Number of the pour with the least loss."""
+
+    best_delivered_g: float | None
+    """That was in the receiver after it."""
+
+    best_delivered_ml: float | None
+    """The same by the liquid's density."""
 
     best_measured_action: dict[str, float | None] | None
     """Its action in display units."""
@@ -140,6 +151,15 @@ class ReceiverSummary(Part):
     window: WindowFound | None
     prediction: dict[str, Spread] | None
     """What fresh seeds of the recommended action came to, by quantity."""
+
+    predicted_delivered_g: float | None
+    """Mean over these seeds of what is in the receiver."""
+
+    predicted_delivered_ml: float | None
+    """The same by the liquid's density."""
+
+    confirmed: Confirmed | None
+    """What came of pouring the recommended action again; null where nobody asked for that."""
 
     not_covered: tuple[NotCovered, ...]
     """What is not simulated of the recommended action."""
@@ -223,8 +243,9 @@ def summarise(
         totals: how much the run took.
     """
     found = theta_of(results)
-    names, predictions = receiver_names(plan), predictions_of(results)
+    names, predictions, confirmations = receiver_names(plan), predictions_of(results), confirmations_of(results)
     spreads = {scene: foreseen.over_seeds for scene, foreseen in predictions.items()}
+    liquids = {} if plan.deployment is None else {scene.name: scene.liquid for scene in plan.deployment.scenes}
     return RunSummary(
         **dict(totals or Totals()),
         campaign=plan.name,
@@ -237,7 +258,12 @@ def summarise(
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         receivers={
             scene: _receiver(
-                names.get(scene, scene), result, spreads.get(scene), (best_not_covered or {}).get(scene, ())
+                names.get(scene, scene),
+                result,
+                spreads.get(scene),
+                (best_not_covered or {}).get(scene, ()),
+                liquids.get(scene),
+                confirmations.get(scene),
             )
             for scene, result in deployments_of(results).items()
         },
@@ -274,15 +300,23 @@ _NOTHING: dict[str, None] = dict.fromkeys(Recommended.model_fields)
 
 
 def _receiver(
-    name: str, result: Deployed, prediction: dict[str, Spread] | None, not_covered: Sequence[NotCovered]
+    name: str,
+    result: Deployed,
+    prediction: dict[str, Spread] | None,
+    not_covered: Sequence[NotCovered],
+    liquid: Liquid | None,
+    confirmed: Confirmed | None,
 ) -> ReceiverSummary:
     pours, best = result.weighed, result.best
+    received = None if prediction is None else prediction.get("received")
+    delivered = None if received is None or liquid is None else received.mean * liquid.mass
     recommended: Mapping[str, Any] = _NOTHING if result.recommended is None else dict(result.recommended)
     return ReceiverSummary(
         receiver=name,
         strategy=result.strategy,
         pours=len(pours),
         failed_pours=result.failed_pours,
+        failures=tuple(f"pour {row.number}: {row.reason}" for row in result.pours if row.status == "failed"),
         refused_pours=result.refused_pours,
         simulations=result.simulations,
         first_loss=pours[0].loss if pours else None,
@@ -290,6 +324,8 @@ def _receiver(
         best_loss=None if best is None else best.loss,
         best_spillage=None if best is None else best.spillage,
         best_pour=None if best is None else best.number,
+        best_delivered_g=None if best is None else best.delivered_g,
+        best_delivered_ml=None if best is None else best.delivered_ml,
         best_measured_action=None if best is None else best.action,
         best_action=recommended["action"],
         best_action_si=recommended["action_si"],
@@ -305,6 +341,9 @@ def _receiver(
         risk=result.risk,
         window=result.window,
         prediction=prediction,
+        predicted_delivered_g=None if delivered is None else 1e3 * delivered,
+        predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),
+        confirmed=confirmed,
         not_covered=tuple(not_covered),
     )
 

@@ -14,6 +14,7 @@ from orchestrator.report.risk import risk_line, window_line
 from orchestrator.report.summary import ReceiverSummary, RunSummary
 from orchestrator.report.trust import trust_line
 from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
+from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import FrontAction
 from sim_engine.spread import Spread
 
@@ -104,7 +105,9 @@ def _receiver_table(rows: Sequence[ReceiverSummary], unit: LossUnit) -> Renderab
         "pours": ("right", [str(row.pours or "") for row in rows]),
         "first": ("right", ["" if row.first_loss is None else unit.text(row.first_loss) for row in rows]),
         "best measured": ("right", [_best_measured(row, unit) for row in rows]),
+        "delivered": ("right", [_amount(row.best_delivered_g, row.best_delivered_ml) for row in rows]),
         "best expected": ("right", [_best_expected(row, unit) for row in rows]),
+        "confirmed": ("right", [_confirmed(row.confirmed, unit) for row in rows]),
         "best action": ("left", [style.display_values(dict(row.best_action_si or {})) for row in rows]),
     }
     table = Table(title=unit.label, title_justify="left", title_style="", box=_box())
@@ -118,6 +121,19 @@ def _receiver_table(rows: Sequence[ReceiverSummary], unit: LossUnit) -> Renderab
 
 def _best_measured(row: ReceiverSummary, unit: LossUnit) -> str:
     return "" if row.best_loss is None else f"{unit.text(row.best_loss)} (pour {row.best_pour})"
+
+
+def _confirmed(found: Confirmed | None, unit: LossUnit) -> str:
+    """'1.40 ± 0.30 % (3 pours)': the mean, and how much a pour differs from it."""
+    if found is None or found.loss is None:
+        return ""
+    count = "1 pour" if found.loss.count == 1 else f"{found.loss.count} pours"
+    return f"{unit.text(found.loss.mean, found.loss.deviation)} ({count})"
+
+
+def _amount(grams: float | None, millilitres: float | None) -> str:
+    """'193.2 g, 193.6 mL'."""
+    return "" if grams is None or millilitres is None else f"{grams:.1f} g, {millilitres:.1f} mL"
 
 
 def _best_expected(row: ReceiverSummary, unit: LossUnit) -> str:
@@ -135,7 +151,13 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
         if row.untrustworthy_simulation:
             remarks.append(Text(f"  {receiver}: {trust_line(row.trust)}", style="yellow"))
         if row.failed_pours:
-            remarks.append(Text(f"  {receiver}: {row.failed_pours} pour(s) failed", style="yellow"))
+            what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
+            why = f": {'; '.join(row.failures)}" if row.failures else ""
+            remarks.append(Text(f"  {receiver}: {what}{why}", style="yellow"))
+        if row.confirmed is not None:
+            lost = [f"pour {pour.number}: {pour.failed}" for pour in row.confirmed.pours if pour.failed]
+            if lost:
+                remarks.append(Text(f"  {receiver}, confirming pours that failed: {'; '.join(lost)}", style="yellow"))
         if row.gave_up:
             remarks.append(Text(f"  {receiver}: {row.gave_up}", style="yellow"))
         elif not _has_losses(row):
@@ -146,7 +168,9 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
         if row.window is not None:
             remarks.append(Text(f"  {receiver}, {window_line(row.window, unit)}"))
         if row.prediction is not None:
-            remarks.append(Text(f"  {receiver}, best action: {_prediction(row.prediction)}"))
+            amount = _amount(row.predicted_delivered_g, row.predicted_delivered_ml)
+            delivered = f"; delivered {amount} in the mean" if amount else ""
+            remarks.append(Text(f"  {receiver}, best action: {_prediction(row.prediction)}{delivered}"))
         for one in row.not_covered:
             remarks.append(Text(f"  {receiver}, best action, {one.kind}: {one.text}", style="yellow"))
     return remarks

@@ -26,6 +26,12 @@ class WeighedPour(Part):
     retained: float
     """Mass left in the pourer [kg]."""
 
+    delivered_g: float
+    """In the receiver: what is neither beside it nor left in the pourer."""
+
+    delivered_ml: float
+    """The same by the liquid's density."""
+
     poured_fraction: float
     """Share of the load that left the pourer."""
 
@@ -56,6 +62,7 @@ class OnePour:
 
     def __init__(self, scene: Scene, action: Action, seed: int) -> None:
         self._request = Pour(scene.name, action, 1, SeedStream(seed, "one pour").next())
+        self._liquid = scene.liquid
         self._asked = False
         self._outcome: PourMeasurement | Failed | None = None
         self.decisions = [Decision(f"one pour, as it was asked for: {action.display()}")]
@@ -101,6 +108,8 @@ class OnePour:
                     loaded=measured.loaded,
                     spilled=measured.spilled,
                     retained=measured.retained,
+                    delivered_g=1e3 * measured.delivered,
+                    delivered_ml=self._liquid.millilitres(measured.delivered),
                     poured_fraction=fractions.poured,
                     spillage=normalised_spillage(fractions),
                 )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orchestrator.journal import JOURNAL_NAME
 from orchestrator.plan import CampaignPlan, OutputPlan, RecordedPour, RecordSet
 from orchestrator.results import Results, learnt_by
 from orchestrator.stages import (
@@ -23,6 +24,7 @@ from orchestrator.stages import (
     stage_seed,
     with_posterior,
 )
+from orchestrator.strategies.calibration.c1 import C1Settings
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, draw_allowed, stratified
 from orchestrator.strategies.calibration.prior import region_of
 from orchestrator.strategies.calibration.scorecard import Scorecard
@@ -31,6 +33,7 @@ from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.study.cells import FINAL, GRID, Cell
 from orchestrator.study.plan import StudyPlan
+from orchestrator.study.record import cell_record
 from orchestrator.study.strategies import AnsweredByTable, FinalPour, SimulatedTable, Tabled
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
@@ -48,6 +51,11 @@ def campaign_of(
         load: of the cells that it needs.
         directory: of its run.
     """
+    plan, stages = _planned(study, cell, load, directory)
+    return replace(plan, resolved=cell_record(study.base.resolved, plan)), stages
+
+
+def _planned(study: StudyPlan, cell: Cell, load: Load, directory: Path) -> tuple[CampaignPlan, list[StageDefinition]]:
     base = study.base
     bench = base.laboratory.bench if not cell.level else study.level(cell.level).bench
     plan = replace(
@@ -57,17 +65,20 @@ def campaign_of(
         laboratory=replace(base.laboratory, bench=bench),
         outputs=OutputPlan(directory, rrd=False, figures=False, record_rate=0.0, recorded_simulations=0),
         on_unknown="repeat",
-        resolved={},
     )
+    match cell.kind:
+        case "grid" | "pours" if plan.calibration is not None:
+            designed = replace(plan.calibration, pour_count=study.pour_count, holdout=study.holdout)
+            plan = replace(plan, calibration=designed)
     match cell.kind:
         case "grid":
             return plan, [StageDefinition(GRID, lambda results, seed: _table(study, seed))]
         case "pours":
             return plan, [StageDefinition(POURS, lambda results, seed: _pours(study, seed), pours=True)]
         case "calibration":
-            return _calibration(study, cell, plan, load)
+            return _calibration(study, cell, plan, load, directory)
         case "uncalibrated":
-            plan = _with_pours(study, cell, plan, load)
+            plan = _with_pours(study, cell, plan, load, directory)
             return plan, [StageDefinition(EVALUATION, lambda results, seed: _score_of_default(plan, seed))]
         case "deployment":
             return _deployment(study, cell, plan, cell.needs, load)
@@ -93,7 +104,9 @@ def _actions(study: StudyPlan) -> list[Action]:
 
 def _table(study: StudyPlan, seed: int) -> Strategy:
     plan = study.calibration("C1").plan
-    middles = [[(i + 0.5) / plan.grid[name] for i in range(plan.grid[name])] for name in plan.parameters.names]
+    assert isinstance(plan.settings, C1Settings)
+    cells = plan.settings.cells
+    middles = [[(i + 0.5) / cells[name] for i in range(cells[name])] for name in plan.parameters.names]
     thetas = [
         SimulationParameters.from_values({**plan.fixed_parameters, **plan.parameters.decode(point)})
         for point in itertools.product(*middles)
@@ -108,7 +121,7 @@ def _pours(study: StudyPlan, seed: int) -> Strategy:
     return DesignedPours(plan.scene, plan.actions, len(points), study.holdout, seed, points=points)
 
 
-def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load) -> CampaignPlan:
+def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
     """The plan with the repetition's weighed pours as records."""
     calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
     assert calibration is not None
@@ -117,14 +130,14 @@ def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load) ->
         poured = pour.poured * mass
         action, spilled = calibration.scene.action(dict(pour.action_si)), (pour.spillage or 0.0) * poured
         pours.append(RecordedPour(action, poured, spilled, mass - poured, pour.split))
-    records = RecordSet(calibration.scene, tuple(pours), Path(cell.needs[0]))
+    records = RecordSet(calibration.scene, tuple(pours), directory.parent / cell.needs[0] / JOURNAL_NAME)
     return replace(plan, calibration=replace(calibration, records=records))
 
 
 def _calibration(
-    study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load
+    study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, directory: Path
 ) -> tuple[CampaignPlan, list[StageDefinition]]:
-    plan = _with_pours(study, cell, plan, load)
+    plan = _with_pours(study, cell, plan, load, directory)
     assert plan.calibration is not None
     stages = calibration_stages(plan.calibration)
     if cell.arm != "C1":

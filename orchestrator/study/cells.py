@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from orchestrator.stages import stage_seed
 from orchestrator.study.plan import StudyPlan
 
@@ -74,8 +73,7 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
         return name
 
     if any(arm.plan.strategy == "C1" for arm in study.calibrations):
-        grid = math.prod(study.calibration("C1").plan.grid.values())
-        add("grid", grid * study.pour_count, 0)
+        add("grid", study.calibration("C1").plan.settings.simulations_on(study.pour_count), 0)
     numbers = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
     for number in range(1, max(numbers) + 1):
         for level in study.levels:
@@ -87,16 +85,16 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
                     add("uncalibrated", study.pour_count, 0, pours, **place)
             for arm in arms:
                 known = arm.plan.strategy == "C1"
-                spent = 0 if known else calibration_simulations(arm.plan, train)
+                spent = 0 if known else arm.plan.settings.simulations_on(train)
                 made_of = (pours, GRID) if known else (pours,)
                 add("calibration", spent + study.pour_count, 0, *made_of, **place, arm=arm.label)
             for deployment in (a for a in study.deployments if number <= a.repetitions):
                 plan = deployment.plan
                 theta = f"calibration.{level.name}.C4.{number:02d}"
-                needs = (theta,) if plan.strategy != "D2" else ()
+                needs = (theta,) if plan.settings.simulates else ()
                 for scene in plan.scenes:
                     there: dict[str, str | int] = {**place, "arm": deployment.label, "receiver": scene.name}
-                    learnt = add("deployment", deployment_simulations(plan), plan.pours, *needs, **there)
+                    learnt = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
                     for again in range(1, study.confirm + 1):
                         add("final", 0, 1, learnt, *needs, **there, again=again)
     return tuple(cells)
@@ -104,24 +102,6 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
 
 def _name(*parts: str, numbers: Sequence[int]) -> str:
     return ".".join([*parts, *(f"{number:02d}" for number in numbers)])
-
-
-def calibration_simulations(plan: CalibrationPlan, train: int) -> int:
-    """Simulations that a calibration spends on so many training pours."""
-    if plan.strategy == "C4":
-        return plan.simulations
-    return train * (math.prod(plan.grid.values()) if plan.strategy == "C1" else plan.thetas)
-
-
-def deployment_simulations(plan: DeploymentPlan) -> int:
-    """Simulations that a deployment into one receiver spends."""
-    match plan.strategy:
-        case "D1":
-            return plan.iterations * plan.simulations_per_iteration
-        case "D3":
-            return plan.prior_simulations + plan.pours * (plan.per_pour or 0)
-        case _:
-            return 0
 
 
 def estimated_seconds(study: StudyPlan, cell: Cell) -> float:

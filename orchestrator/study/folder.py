@@ -7,7 +7,6 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from pydantic import SerializeAsAny, field_validator
 
 from orchestrator.codec import digest, first_difference, from_json, to_json
 from orchestrator.errors import RunError
-from orchestrator.fingerprint import deployment_as_begun
 from orchestrator.results import decode_result
 from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.study.cells import Cell
@@ -123,19 +121,6 @@ def opened(study: StudyPlan) -> Iterator[Path]:
         text = json.dumps(study_fingerprint(study), indent=1, ensure_ascii=False)
         write_whole(folder / SETTINGS, text + "\n")
         yield folder
-
-
-def as_begun(study: StudyPlan) -> StudyPlan:
-    """The study with what its deployments began with, where they have younger settings today that nobody asked for."""
-    path = study.folder / SETTINGS
-    if not path.is_file():
-        return study
-    before = json.loads(path.read_text(encoding="utf-8")).get("deployments", {})
-    arms = tuple(
-        replace(arm, plan=deployment_as_begun(arm.plan, before[arm.label])) if arm.label in before else arm
-        for arm in study.deployments
-    )
-    return replace(study, deployments=arms)
 
 
 def check_settings(study: StudyPlan) -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.bench.spec import VirtualBenchSpec
-from orchestrator.codec import to_json
-from orchestrator.fingerprint import fingerprint, without_newest
+from orchestrator.fingerprint import deciding, fingerprint
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 
 
@@ -112,9 +111,9 @@ def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
         "name": study.name,
         "seed": study.seed,
         "base": base,
-        "levels": {level.name: to_json(level.bench, VirtualBenchSpec) for level in study.levels},
-        "calibrations": {arm.label: without_newest(to_json(arm.plan, CalibrationPlan)) for arm in study.calibrations},
-        "deployments": {arm.label: without_newest(to_json(arm.plan, DeploymentPlan)) for arm in study.deployments},
+        "levels": {level.name: deciding(level.bench) for level in study.levels},
+        "calibrations": {arm.label: deciding(arm.plan) for arm in study.calibrations},
+        "deployments": {arm.label: deciding(arm.plan) for arm in study.deployments},
         "pours": [study.pour_count, study.holdout],
         "compared": study.compared,
     }

@@ -27,7 +27,7 @@ from orchestrator.stages import CALIBRATION
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import Cell, cells_of
 from orchestrator.study.code import code_now
-from orchestrator.study.folder import CellResult, as_begun, read_result, run_folder, write_result
+from orchestrator.study.folder import CellResult, read_result, run_folder, write_result
 from orchestrator.study.plan import StudyPlan
 
 Make = Callable[[LaboratorySpec, bool], Laboratory]
@@ -123,7 +123,7 @@ def work(path: Path, make: Make | None = None) -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     code_now()  # of the sources that this process has read, before anybody changes them
-    study = as_begun(load_study(path))
+    study = load_study(path)
     cells = {cell.id: cell for cell in cells_of(study)}
     simulators = InProcessSimulatorPool()
     make = make or in_this_process(simulators)

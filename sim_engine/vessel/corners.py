@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from sim_engine.vessel.sdf import SignedDistanceGrid
 
@@ -42,6 +42,8 @@ def equivalent_distance(
     Returns:
         Shape of the grid [m].
     """
+    from scipy import signal  # half a second to load, for those who only check a motion
+
     step = grid.spacing
     reach = int(np.ceil(support / step))
     z = grid.axes()[2]

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny
 
 from sim_engine.doors import Door
+from sim_engine.marks import BY_CONTENT
 
 LengthUnit = Literal["m", "cm", "mm", "in"]
 
@@ -66,7 +67,7 @@ class MeshShape(Shape):
     """
 
     kind: Literal["mesh"] = "mesh"
-    path: Path
+    path: Annotated[Path, BY_CONTENT]
     unit: LengthUnit | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
 

@@ -10,6 +10,7 @@ from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.load import load_campaign
 from orchestrator.plan import CampaignPlan
 from orchestrator.stages import stages_of
+from orchestrator.strategies.deployment.d3 import D3Settings
 from sim_engine.task import PoseError
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
@@ -31,7 +32,7 @@ def test_paper_has_the_budgets_of_the_paper() -> None:
     assert deployment is not None
     assert (calibration.pour_count, calibration.holdout) == (32, 4)
     assert (calibration.strategy, calibration.simulations) == ("C4", 108)
-    assert (deployment.strategy, deployment.prior_simulations, deployment.pours) == ("D3", 37, 15)
+    assert deployment.settings == D3Settings(prior_simulations=37, pours=15, per_pour=2)
     receivers = {scene.receiver.name for scene in deployment.scenes}
     assert len(receivers) == 3
     assert calibration.scene.receiver.name not in receivers
@@ -56,7 +57,7 @@ def test_a_resumed_run_of_a_shipped_campaign_is_exact_and_asks_nobody(name: str)
     campaign = plan(name)
     assert campaign.on_unknown == "repeat"
     assert campaign.deployment is not None
-    assert campaign.deployment.per_pour is not None, "with 'free' the clock decides what is asked for"
+    assert campaign.deployment.settings.order == "logical", "else the clock decides what is asked for"
     assert {stage.order for stage in stages_of(campaign)} == {"logical"}
 
 
@@ -69,6 +70,8 @@ def test_what_is_real_differs_from_what_simulation_starts_with(name: str) -> Non
     assert bench is not None
     hidden, assumed = bench.liquid.model_dump(), campaign.parameters.model_dump()
     assert any(hidden[axis] != assumed[axis] for axis in campaign.calibration.parameters.names)
+    for axis in campaign.calibration.parameters.axes:
+        assert 0.05 < axis.encode(hidden[axis.name]) < 0.95, f"{axis.name} can't be found at an end of what is searched"
     assert bench.pose_error != PoseError()
     assert bench.pose_noise != PoseError()
 

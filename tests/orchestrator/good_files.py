@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
 from orchestrator.config.load import load_campaign
+from orchestrator.config.yaml.dump import as_file
 from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.config.yaml.references import References
+from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.source import Document, Place, Report
+from orchestrator.config.yaml.validate import validate
 
 CAMPAIGN = """\
 name: test
@@ -81,3 +88,13 @@ def report(path: Path) -> str:
     with pytest.raises(ConfigError) as caught:
         load_campaign(path)
     return str(caught.value)
+
+
+def written_out(model: type[Section], text: str) -> str:
+    """A section of a text as a run's record has it."""
+    report = Report()
+    place = Place(Document.parse(dedent(text), Path("written.yaml").resolve()))
+    section = validate(model, place, report)
+    report.raise_if_any()
+    assert section is not None
+    return json.dumps(as_file(section, place, References(report), whole=False))

@@ -32,6 +32,7 @@ from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError, Scene
 from sim_engine.vessel.spec import cylinder
+from tests.orchestrator import plans
 
 Spill = Callable[[Action, SimulationParameters, np.random.Generator], float]
 """Fraction spilled of everything poured; raising ValueError makes the action invalid, NaN makes the trial fail."""
@@ -50,24 +51,24 @@ THETA = SimulationParameters()
 
 
 def calibration_plan(**changes: Any) -> CalibrationPlan:
-    plan = CalibrationPlan(
-        strategy="C4",
-        scene=SCENE,
-        actions=CALIBRATION_ACTIONS,
-        parameters=PARAMETERS,
-        fixed_parameters={"friction": 0.1},
-        pour_count=32,
-        holdout=4,
-        records=None,
-        transfer=None,
-        simulations=60,
-    )
-    return replace(plan, **changes)
+    values: dict[str, Any] = {
+        "scene": SCENE,
+        "actions": CALIBRATION_ACTIONS,
+        "parameters": PARAMETERS,
+        "fixed_parameters": {"friction": 0.1},
+        "pour_count": 32,
+        "holdout": 4,
+    }
+    if changes.get("strategy", "C4") == "C4":
+        values["simulations"] = 60
+    return plans.calibration(**values | changes)
 
 
 def deployment_plan(**changes: Any) -> DeploymentPlan:
-    plan = DeploymentPlan(strategy="D3", scenes=(SCENE,), actions=ACTIONS, loss=Loss(), pours=8, prior_simulations=20)
-    return replace(plan, **changes)
+    values: dict[str, Any] = {"scenes": (SCENE,), "actions": ACTIONS, "loss": Loss(), "pours": 8}
+    if changes.get("strategy", "D3") == "D3":
+        values["prior_simulations"] = 20
+    return plans.deployment(**values | changes)
 
 
 def executed(action: Action, error: PoseError | None) -> Action:

@@ -20,17 +20,13 @@ from orchestrator.codec import (
     encode_outcome,
     encode_request,
     first_difference,
-    from_json,
-    to_json,
 )
-from orchestrator.plan import CampaignPlan
 from orchestrator.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.space import Axis, Space
 from tests.depth import examples
-from tests.orchestrator.toy import toy_plan
 
 # Numbers below 2e-308 are no numbers of a laboratory, and a process in which Taichi has run takes them for 0.
 number = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)
@@ -145,11 +141,6 @@ def test_requests_survive_bit_for_bit(request: Simulate | Pour | Suggest) -> Non
 def test_outcomes_survive_bit_for_bit(outcome: Simulated | Poured | Suggested | Failed) -> None:
     written = encode_outcome(outcome)
     assert decode_outcome(through_json(written)) == outcome
-
-
-def test_a_whole_plan_survives(tmp_path: Any) -> None:
-    plan = toy_plan(tmp_path)
-    assert from_json(through_json(to_json(plan, CampaignPlan)), CampaignPlan) == plan
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])

@@ -21,7 +21,7 @@ from actors.protocols import PourProgress, ProgressCallback
 from actors.spec import LaboratorySpec
 from orchestrator.campaign import CampaignResult, run_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.plan import CampaignPlan, OutputPlan
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -47,6 +47,7 @@ from sim_engine.simulated import SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
+from tests.orchestrator import plans
 
 SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
 SCENE = Scene(
@@ -60,7 +61,7 @@ THETA = SimulationParameters(particles=500)
 
 
 def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
-    deployment = DeploymentPlan("D3", (SCENE,), SPACE, Loss(), pours=3, per_pour=2)
+    deployment = plans.deployment(scenes=(SCENE,), actions=SPACE, loss=Loss(), pours=3, per_pour=2)
     values: dict[str, Any] = {
         "name": "toy",
         "seed": 7,

@@ -27,7 +27,7 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.plan import CampaignPlan, OutputPlan
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -53,6 +53,7 @@ from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
+from tests.orchestrator import plans
 
 BEAKER = cylinder("beaker", inner_radius=0.035, inner_height=0.09)
 TUMBLER = Scene("tumbler", BEAKER, cylinder("tumbler", inner_radius=0.05, inner_height=0.09), Liquid(mass=0.2))
@@ -73,8 +74,19 @@ LEARNT = Foreseen(scene="narrow cup", simulations=0, simulations_lost=0, thetas=
 
 def campaign(*, pours: int = 3) -> CampaignPlan:
     """Calibration in the tumbler, D3 into the narrow cup."""
-    calibration = CalibrationPlan("C4", TUMBLER, ACTIONS, THETA, {}, 8, 2, None, None, simulations=8, initial=4)
-    deployment = DeploymentPlan("D3", (NARROW,), ACTIONS, Loss(), pours=pours, prior_simulations=6)
+    calibration = plans.calibration(
+        scene=TUMBLER,
+        actions=ACTIONS,
+        parameters=THETA,
+        fixed_parameters={},
+        pour_count=8,
+        holdout=2,
+        simulations=8,
+        initial=4,
+    )
+    deployment = plans.deployment(
+        scenes=(NARROW,), actions=ACTIONS, loss=Loss(), pours=pours, prior_simulations=6, per_pour=0
+    )
     return CampaignPlan(
         "narrow-cup",
         7,

@@ -13,6 +13,7 @@ from actors.arm.path.kinematics import beyond_reach, posture
 from actors.arm.path.limits import JOINT_NAMES, UPRIGHT
 from actors.arm.path.solids import Nearest, hull, nearest_links, nearest_to_receiver
 from actors.arm.path.stretch import Stretch
+from actors.arm.path.travel import RacingJointError
 from actors.arm.protocol import PathReport
 from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
@@ -78,6 +79,24 @@ def check_reach(unreached: Stretch) -> str:
     if distance > 0.0:
         return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer or lower{another}"
     return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it{another}"
+
+
+def check_way(racing: RacingJointError, spec: UrArmSpec) -> str:
+    """What to say about a way from home through a singularity."""
+    direction = math.degrees(spec.cell.direction)
+    facing = math.degrees(math.remainder(spec.cell.direction + racing.heading, 2.0 * math.pi))
+    turned = math.degrees(racing.turn)
+    why = (
+        f"home holds the pourer as for a direction of {facing:.0f} deg, and cell.direction is {direction:.0f} deg: the "
+        f"full pourer would be turned by {turned:.0f} deg on its way"
+        if turned >= 1.0
+        else "on the way from home"
+    )
+    cure = f"set cell.direction nearer to {facing:.0f} deg, or wait at a 'home' nearer to the pour"
+    return (
+        f"{why}, through a place where two joints turn about one axis and {JOINT_NAMES[racing.joint]} would have to "
+        f"race; {cure if turned >= 1.0 else 'move the receiver, or let the arm wait elsewhere'}"
+    )
 
 
 def report(stretches: list[Stretch], clearance: float, pourer: Vessel, deviation: float) -> PathReport:

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.joint_path import JointPath, PourPath
-from actors.arm.path.checks import check_clearance, check_reach, check_stretch, refusal, report
+from actors.arm.path.checks import check_clearance, check_reach, check_stretch, check_way, refusal, report
 from actors.arm.path.limits import check_limits
 from actors.arm.path.pace import STEEPEST, followable, pour_times
 from actors.arm.path.stretch import Phases, Stretch
-from actors.arm.path.travel import STEP, OutOfReachError, follow, home_pose, routes, travel
+from actors.arm.path.travel import STEP, OutOfReachError, RacingJointError, follow, home_pose, routes, travel
 from actors.arm.spec import UrArmSpec
-from actors.protocols import InvalidActionError
+from actors.protocols import InvalidActionError, UnreachablePlaceError
 from sim_engine.contact import rotations
 from sim_engine.motion import Phase, PourMotion, turn
 from sim_engine.vessel.vessel import Vessel
@@ -59,6 +59,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
 
     Raises:
         InvalidActionError: it must not or can't be executed; the text lists everything that was found wrong.
+        UnreachablePlaceError: likewise, and no other pour that begins in the same place can.
     """
     problems = check_limits(spec)
     if problems:
@@ -66,6 +67,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     made = followable(motion)
     phases: Phases = tuple((p.name, p.start, p.end) for p in made.phases)
     approach, approached = _approach(made.sample(np.zeros(1))[0], spec, pourer, receiver, problems)
+    barred = bool(problems)
     pour = None
     try:
         pour = _pour(made, np.array(spec.home) if approach is None else approach.joints[-1], spec)
@@ -85,7 +87,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     if pour is not None and len(pour.times) > MOST_WAYPOINTS:
         problems.append(f"the pour needs {len(pour.times)} waypoints, a controller takes {MOST_WAYPOINTS}")
     if problems or pour is None or approach is None:
-        raise InvalidActionError(refusal(problems))
+        raise (UnreachablePlaceError if barred else InvalidActionError)(refusal(problems))
     retreat = _retreat(made, approach, pour, spec)
     back = Stretch.of("retreat", retreat, spec)
     problems = check_stretch(back, pourer, receiver)
@@ -122,6 +124,8 @@ def _approach(
                 "approach", np.linspace(0.0, STEP * len(error.poses), len(error.poses)), error.poses, spec
             )
             found, distance = [check_reach(stretch)], np.inf
+        except RacingJointError as error:
+            found, distance = [check_way(error, spec)], np.inf
         else:
             nearest, found = check_clearance(stretch, path.duration, pourer, receiver)
             found += check_stretch(stretch, pourer, receiver)

@@ -27,6 +27,28 @@ STEP = 0.02
 """Between two waypoints on the way [s]."""
 
 
+MOST_TURNS = 3.0
+"""Turns of a joint along a line, at its fastest: one that passes near a singularity would make tens or thousands."""
+
+LONGEST = 60.0
+"""Of a line that a joint turns so much for [s]."""
+
+
+class RacingJointError(Exception):
+    """A line leads through a singularity: a joint would turn so much there that the way takes minutes.
+
+    Attributes:
+        joint: which, from 0.
+        heading: of the pourer where the line begins, about the world's vertical [rad]; 0 is that of a pour.
+        turn: of the pourer along the line [rad].
+        seconds: that the line would take.
+    """
+
+    def __init__(self, joint: int, heading: float, turn: float, seconds: float) -> None:
+        super().__init__("through a singularity")
+        self.joint, self.heading, self.turn, self.seconds = joint, heading, turn, seconds
+
+
 class OutOfReachError(Exception):
     """Poses that an arm can't take in the posture it is in.
 
@@ -93,6 +115,7 @@ def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSpec) -> JointP
 
     Raises:
         OutOfReachError: some pose can't be reached.
+        RacingJointError: a line passes a singularity.
     """
     times, joints = [np.zeros(1)], [near[None]]
     for a, b in pairwise(knots):
@@ -113,7 +136,8 @@ def _line(
 ) -> tuple[FloatArray, FloatArray]:
     s = np.linspace(0.0, 1.0, max(math.ceil(distance / 0.005), math.ceil(angle / math.radians(1.0)), 8) + 1)
     joints = follow(_between(a, b, s), near, spec)
-    first = np.abs(np.diff(joints, axis=0)).max() * (len(s) - 1)
+    rates = np.abs(np.diff(joints, axis=0)).max(axis=0) * (len(s) - 1)
+    first = rates.max()
     second = np.abs(np.diff(joints, n=2, axis=0)).max() * (len(s) - 1) ** 2
     reach = float(np.linalg.norm(cell_frames(spec).pourer.position)) + 0.1
     way = distance + angle * reach
@@ -125,6 +149,9 @@ def _line(
         math.sqrt(half / max(second, 1e-9)),
         0.5 * spec.limits.tilt_speed / max(angle, 1e-9),
     )
+    if first > MOST_TURNS * 2.0 * math.pi and 1.0 / speed > LONGEST:
+        heading = 2.0 * math.atan2(a[6], a[3])
+        raise RacingJointError(int(np.argmax(rates)), math.remainder(heading, 2.0 * math.pi), angle, 1.0 / speed)
     times, fraction = trapezoid(1.0, 0.98 * speed, min(TOOL_ACCELERATION / way, half / max(first, 1e-9)), STEP)
     return times, follow(_between(a, b, fraction), near, spec)
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from actors.arm.spec import ArmSpec
-from actors.protocols import InvalidActionError
+from actors.bench.planning import vessel as built
+from actors.protocols import InvalidActionError, UnreachablePlaceError
+from orchestrator.config.campaign.sense import senseless
 from orchestrator.config.yaml.errors import ConfigError, Problem
 from orchestrator.config.yaml.files import why_not_writable
 from orchestrator.config.yaml.source import Document, Loc
@@ -21,7 +24,6 @@ from sim_engine.hydrostatics import level
 from sim_engine.motion import plan_motion
 from sim_engine.space import Space
 from sim_engine.task import Scene
-from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.spec import MeshShape, VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
@@ -49,23 +51,45 @@ class _Role:
         return (*(self.section + key for key in keys), *keys, self.section)
 
 
+Place = tuple[float, float, float]
+
+
+def _place(action: Action) -> Place:
+    """Where a pour begins: what the way there depends on."""
+    return action.x_offset, action.y_offset, action.height
+
+
+def _nothing(told: object) -> None:
+    """Where nobody listens."""
+
+
 @dataclass
 class _Checker:
+    source: Path
     arm: ArmSpec | None = None
     document: Document | None = None
-    problems: list[Problem | str] = field(default_factory=list)
+    warn: Callable[[Problem], None] = _nothing
+    doing: Callable[[str], None] = _nothing
+    problems: list[Problem] = field(default_factory=list)
     vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
+    landings: dict[tuple[object, ...], float | None] = field(default_factory=dict)
 
     def add(self, places: tuple[Loc, ...], text: str) -> None:
         """Note a problem at the first of some places that the campaign's file has."""
+        self.problems.append(self.problem(places, text))
+
+    def problem(self, places: tuple[Loc, ...], text: str) -> Problem:
+        """A problem at the first of some places that the campaign's file has."""
         document = self.document
         found = None if document is None else next((loc for loc in places if loc in document.marks), None)
-        self.problems.append(text if document is None or found is None else document.problem(found, text))
+        if document is None or found is None:
+            return Problem(self.source, 0, 0, "", text)
+        return document.problem(found, text)
 
     def vessel(self, spec: VesselSpec, places: tuple[Loc, ...]) -> Vessel | None:
         if spec not in self.vessels:
             try:
-                self.vessels[spec] = build_vessel(spec)
+                self.vessels[spec] = built(spec)
             except (VesselError, OSError) as error:
                 where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
                 self.add(places, f"vessel '{spec.name}'{where}: {error}")
@@ -98,20 +122,28 @@ class _Checker:
         if vessels is None or self._never_pours(scene, trials, vessels[0], role):
             return
         first = beyond = ""
-        for chosen in trials:
+        barred: set[Place] = set()
+        for i, chosen in enumerate(trials, start=1):
+            if i > 1:
+                self.doing(f"{role.text}: {len(trials)} actions are tried, none of {i - 1} can be made")
             try:
-                contact = touch(scene, scene.action(chosen), *vessels)
+                action = scene.action(chosen)
+                if _place(action) in barred:
+                    continue
+                contact = touch(scene, action, *vessels)
             except ValueError as error:  # an action out of bounds, or a motion that can't be made
                 contact = str(error)
             if contact is None:
-                problem = self._for_the_arm(scene, scene.action(chosen), actions, *vessels)
+                problem = self._for_the_arm(scene, action, actions, barred)
                 if not problem:
+                    for places, text in senseless(plan, scene, *vessels, self.arm, self.landings):
+                        self.warn(self.problem(role.places(*places), f"{role.text}: {text}"))
                     return
                 beyond = beyond or problem
             else:
                 first = first or contact
         if beyond:
-            text = f"{role.text}: the arm can make no action that was tried; for example {beyond}"
+            text = f"{role.text}: the arm can make none of {len(trials)} actions that were tried; for example {beyond}"
             self.add(role.places(("actions",)), text)
             return
         text = (
@@ -153,13 +185,19 @@ class _Checker:
         self.add(role.places(("actions", "max_angle"), ("motion", "max_angle")), text)
         return True
 
-    def _for_the_arm(self, scene: Scene, action: Action, actions: Space, pourer: Vessel, receiver: Vessel) -> str:
-        """Why the laboratory's arm, if it has one, can't make it; '' if it can."""
+    def _for_the_arm(self, scene: Scene, action: Action, actions: Space, barred: set[Place]) -> str:
+        """Why the laboratory's arm, if it has one, can't make it; '' if it can.
+
+        Args:
+            barred: places that the arm can't get to from home, whatever it does there. Filled here.
+        """
         if self.arm is None:
             return ""
         try:
             self.arm.plan(scene, action)
         except InvalidActionError as error:
+            if isinstance(error, UnreachablePlaceError):
+                barred.add(_place(action))
             return f"{action.display(*actions.names)}: {error}"
         return ""
 
@@ -186,7 +224,13 @@ class _Checker:
                 return
 
 
-def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Problem]:
+def check_campaign(
+    plan: CampaignPlan,
+    *,
+    as_written: bool = True,
+    warn: Callable[[Problem], None] = _nothing,
+    doing: Callable[[str], None] = _nothing,
+) -> list[Problem]:
     """Build the vessels of a campaign and try its actions.
 
     Runs must find a folder. Checked for every scene: both vessels can be built and hold the liquid; some action of the
@@ -196,6 +240,8 @@ def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Probl
     Args:
         plan: of the campaign.
         as_written: whether its vessels are those of its file; places in it would else mislead.
+        warn: is told what can be run and makes little sense.
+        doing: is told what is being tried, where that takes long.
 
     Returns:
         What is wrong, with its place as far as the campaign's file has one; empty when the campaign can start.
@@ -204,7 +250,7 @@ def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Probl
         document = Document.read(plan.source) if as_written else None
     except ConfigError:
         document = None  # a plan that was never a file
-    checker = _Checker(plan.laboratory.arm, document)
+    checker = _Checker(plan.source, plan.laboratory.arm, document, warn, doing)
     at: Loc
     if (problem := why_not_writable(plan.outputs.directory)) is not None:
         checker.add((("outputs", "directory"),), problem)
@@ -224,19 +270,22 @@ def check_campaign(plan: CampaignPlan, *, as_written: bool = True) -> list[Probl
             receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
             checker.reachable(plan.deployment, scene, role)
-    whole = [p if isinstance(p, Problem) else Problem(plan.source, 0, 0, "", p) for p in checker.problems]
-    return list(dict.fromkeys(whole))
+    return list(dict.fromkeys(checker.problems))
 
 
-def check_vessels(scene: Scene) -> list[str]:
+def check_vessels(scene: Scene, source: Path) -> list[Problem]:
     """Build the vessels of one scene.
 
+    Args:
+        scene: any.
+        source: the campaign's file.
+
     Returns:
-        What is wrong (a vessel that is none, or can't hold the load), one text each.
+        What is wrong: a vessel that is none, or can't hold the load.
     """
-    checker = _Checker()
+    checker = _Checker(source)
     checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"))
-    return [str(problem) for problem in checker.problems]
+    return checker.problems
 
 
 def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:

@@ -87,10 +87,3 @@ def _kind(
             kinds = f"{KINDS[unit]} ({name}) to {KINDS[first.unit]} ({first.name})"
             raise QuantityError(f"{text!r} adds {kinds}; all terms should be of one kind")
     return first.unit, f"60 {first.display_unit}"
-
-
-def constraint_as_file(constraint: Linear) -> str:
-    """As a file would have it, exactly."""
-    terms = " ".join(f"{'-' if weight < 0 else '+'} {abs(weight)!r} * {name}" for name, weight in constraint.weights)
-    unit = ACTION_DIMENSIONS[constraint.weights[0][0]].unit
-    return f"{terms} <= {constraint.upper!r} {unit}".removeprefix("+ ")

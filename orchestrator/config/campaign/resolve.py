@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.spec import LaboratorySpec
+from orchestrator.config.campaign.record import campaign_record
 from orchestrator.config.campaign.resolve_calibration import resolve_calibration
 from orchestrator.config.campaign.resolve_deployment import resolve_deployment
 from orchestrator.config.campaign.scenes import SceneBuilder
@@ -52,6 +53,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         )
     if report.problems or laboratory is None or file.name is None:
         return None
+    directory = _directory(file.outputs.directory, root)
     in_force = default if parameters is None else default | parameters.in_force()
     return CampaignPlan(
         name=file.name,
@@ -62,7 +64,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         calibration=calibration,
         deployment=deployment,
         outputs=OutputPlan(
-            directory=_directory(file.outputs.directory, root),
+            directory=directory,
             rrd=file.outputs.rrd,
             figures=file.outputs.figures,
             record_rate=file.outputs.record_rate,
@@ -70,6 +72,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         ),
         parallel_simulations=file.parallel_simulations,
         on_unknown=file.on_unknown,
+        resolved=campaign_record(file, root, references, directory),
         laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
     )
 

@@ -5,30 +5,28 @@ from __future__ import annotations
 import ipaddress
 import math
 import re
-from typing import Any
 
 from actors.arm.geometry import ArmLimits, Cell, Mount, Plane, Pose, Vector
 from actors.arm.path.kinematics import MODELS
 from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arm_sections import (
     JOINTS,
-    ArmSection,
     CellSection,
     LimitsSection,
     PlaneSection,
     PointSection,
+    UrArmSection,
 )
-from orchestrator.config.yaml.quantities import format_quantity
 from orchestrator.config.yaml.source import Place, Report
 
-__all__ = ["ArmSection", "CellSection", "arm_as_file", "resolve_arm"]
+__all__ = ["CellSection", "UrArmSection", "resolve_arm"]
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\.?")
 
 
 def resolve_arm(
-    arm: ArmSection, cell: CellSection | None, place: Place, report: Report, *, mode: str
+    arm: UrArmSection, cell: CellSection | None, place: Place, report: Report, *, mode: str
 ) -> UrArmSpec | None:
     """The arm of a laboratory's file; what is wrong goes to the report, and then there is none.
 
@@ -87,7 +85,7 @@ def resolve_arm(
     return spec if len(report.problems) == before else None
 
 
-def _check_address(arm: ArmSection, at: Place, report: Report, mode: str) -> None:
+def _check_address(arm: UrArmSection, at: Place, report: Report, mode: str) -> None:
     if mode != "hardware":
         if arm.address is not None:
             report.add(at.at("address"), "a virtual arm has no address: remove it, or write 'mode: hardware'")
@@ -147,54 +145,3 @@ def _point(section: PointSection | None) -> Vector | None:
     if section is None or section.x is None or section.y is None or section.z is None:
         return None
     return (section.x, section.y, section.z)
-
-
-def arm_as_file(spec: UrArmSpec) -> dict[str, Any]:
-    """Arm and cell as a laboratory's file would have them, JSON-ready: the keys 'arm' and 'cell'."""
-    limits = spec.limits
-    arm: dict[str, Any] = {
-        "model": spec.model,
-        **({"address": spec.address} if spec.address else {}),
-        "mount": {
-            "tilt": format_quantity(spec.mount.tilt, "rad", "deg"),
-            "turn": format_quantity(spec.mount.turn, "rad", "deg"),
-        },
-        "tool": _pose_as_file(spec.tool),
-        "payload": format_quantity(spec.payload, "kg", "kg"),
-        "payload_centre": _point_as_file(spec.payload_centre),
-        "grip": _pose_as_file(spec.grip),
-        "home": {name: format_quantity(q, "rad", "deg") for name, q in zip(JOINTS, spec.home, strict=True)},
-        "limits": {
-            "box": {"low": _point_as_file(limits.box_low), "high": _point_as_file(limits.box_high)},
-            "planes": [
-                {"normal": list(plane.normal), "offset": format_quantity(plane.offset, "m", "mm")}
-                for plane in limits.planes
-            ],
-            "joint_speed": format_quantity(limits.joint_speed, "rad/s", "deg/s"),
-            "tool_speed": format_quantity(limits.tool_speed, "m/s", "mm/s"),
-            "tilt": format_quantity(limits.tilt, "rad", "deg"),
-            "tilt_speed": format_quantity(limits.tilt_speed, "rad/s", "deg/s"),
-            "singularity": limits.singularity,
-            "clearance": format_quantity(limits.clearance, "m", "mm"),
-        },
-        "approach_speed": format_quantity(spec.approach_speed, "rad/s", "deg/s"),
-        "approach_acceleration": format_quantity(spec.approach_acceleration, "rad/s^2", "deg/s^2"),
-        "untilt_speed": format_quantity(spec.untilt_speed, "rad/s", "deg/s"),
-        "announcement": format_quantity(spec.announcement, "s", "s"),
-        "rate": format_quantity(spec.rate, "1/s", "Hz"),
-    }
-    cell = {
-        "receiver": _point_as_file(spec.cell.receiver),
-        "direction": format_quantity(spec.cell.direction, "rad", "deg"),
-        "table": format_quantity(spec.cell.table, "m", "mm"),
-    }
-    return {"arm": arm, "cell": cell}
-
-
-def _point_as_file(point: Vector) -> dict[str, str]:
-    return {name: format_quantity(v, "m", "mm") for name, v in zip("xyz", point, strict=True)}
-
-
-def _pose_as_file(pose: Pose) -> dict[str, str]:
-    table = _point_as_file((pose.x, pose.y, pose.z))
-    return table | {name: format_quantity(getattr(pose, name), "rad", "rad") for name in ("rx", "ry", "rz")}

@@ -10,8 +10,10 @@ from typing import Annotated, ClassVar, Literal
 
 from actors.arm.geometry import ArmLimits, Cell
 from actors.arm.spec import UrArmSpec
+from orchestrator.config.laboratory.arms import ArmSettings
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Number, Section, Text
+from orchestrator.config.yaml.source import Place, Report
 
 _LIMITS = ArmLimits((0.0,) * 3, (0.0,) * 3)
 _ARM = UrArmSpec("ur10e", _LIMITS, Cell((0.0,) * 3), (0.0,) * 6)
@@ -167,7 +169,7 @@ class LimitsSection(Section):
     """Between the pourer and the receiver."""
 
 
-class ArmSection(Section):
+class UrArmSection(ArmSettings):
     """A UR arm that holds the pourer."""
 
     required: ClassVar[dict[str, str]] = {
@@ -178,6 +180,9 @@ class ArmSection(Section):
         "home": "{base: 0 deg, shoulder: -90 deg, elbow: 90 deg, wrist1: 0 deg, wrist2: -90 deg, wrist3: 0 deg}",
         "limits": "{box: {low: {x: …, y: …, z: …}, high: {x: …, y: …, z: …}}}",
     }
+
+    kind: Literal["ur"] = "ur"
+    """A UR robot; meant where there is no such key."""
 
     model: Literal["ur10", "ur10e"] | None = None
     """Which robot."""
@@ -220,6 +225,12 @@ class ArmSection(Section):
 
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = _ARM.rate
     """At which the joints are read back."""
+
+    def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> UrArmSpec | None:
+        """See `ArmSettings.resolve`."""
+        from orchestrator.config.laboratory.arm import resolve_arm
+
+        return resolve_arm(self, cell, place, report, mode=mode)
 
 
 class CellSection(Section):

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from actors.balance.doors import dialects
+from actors.balance.doors import BALANCES, dialects, kinds
 from actors.balance.placement import Placement
 from actors.balance.settling import SettlingRule
-from actors.balance.spec import AUTO, BalanceSpec, SerialBalanceSpec, parse_format
+from actors.balance.spec import AUTO, BalanceDevice, BalanceSpec, NumbersBalanceSpec, SerialBalanceSpec, parse_format
+from actors.balance.virtual_balance import BalanceSettings
 from actors.balance.virtual_serial.scale import ScaleSettings
-from orchestrator.config.yaml.quantities import Quantity, format_quantity
-from orchestrator.config.yaml.sections import PositiveCount, Section, Text
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import Choice, PositiveCount, Section, Text, tagged
 from orchestrator.config.yaml.source import Place, Report
 
 _RULE = SettlingRule()
@@ -29,7 +30,10 @@ PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=T
 USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
 """Speeds that balances can be set to [bits per second]."""
 
-DialectName: Any = Literal[(AUTO, *dialects())]  # what is installed, ours as everybody's
+
+def dialect_names() -> list[str]:
+    """What `dialect` may be: what is installed, ours as everybody's."""
+    return [AUTO, *dialects()]
 
 
 class SettlingSection(Section):
@@ -68,10 +72,49 @@ class VirtualScaleSection(Section):
 
 
 class BalanceDeviceSection(Section):
-    """The balance: where it stands, and how it is reached."""
+    """The balance: where it stands, and how it is reached.
+
+    A further kind is a class derived from this in a package, registered at the door `decant.balances` under its `kind`.
+    """
+
+    tag: ClassVar[str] = "kind"
+
+    kind: str = ""
+    """What is there; a literal in each class, and its name at the door."""
 
     placement: Literal["tray", "receiver", "everything", "manual"] = "tray"
     """What it stands under: 'tray' reads the spill, 'receiver' what was received, 'everything' what was poured; with 'manual' the operator types all weights."""  # noqa: E501
+
+    pourer: Literal["here", "elsewhere"] = "here"
+    """Where the pourer is weighed: on this balance, or on another one and typed."""
+
+    load_tolerance: PositiveMass = _BALANCE.load_tolerance
+    """How far a load may lie from the one that the campaign asks for."""
+
+    @classmethod
+    def unknown_tag(cls, word: str) -> str:
+        """Which plug-in would have it, if it could be loaded."""
+        return next((str(broken) for broken in BALANCES.broken if broken.name == word), "")
+
+    def check(self, place: Place, report: Report, *, mode: str) -> None:
+        """Complain of what makes no sense together.
+
+        Args:
+            place: where the section stands.
+            report: takes problems.
+            mode: of the laboratory, 'virtual' or 'hardware'.
+        """
+
+    def device(self) -> BalanceDevice:
+        """The settings as values, which know their driver."""
+        raise NotImplementedError
+
+
+class SerialSection(BalanceDeviceSection):
+    """A balance on a serial line."""
+
+    kind: Literal["serial"] = "serial"
+    """A balance on a serial line."""
 
     port: Text | None = None
     """Its serial port; names under /dev/serial/by-id/ stay when it is plugged in again."""
@@ -79,7 +122,7 @@ class BalanceDeviceSection(Section):
     virtual: VirtualScaleSection | None = None
     """A balance that is not there, in place of a port."""
 
-    dialect: DialectName = AUTO
+    dialect: Annotated[str, Choice(dialect_names)] = AUTO
     """How it talks; 'auto' finds out."""
 
     baud: PositiveCount | None = None
@@ -109,15 +152,64 @@ class BalanceDeviceSection(Section):
     reconnect_time: Duration = _SERIAL.reconnect_time
     """How long a port that vanished is waited for."""
 
-    pourer: Literal["here", "elsewhere"] = "here"
-    """Where the pourer is weighed: on this balance, or on another one and typed."""
+    def check(self, place: Place, report: Report, *, mode: str) -> None:
+        """See `BalanceDeviceSection.check`."""
+        if self.placement != "manual":
+            _check_line(self, place, report, mode)
+        if self.settling.deadline <= self.settling.span:
+            report.add(place.at("settling"), "nothing can settle: 'deadline' should be longer than 'span'")
 
-    load_tolerance: PositiveMass = _BALANCE.load_tolerance
-    """How far a load may lie from the one that the campaign asks for."""
+    def device(self) -> SerialBalanceSpec:
+        """See `BalanceDeviceSection.device`."""
+        return SerialBalanceSpec(
+            port=self.port or "",
+            dialect=self.dialect,
+            baud=self.baud,
+            format=self.format,
+            handshake=self.handshake,
+            settling=SettlingRule(**self.settling.model_dump()),
+            step=self.step,
+            repeatability=self.repeatability,
+            interval=self.interval,
+            answer_time=self.answer_time,
+            reconnect_time=self.reconnect_time,
+            virtual=None if self.virtual is None else ScaleSettings(**self.virtual.model_dump()),
+        )
 
 
-_OF_THE_LINE = ("port", "virtual", "dialect", "baud", "format", "handshake", "interval", "answer_time",
-                "reconnect_time", "settling", "pourer")  # fmt: skip
+class NumbersSection(BalanceDeviceSection):
+    """A balance of numbers: nothing is at its far end, and its driver is told what stands on it."""
+
+    kind: Literal["numbers"] = "numbers"
+    """A balance of numbers, on a virtual bench."""
+
+    resolution: PositiveMass = 1e-4
+    """Step of its display."""
+
+    noise: Error = 1e-4
+    """Standard deviation of a reading."""
+
+    settling_time: Duration = 1.5
+    """Until a change is shown to within a hundredth of it."""
+
+    def check(self, place: Place, report: Report, *, mode: str) -> None:
+        """See `BalanceDeviceSection.check`."""
+        if mode == "hardware":
+            report.add(place, "a laboratory of hardware weighs on a balance that is there; give its 'port'")
+        _check_step(self.resolution, self.load_tolerance, place.at("resolution"), report)
+
+    def device(self) -> NumbersBalanceSpec:
+        """See `BalanceDeviceSection.device`."""
+        return NumbersBalanceSpec(BalanceSettings(self.resolution, self.noise, 0.0, self.settling_time, 1.0))
+
+
+_TYPED = ("kind", "placement", "load_tolerance", "step", "repeatability")
+"""Keys that have a meaning where the operator types all weights."""
+
+
+def any_balance() -> Any:
+    """The section of whatever balance is installed."""
+    return tagged(kinds(), default="serial")
 
 
 def resolve_balance(section: BalanceDeviceSection, place: Place, report: Report, *, mode: str) -> BalanceSpec | None:
@@ -132,27 +224,24 @@ def resolve_balance(section: BalanceDeviceSection, place: Place, report: Report,
     before = len(report.problems)
     if section.placement == "manual":
         _check_manual(section, place, report)
-    else:
-        _check_line(section, place, report, mode)
-    if section.settling.deadline <= section.settling.span:
-        report.add(place.at("settling"), "nothing can settle: 'deadline' should be longer than 'span'")
+    section.check(place, report, mode=mode)
     if len(report.problems) > before:
         return None
     return BalanceSpec(
         placement=Placement(section.placement),
-        device=None if section.placement == "manual" else _serial(section),
+        device=None if section.placement == "manual" else section.device(),
         pourer_elsewhere=section.pourer == "elsewhere",
         load_tolerance=section.load_tolerance,
     )
 
 
 def _check_manual(section: BalanceDeviceSection, place: Place, report: Report) -> None:
-    for key in _OF_THE_LINE:
-        if key in section.model_fields_set:
+    for key, name in section.written_keys().items():
+        if name in section.model_fields_set and name not in _TYPED:
             report.add(place.at(key), "is not used with placement 'manual', where the operator types all weights")
 
 
-def _check_line(section: BalanceDeviceSection, place: Place, report: Report, mode: str) -> None:
+def _check_line(section: SerialSection, place: Place, report: Report, mode: str) -> None:
     if section.port is not None and section.virtual is not None:
         report.add(place.at("virtual"), "a balance has a 'port' or is 'virtual', not both")
     elif mode == "hardware" and section.virtual is not None:
@@ -184,53 +273,3 @@ def _check_step(step: float, tolerance: float, place: Place, report: Report) -> 
             f"a display in steps of {1e3 * step:g} g can't tell whether a load lies within load_tolerance, "
             f"{1e3 * tolerance:g} g; weigh on a finer balance, or raise load_tolerance",
         )
-
-
-def _serial(section: BalanceDeviceSection) -> SerialBalanceSpec:
-    return SerialBalanceSpec(
-        port=section.port or "",
-        dialect=section.dialect,
-        baud=section.baud,
-        format=section.format,
-        handshake=section.handshake,
-        settling=SettlingRule(**section.settling.model_dump()),
-        step=section.step,
-        repeatability=section.repeatability,
-        interval=section.interval,
-        answer_time=section.answer_time,
-        reconnect_time=section.reconnect_time,
-        virtual=None if section.virtual is None else ScaleSettings(**section.virtual.model_dump()),
-    )
-
-
-def balance_as_file(spec: BalanceSpec) -> dict[str, Any]:
-    """The balance as a file would have it, JSON-ready."""
-    table: dict[str, Any] = {"placement": str(spec.placement)}
-    if isinstance(spec.device, SerialBalanceSpec):
-        s, rule = spec.device, spec.device.settling
-        table |= {} if s.virtual is not None else {"port": s.port}
-        table |= {"dialect": s.dialect, "handshake": s.handshake}
-        table |= {key: value for key, value in (("baud", s.baud), ("format", s.format)) if value is not None}
-        table |= {} if s.step is None else {"step": format_quantity(s.step, "kg", "g")}
-        table |= {
-            "repeatability": format_quantity(s.repeatability, "kg", "g"),
-            "settling": {
-                "readings": rule.readings,
-                "span": format_quantity(rule.span, "s", "s"),
-                "steps": rule.steps,
-                "deadline": format_quantity(rule.deadline, "s", "s"),
-            },
-            "interval": format_quantity(s.interval, "s", "s"),
-            "answer_time": format_quantity(s.answer_time, "s", "s"),
-            "reconnect_time": format_quantity(s.reconnect_time, "s", "s"),
-            "pourer": "elsewhere" if spec.pourer_elsewhere else "here",
-        }
-        if (v := s.virtual) is not None:
-            table["virtual"] = {
-                "resolution": format_quantity(v.resolution, "kg", "g"),
-                "capacity": format_quantity(v.capacity, "kg", "kg"),
-                "noise": format_quantity(v.noise, "kg", "g"),
-                "drift": format_quantity(v.drift, "kg/s", "g/s"),
-                "settling_time": format_quantity(v.settling_time, "s", "s"),
-            }
-    return table | {"load_tolerance": format_quantity(spec.load_tolerance, "kg", "g")}

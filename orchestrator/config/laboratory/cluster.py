@@ -43,8 +43,3 @@ def resolve_ray(section: RaySection | None) -> RaySpec | None:
     if section is None or section.address is None:
         return None
     return RaySpec(section.address, section.bench_resource)
-
-
-def ray_as_file(spec: RaySpec) -> dict[str, object]:
-    """The cluster as a file would have it, JSON-ready."""
-    return {"address": spec.address, "bench_resource": spec.bench_resource}

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from actors.operator import OperatorSpec
-from orchestrator.config.yaml.quantities import Quantity, format_quantity
+from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Place, Report
 
@@ -57,13 +57,3 @@ def resolve_operator(section: OperatorSection, place: Place, report: Report, *, 
         reminder=section.reminder,
         deadline=section.deadline,
     )
-
-
-def operator_as_file(spec: OperatorSpec, *, mode: str) -> dict[str, Any]:
-    """The operator as a file would have it, JSON-ready."""
-    return {
-        "answers": spec.answers,
-        **({} if mode == "hardware" else {"time": format_quantity(spec.time, "s", "s")}),
-        "reminder": format_quantity(spec.reminder, "s", "s"),
-        "deadline": format_quantity(spec.deadline, "s", "s"),
-    }

@@ -7,62 +7,27 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, create_model
 
-from actors.arm.spec import ArmSpec, UrArmSpec
 from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
 from actors.spec import LaboratorySpec
-from orchestrator.config.laboratory.arm import ArmSection, CellSection, arm_as_file, resolve_arm
-from orchestrator.config.laboratory.balance import BalanceDeviceSection, balance_as_file, resolve_balance
-from orchestrator.config.laboratory.cluster import RaySection, ray_as_file, resolve_ray
-from orchestrator.config.laboratory.operator import OperatorSection, operator_as_file, resolve_operator
-from orchestrator.config.motion import parameter_quantity, value_as_file
-from orchestrator.config.yaml.quantities import Quantity, format_quantity
-from orchestrator.config.yaml.sections import Count, Name, Section, Switch
+from orchestrator.config.laboratory.arm_sections import CellSection
+from orchestrator.config.laboratory.arms import ARMS, ArmSettings
+from orchestrator.config.laboratory.balance import any_balance, resolve_balance
+from orchestrator.config.laboratory.cluster import RaySection, resolve_ray
+from orchestrator.config.laboratory.operator import OperatorSection, resolve_operator
+from orchestrator.config.motion import parameter_quantity
+from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import MADE, Count, Name, Section, Switch, tagged
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import PoseError
 
 _DEFAULT = VirtualBenchSpec(liquid=SimulationParameters())
 
-Offset = Annotated[float, Quantity("m", "1 mm", -0.05, 0.05)]
-Tilt = Annotated[float, Quantity("rad", "1 deg", -0.2, 0.2)]
 Duration = Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)]
 Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
-Factor = Annotated[float, Quantity("1", "1.02", 0.5, 1.5)]
-Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
-
-
-class PoseErrorSection(Section):
-    """How the real placement differs from the intended one."""
-
-    x: Offset = 0.0
-    """The receiver stands that much further from the pourer."""
-
-    y: Offset = 0.0
-    """… and that much sideways."""
-
-    tilt: Tilt = 0.0
-    """The pourer is held that much more tilted than commanded."""
-
-    speed_factor: Factor = 1.0
-    """Executed over commanded angular velocity."""
-
-
-class PoseNoiseSection(Section):
-    """Standard deviations of the same from pour to pour."""
-
-    x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Of the distance."""
-
-    y: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Of the sideways placement."""
-
-    tilt: Annotated[float, Quantity("rad", "0.3 deg", 0.0, 0.2)] = 0.0
-    """Of the tilt."""
-
-    speed_factor: Spread = 0.0
-    """Of executed over commanded angular velocity."""
 
 
 class BalanceSection(Section):
@@ -98,7 +63,7 @@ def hidden_liquid_model() -> type[HiddenLiquidBase]:
         for name, info in SimulationParameters.info().items()
     }
     model: type[HiddenLiquidBase] = create_model(
-        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, **fields
+        "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, __cls_kwargs__=MADE, **fields
     )
     return model
 
@@ -130,8 +95,16 @@ class BenchSection(Section):
     """Refilling, placing, wiping between two pours, in bench time; with an arm see 'operator'."""
 
 
+AnyArm: Any = tagged(ARMS.all, default="ur")
+"""Arms of all kinds that are installed."""
+
+AnyBalance: Any = any_balance()
+
+
 class LaboratoryFile(Section):
     """Where a campaign runs."""
+
+    recorded_as_given: ClassVar[bool] = True
 
     required: ClassVar[dict[str, str]] = {"name": "virtual"}
 
@@ -153,13 +126,13 @@ class LaboratoryFile(Section):
     ray: RaySection | None = None
     """The Ray cluster to run on; unless given, a private Ray on this machine."""
 
-    arm: ArmSection | None = None
-    """The arm that holds the pourer, reached over its controller's own wires, virtual or not."""
+    arm: AnyArm | None = None
+    """The arm that holds the pourer, virtual or not; its `kind` is one of those that are installed."""
 
     cell: CellSection | None = None
     """What stands where around the arm."""
 
-    balance: BalanceDeviceSection | None = None
+    balance: AnyBalance | None = None
     """The balance beside the arm."""
 
     operator: OperatorSection = OperatorSection()
@@ -182,7 +155,8 @@ def resolve_laboratory(section: LaboratoryFile, place: Place, report: Report) ->
         _check_hardware(section, place, report)
     _check_wires(section, place, report)
     operator = resolve_operator(section.operator, place.at("operator"), report, mode=section.mode)
-    arm = None if section.arm is None else resolve_arm(section.arm, section.cell, place, report, mode=section.mode)
+    written: ArmSettings | None = section.arm
+    arm = None if written is None else written.resolve(section.cell, place, report, mode=section.mode)
     balance = None
     if section.arm is not None and section.balance is not None:
         balance = resolve_balance(section.balance, place.at("balance"), report, mode=section.mode)
@@ -192,7 +166,7 @@ def resolve_laboratory(section: LaboratoryFile, place: Place, report: Report) ->
         return None  # reported already, as missing
     bench = None if section.bench is None else _bench(section.bench)
     if arm is not None and bench is not None:
-        arm, balance = replace(arm, time_scale=bench.time_scale), _paced(balance, bench.time_scale)
+        arm, balance = arm.paced(bench.time_scale), _paced(balance, bench.time_scale)
     return LaboratorySpec(
         name=section.name,
         simulators=section.simulators,
@@ -272,59 +246,3 @@ def _paced(balance: BalanceSpec | None, time_scale: float) -> BalanceSpec | None
     if balance is None or balance.device is None:
         return balance
     return replace(balance, device=balance.device.paced(time_scale))
-
-
-def laboratory_as_file(spec: LaboratorySpec) -> dict[str, object]:
-    """The laboratory as a file would have it, JSON-ready."""
-    table: dict[str, object] = {
-        "name": spec.name,
-        "mode": spec.mode,
-        "simulators": spec.simulators,
-        "in_process": spec.in_process,
-        "object_store": f"{spec.object_store_mb} MB",
-        **({} if spec.ray is None else {"ray": ray_as_file(spec.ray)}),
-        **_wires_as_file(spec.arm, spec),
-    }
-    if spec.bench is None:
-        return table
-    b = spec.bench
-    info = SimulationParameters.info()
-    liquid = b.liquid.model_dump()
-    bench: dict[str, object] = {
-        "liquid": {n: value_as_file(v, info[n].unit, info[n].unit, whole=info[n].integer) for n, v in liquid.items()},
-        "pose_error": pose_as_file(b.pose_error),
-        "pose_noise": pose_as_file(b.pose_noise),
-        "time_scale": b.time_scale,
-    }
-    if spec.arm is None:
-        bench |= {
-            "balance": {
-                "resolution": format_quantity(b.balance_resolution, "kg", "g"),
-                "noise": format_quantity(b.balance_noise, "kg", "g"),
-                "drift": format_quantity(b.balance_drift, "kg/s", "g/s"),
-                "settling_time": format_quantity(b.settling_time, "s", "s"),
-            },
-            "operator_time": format_quantity(b.operator_time, "s", "s"),
-        }
-    return table | {"bench": bench}
-
-
-def _wires_as_file(arm: ArmSpec | None, spec: LaboratorySpec) -> dict[str, object]:
-    if arm is None:
-        return {}
-    assert isinstance(arm, UrArmSpec)
-    return {
-        **arm_as_file(arm),
-        **({} if spec.balance is None else {"balance": balance_as_file(spec.balance)}),
-        "operator": operator_as_file(spec.operator, mode=spec.mode),
-    }
-
-
-def pose_as_file(pose: PoseError) -> dict[str, object]:
-    """Errors of execution, or their standard deviations, as files have them."""
-    return {
-        "x": format_quantity(pose.x, "m", "mm"),
-        "y": format_quantity(pose.y, "m", "mm"),
-        "tilt": format_quantity(pose.tilt, "rad", "deg"),
-        "speed_factor": pose.speed_factor,
-    }

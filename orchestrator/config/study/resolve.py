@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from actors.bench.spec import VirtualBenchSpec
 from actors.spec import LaboratorySpec
+from orchestrator.config.campaign.complaints import PlacedComplaints
 from orchestrator.config.yaml.source import Place, Report
-from orchestrator.fingerprint import NEW_MODEL
-from orchestrator.plan import CalibrationName, CalibrationPlan, DeploymentName, DeploymentPlan, TrustPlan
+from orchestrator.plan import CalibrationPlan, DeploymentPlan
+from orchestrator.strategies.doors import calibrations, deployments
+from orchestrator.strategies.settings import Premises
 from orchestrator.study.plan import CalibrationArm, DeploymentArm, Level
 from sim_engine.task import PoseError
 
@@ -24,25 +25,17 @@ HARDWARE = (
     "run', and name a virtual laboratory here"
 )
 
-CALIBRATION_KEYS = {
-    "per_axis": ("C1",),
-    "samples": ("C2",),
-    "iterations": ("C3",),
-    "simulations": ("C4",),
-    "initial": ("C3", "C4"),
-    "kappa": ("C3", "C4"),
-}
-BUDGET = {"C1": ("per_axis", 10), "C2": ("samples", 18), "C3": ("iterations", 59), "C4": ("simulations", 108)}
-"""What a calibration has to spend, with the paper's number as an example."""
+BUDGETS = (
+    *("grid", "per_axis", "samples", "simulations"),
+    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "per_pour", "prices", "mean"),
+)
+"""Settings that an arm does not take over from the base campaign: a study says itself what each may spend."""
 
-DEPLOYMENT_KEYS = {
-    "pours": ("D2", "D3"),
-    "iterations": ("D1",),
-    "simulations_per_iteration": ("D1",),
-    "prior_simulations": ("D3",),
-    "per_pour": ("D3",),
-    "mean": ("D2",),
+AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
+    "D2_paper": {"mean": "zero"},
+    "D3_paper": {"model": "residual", "trust": "always"},
 }
+"""What the paper's forms have otherwise than ours."""
 
 
 def bench_of(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenchSpec | None:
@@ -119,40 +112,33 @@ def calibration_arms(
     arms = []
     for written in ("C1", "C2", "C3", "C4", "C4_paper") if section is not None else ():
         arm: Any = section.value(written) if section is not None else None
-        at, name = root.at("calibration", written), cast("CalibrationName", written[:2])
-        if arm is None:
+        at, kind = root.at("calibration", written), calibrations()[written[:2]]
+        if arm is None or any(arm.value(key) is None for key in arm.required if key != "repetitions"):
             continue
-        _check_keys(arm, name, CALIBRATION_KEYS, at, report)
-        key, example = BUDGET[name]
-        budget = arm.value(key)
-        if budget is None:
-            if not report.is_broken(at.at(key)):
-                report.add(at, f"key '{key}' is missing; add for example '{key}: {example}'", key=True)
+        base_settings, changes = base.settings, arm.changes()
+        if "averaging" in kind.model_fields:
+            shared = getattr(base_settings, "averaging", "context")
+            changes["averaging"] = "noise" if written == "C4_paper" else shared
+        settings = kind.like(base_settings, without=BUDGETS, **changes)
+        budget = getattr(settings, "iterations", None) or getattr(settings, "simulations", None)
+        if (initial := getattr(settings, "initial", None)) is not None and budget is not None and initial > budget:
+            if "initial" in changes:
+                key = next(key for key in arm.required if key != "repetitions")
+                report.add(at.at("initial"), f"{initial} random θ don't fit into {key}: {budget}")
+            settings = settings.model_copy(update={"initial": budget})
+        settled = settings.settled(base.parameters.names, train, PlacedComplaints(at, report, frozenset()))
+        if settled is None:
             continue
-        changes: dict[str, Any] = {"strategy": name, "grid": {}, "thetas": 0, "averaging": "context", "prior": ()}
-        match name:
-            case "C1":
-                changes |= {"grid": dict.fromkeys(base.parameters.names, budget)}
-                changes |= {"simulations": train * budget**base.parameters.dimension}
-            case "C4":
-                averaging = "noise" if written == "C4_paper" else base.averaging
-                changes |= {"simulations": budget, "averaging": averaging, "prior": base.prior}
-            case _:
-                changes |= {"thetas": budget, "simulations": train * budget}
-        trials = budget if name in ("C3", "C4") else math.inf
-        initial = base.initial if arm.initial is None else arm.initial
-        if arm.initial is not None and initial > trials:
-            report.add(at.at("initial"), f"{initial} random θ don't fit into {key}: {budget}")
-        changes |= {"initial": int(min(initial, trials)), "kappa": base.kappa if arm.kappa is None else arm.kappa}
+        plan = replace(base, settings=settled, prior=base.prior if kind.has_prior else ())
         where = levels if written == "C4" else (compared,)
-        arms.append(CalibrationArm(_label(written), replace(base, **changes), arm.repetitions or 1, where))
+        arms.append(CalibrationArm(_label(written), plan, arm.repetitions or 1, where))
     return tuple(arms)
 
 
 def deployment_arms(
     section: Section | None,
     base: DeploymentPlan | None,
-    calibrations: tuple[CalibrationArm, ...],
+    calibrated: tuple[CalibrationArm, ...],
     root: Place,
     report: Report,
 ) -> tuple[DeploymentArm, ...]:
@@ -162,75 +148,37 @@ def deployment_arms(
     if base is None:
         report.add(root.at("deployment"), "the base campaign has no 'deployment' section to take receivers from")
         return ()
-    most = max((arm.repetitions for arm in calibrations if arm.label == "C4"), default=0)
+    most = max((arm.repetitions for arm in calibrated if arm.label == "C4"), default=0)
     arms: list[DeploymentArm] = []
     for key in ("D1", "D2", "D2_paper", "D3", "D3_paper"):
         arm: Any = section.value(key)
-        at, name = root.at("deployment", key), cast("DeploymentName", key[:2])
+        at, kind = root.at("deployment", key), deployments()[key[:2]]
         if arm is None:
             continue
-        _check_keys(arm, name, DEPLOYMENT_KEYS, at, report)
         if key == "D2_paper" and arm.mean == "constant":
             report.add(at.at("mean"), "D2_paper has the paper's mean, 'zero'; remove the key, or compare with D2")
         repetitions = arm.repetitions or 1
-        if name != "D2" and repetitions > most:
+        if kind.simulates and repetitions > most:
             report.add(
                 at.at("repetitions") if arm.repetitions is not None else at,
-                f"{name} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
+                f"{key[:2]} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
                 f"add 'calibration: {{C4: {{repetitions: {repetitions}, simulations: 108}}}}'",
             )
-        if name != "D1" and arm.pours is None:
-            if not report.is_broken(at.at("pours")):
-                report.add(at, "key 'pours' is missing; add for example 'pours: 15'", key=True)
+        if any(arm.value(needed) is None for needed in arm.required if needed != "repetitions"):
             continue
-        common = replace(
-            base,
-            strategy=name,
-            pours=1 if name == "D1" else arm.pours,
-            per_pour=0,
-            data=None,
-            model="residual",
-            trust=None,
-            plain=False,
-            # Risk and window are D1's: with them the others would be planned as D1, too.
-            risk=base.risk if name == "D1" else None,
-            tolerance=base.tolerance if name == "D1" else None,
-            mean="zero" if key == "D2_paper" else arm.mean or "constant",
-            kappa=base.kappa if arm.kappa is None else arm.kappa,
-            initial=base.initial if arm.initial is None else arm.initial,
-        )
-        if name == "D1":
-            numbers = sorted(set(arm.iterations or [15]))
-            repeats = arm.simulations_per_iteration or 2
-            if base.risk is not None and repeats < 2:
-                report.add(
-                    at.at("simulations_per_iteration"),
-                    "one simulation of each action is made as planned, so that with the campaign's 'risk' at least 2 "
-                    "are needed",
-                )
-            arms += [
-                DeploymentArm(f"D1-{n}", replace(common, iterations=n, simulations_per_iteration=repeats), repetitions)
-                for n in numbers
-            ]
-        elif name == "D3":
-            prior = 37 if arm.prior_simulations is None else arm.prior_simulations
-            beside = 2 if arm.per_pour is None else arm.per_pour
-            common = replace(common, prior_simulations=prior, per_pour=beside)
-            if key == "D3":
-                model, trust = (base.model, base.trust) if base.strategy == "D3" else (NEW_MODEL, TrustPlan())
-                common = replace(common, model=model, trust=trust)
-            arms.append(DeploymentArm(_label(key), replace(common, plain=common.model == "residual"), repetitions))
-        else:
+        changes = arm.changes() | AS_IN_THE_PAPER.get(key, {})
+        rounds = changes.pop("iterations", None)
+        settings = kind.like(base.settings, without=BUDGETS, **changes)
+        settings.check(Premises(base.actions, base.objectives is not None), PlacedComplaints(at, report, frozenset()))
+        common = replace(base, settings=settings, data=None, confirm=0)  # a study has a 'confirm' of its own
+        if rounds is None:
             arms.append(DeploymentArm(_label(key), common, repetitions))
+        for n in sorted(set(rounds or ())):
+            plan = common.with_settings(iterations=n)
+            arms.append(DeploymentArm(f"{key}-{n}", plan, repetitions))
     return tuple(arms)
 
 
 def _label(key: str) -> str:
     """What figures and folders call an arm."""
     return key.replace("_", "-")
-
-
-def _check_keys(arm: Any, name: str, belongs: dict[str, tuple[str, ...]], at: Place, report: Report) -> None:
-    for key, strategies in belongs.items():
-        if arm.value(key) is not None and name not in strategies:
-            report.add(at.at(key), f"belongs to {' and '.join(strategies)}, not to {name}; remove it", key=True)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
-from orchestrator.config.campaign.sections import Kappa
-from orchestrator.config.laboratory.sections import (
-    HiddenLiquid,
-    LaboratoryFile,
-    PoseErrorSection,
-    PoseNoiseSection,
-)
+from pydantic import Field, create_model
+
+from orchestrator.config.laboratory.sections import HiddenLiquid, LaboratoryFile
 from orchestrator.config.load import load_campaign
 from orchestrator.config.motion import Parameters, ParametersBase
+from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.study.resolve import bench_of, calibration_arms, deployment_arms, levels_of, written_levels
+from orchestrator.config.yaml.dump import as_file
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
@@ -24,6 +22,14 @@ from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
+from orchestrator.strategies.calibration.c1 import C1Settings
+from orchestrator.strategies.calibration.c2 import C2Settings
+from orchestrator.strategies.calibration.c3 import C3Settings
+from orchestrator.strategies.calibration.c4 import C4Settings
+from orchestrator.strategies.deployment.d1 import D1Settings
+from orchestrator.strategies.deployment.d2 import D2Settings
+from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.settings import StrategySettings
 from orchestrator.study.plan import StudyPlan
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
@@ -47,101 +53,90 @@ class LevelSection(Section):
     """Its scatter, drawn anew for each pour."""
 
 
-class CalibrationArmSection(Section):
-    """A calibration: how often, and what it may spend."""
+class ArmSection(Section):
+    """A strategy that is compared: how often, and what it may spend."""
 
     required: ClassVar[dict[str, str]] = {"repetitions": "10"}
 
     repetitions: PositiveCount | None = None
-    """How often it is run, each time on pours of its own."""
+    """How often it is run: a calibration each time on pours of its own, a deployment into each receiver."""
 
-    per_axis: PositiveCount | None = None
-    """C1: values of every searched parameter."""
+    def changes(self) -> dict[str, Any]:
+        """Settings of the strategy that are given here."""
+        own = type(self).model_fields.keys() - ArmSection.model_fields.keys()
+        return {name: value for name in own if (value := getattr(self, name)) is not None}
 
-    samples: PositiveCount | None = None
-    """C2: θ in all."""
 
-    iterations: PositiveCount | None = None
-    """C3: θ in all, each simulated on all training pours."""
+def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
+    """The section of an arm: some of its strategy's settings, none of which has to be given but the required ones."""
+    fields: Any = {}
+    for key in keys:
+        info = settings.model_fields[key]
+        value: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
+        fields[key] = (value | None, Field(None, description=info.description))
+    name = f"{settings.model_fields['strategy'].default}ArmSection"
+    model = create_model(name, __base__=ArmSection, __doc__=ArmSection.__doc__, **fields)
+    model.required = ArmSection.required | required
+    model.variant = settings.model_fields["strategy"].default
+    return model
 
-    simulations: PositiveCount | None = None
-    """C4: single simulated pours."""
 
-    initial: PositiveCount | None = None
-    """C3, C4: random θ before the surrogate takes over."""
+C1Arm: Any = _arm(C1Settings, "per_axis", per_axis="10")
+C2Arm: Any = _arm(C2Settings, "samples", samples="18")
+C3Arm: Any = _arm(C3Settings, "iterations", "initial", "kappa", iterations="59")
+C4Arm: Any = _arm(C4Settings, "simulations", "initial", "kappa", simulations="108")
+D2Arm: Any = _arm(D2Settings, "pours", "mean", "initial", "kappa", pours="15")
 
-    kappa: Kappa | None = None
-    """C3, C4: κ of the lower confidence bound."""
+
+class D1ArmSection(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
+    """A strategy that is compared: how often, and what it may spend."""
+
+    iterations: list[PositiveCount] = Field(default=[15])
+    """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
+
+
+class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
+    """A strategy that is compared: how often, and what it may spend."""
+
+    per_pour: Count | None = None
+    """Simulations told between two pours; not 'free', for then the clock would decide what is asked for."""
 
 
 class CalibrationsSection(Section):
     """The calibrations that are compared."""
 
-    C1: CalibrationArmSection | None = None
+    C1: C1Arm | None = None
     """Uniform grid."""
 
-    C2: CalibrationArmSection | None = None
+    C2: C2Arm | None = None
     """Stratified sampling."""
 
-    C3: CalibrationArmSection | None = None
+    C3: C3Arm | None = None
     """Bayesian optimisation, each θ on all training pours."""
 
-    C4: CalibrationArmSection | None = None
+    C4: C4Arm | None = None
     """Bayesian optimisation, one simulation an iteration; its θ* are what D1 and D3 simulate with."""
 
-    C4_paper: CalibrationArmSection | None = None
+    C4_paper: C4Arm | None = None
     """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""
-
-
-class DeploymentArmSection(Section):
-    """A deployment: how often, and what it may spend."""
-
-    required: ClassVar[dict[str, str]] = {"repetitions": "10"}
-
-    repetitions: PositiveCount | None = None
-    """How often it is run into each receiver."""
-
-    pours: PositiveCount | None = None
-    """D2, D3: real pours."""
-
-    iterations: list[PositiveCount] | None = None
-    """D1: iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
-
-    simulations_per_iteration: PositiveCount | None = None
-    """D1: simulations averaged in each."""
-
-    prior_simulations: Count | None = None
-    """D3: simulations before the first pour."""
-
-    per_pour: Count | None = None
-    """D3: simulations told between two pours."""
-
-    mean: Literal["constant", "zero"] | None = None
-    """D2: prior mean of the surrogate."""
-
-    initial: PositiveCount | None = None
-    """Random actions before the surrogate takes over."""
-
-    kappa: Kappa | None = None
-    """κ of the lower confidence bound."""
 
 
 class DeploymentsSection(Section):
     """The deployments that are compared, into each of the base campaign's receivers."""
 
-    D1: DeploymentArmSection | None = None
+    D1: D1ArmSection | None = None
     """Plan in simulation, pour once."""
 
-    D2: DeploymentArmSection | None = None
+    D2: D2Arm | None = None
     """Learn on real pours."""
 
-    D2_paper: DeploymentArmSection | None = None
+    D2_paper: D2Arm | None = None
     """D2 as in the paper: a surrogate with a zero mean."""
 
-    D3: DeploymentArmSection | None = None
+    D3: D3ArmSection | None = None
     """Real pours with a simulated prior, the campaign's model of it and check of trust."""
 
-    D3_paper: DeploymentArmSection | None = None
+    D3_paper: D3ArmSection | None = None
     """D3 as in the paper: a GP of the residual around the simulations' mean, always trusted."""
 
 
@@ -281,9 +276,9 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
 
 
 def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
-    laboratory = None
+    references, laboratory = References(report), None
     if file.laboratory is not None:
-        laboratory = References(report).laboratory(file.laboratory, root.at("laboratory"))
+        laboratory = references.laboratory(file.laboratory, root.at("laboratory"))
     if file.campaign is None:
         return None
     path = resolved(root.directory / file.campaign)
@@ -295,7 +290,10 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
     except ConfigError as error:
         report.problems.extend(error.problems)
         return None
-    base = base if laboratory is None else replace(base, laboratory=laboratory)
+    if laboratory is not None:
+        found = references.section(file.laboratory, root.at("laboratory"), LaboratoryFile)
+        record = {} if found is None else as_file(*found, references)
+        base = replace(base, laboratory=laboratory, resolved={**base.resolved, "laboratory": record})
     return base if file.parameters is None else _with_parameters(base, file.parameters, root.at("parameters"), report)
 
 

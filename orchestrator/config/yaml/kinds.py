@@ -6,6 +6,7 @@ from typing import Any
 
 from orchestrator.config.yaml.errors import Problem
 from orchestrator.config.yaml.source import Document
+from sim_engine.vessel.spec import VESSELS
 
 TELLING = {
     "study": {"mismatch", "compared", "campaign"},
@@ -26,13 +27,18 @@ NEEDED = {
 def kind_of(data: Any) -> str | None:
     """'study', 'campaign', 'vessel' or 'laboratory'; None if no key tells."""
     keys = set(data) if isinstance(data, dict) else set()
-    return next((kind for kind, telling in TELLING.items() if keys & telling), None)
+    return next((kind for kind in TELLING if keys & telling(kind)), None)
+
+
+def telling(kind: str) -> set[str]:
+    """Keys that tell a kind of file, with those that packages add."""
+    return TELLING[kind] | (set(VESSELS.names) if kind == "vessel" else set())
 
 
 def wrong_kind(document: Document, wanted: str) -> Problem | None:
     """The problem with a file that plainly is of another kind than the one wanted; None otherwise."""
     found = kind_of(document.data)
     keys = set(document.data) if isinstance(document.data, dict) else set()
-    if found is None or found == wanted or keys & TELLING[wanted]:
+    if found is None or found == wanted or keys & telling(wanted):
         return None
     return Problem(document.path, 0, 0, "", f"describes a {found}, but a {wanted} is needed here ({NEEDED[wanted]})")

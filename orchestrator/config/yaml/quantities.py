@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from orchestrator.config.yaml.errors import did_you_mean
@@ -160,9 +160,15 @@ def format_quantity(value: float, unit: str, display: str) -> str:
     return f"{value!r} {unit}"
 
 
+FROM_FILE: dict[str, Any] = {"from": "file"}
+"""Validation context of what people wrote."""
+
+
 @dataclass(frozen=True)
 class Quantity:
     """Pydantic annotation: a quantity with a unit, kept as a float in `unit`.
+
+    In a file (validated with `FROM_FILE`) the unit must be written; a program may also give the bare SI number.
 
     Attributes:
         unit: SI unit of the value; '1' for a plain number.
@@ -221,14 +227,16 @@ class Quantity:
             return f"{self.upper / factor:g}{unit} and less"
         return f"{self.lower / factor:g} … {self.upper / factor:g}{unit}"
 
-    def _validate(self, value: Any) -> float | str:
+    def _validate(self, value: Any, info: ValidationInfo) -> float | str:
+        if info.context is not FROM_FILE and isinstance(value, int | float) and not isinstance(value, bool):
+            value = f"{value!r} {self.unit}" if self.unit != "1" else value
         try:
             return self.parse(value)
         except QuantityError as error:
             raise PydanticCustomError("quantity", "{text}", {"text": str(error)}) from None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(self._validate)
+        return core_schema.with_info_plain_validator_function(self._validate)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         kind = KINDS.get(self.unit, self.unit)

@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+import functools
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    Strict,
+    Tag,
+)
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
+
+from sim_engine.marks import Mark
 
 Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
@@ -40,6 +56,36 @@ Name = Annotated[str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", m
 Text = Annotated[str, Strict(), Field(min_length=1)]
 
 
+@dataclass(frozen=True)
+class Choice:
+    """One of some words that are known once a file is read, such as the names of what is installed.
+
+    Attributes:
+        words: gives them.
+    """
+
+    words: Callable[[], Sequence[str]]
+
+    def _validate(self, value: Any) -> str:
+        words = self.words()
+        if value not in words:
+            expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
+            raise PydanticKnownError("literal_error", {"expected": expected})
+        return str(value)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self._validate)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"enum": list(self.words()), "type": "string"}
+
+
+IN_FILE = Mark("a path, relative to the file that it is written in")
+
+FilePath = Annotated[Text, IN_FILE]
+"""The path of a file or folder, relative to the file that names it."""
+
+
 class Section(BaseModel):
     """A mapping in a file.
 
@@ -52,21 +98,70 @@ class Section(BaseModel):
     required: ClassVar[dict[str, str]] = {}
     """Keys that must be given, each with an example."""
 
+    recorded_as_given: ClassVar[bool] = False
+    """Whether a run's record leaves out what was left out, because some keys may not stand beside others."""
+
+    tag: ClassVar[str] = ""
+    """Key that tells the variants of a tagged union apart; empty for a section without variants."""
+
+    variant: ClassVar[str] = ""
+    """What a section is a variant of that stands under a key of its own; so that keys of its siblings are known."""
+
+    @classmethod
+    def unknown_tag(cls, word: str) -> str:
+        """Why no variant has this tag, if more can be said than which there are."""
+        return ""
+
     @classmethod
     def written_keys(cls) -> dict[str, str]:
         """Keys as written in files, mapped to field names."""
         return {field.alias or name: name for name, field in cls.model_fields.items()}
+
+    def completed(self) -> Self:
+        """With what is meant by keys that are left out, for a run's record."""
+        return self
 
     def value(self, key: str) -> Any:
         """Value of a key as written in files; None where it was not given."""
         return getattr(self, self.written_keys()[key])
 
 
+MADE: dict[str, Any] = {"use_attribute_docstrings": False}
+"""For sections that are made from tables: no source is searched for their keys' meanings, which takes a second."""
+
 S = TypeVar("S", bound=Section)
 
 
 def _form(value: Any) -> str:
     return "path" if isinstance(value, str) else "inline"
+
+
+def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
+    """One of several sections, told apart by the key that they call their `tag`: `{strategy: D3, …}`.
+
+    Args:
+        variants: by the word that the key has; two or more.
+        default: the variant that is meant where the key is missing; with none the key must be given.
+    """
+    if not variants:
+        raise RuntimeError("Decant's own entry points are not registered; install it again (pip install -e .)")
+    key = next(iter(variants.values())).tag
+
+    def word(value: Any) -> str | None:
+        found = value.get(key, default) if isinstance(value, Mapping) else getattr(value, key, None)
+        return found if isinstance(found, str) else ""
+
+    union = functools.reduce(operator.or_, (Annotated[model, Tag(name)] for name, model in variants.items()))
+    return Annotated[union, Discriminator(word)]
+
+
+def word_or(word: str, model: type[Section]) -> Any:
+    """A section, or a word in its place."""
+
+    def form(value: Any) -> str:
+        return "word" if isinstance(value, str) else "section"
+
+    return Annotated[Annotated[Literal[word], Tag("word")] | Annotated[model, Tag("section")], Discriminator(form)]
 
 
 PathOr = Annotated[Annotated[Text, Tag("path")] | Annotated[S, Tag("inline")], Discriminator(_form)]

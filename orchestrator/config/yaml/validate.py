@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 
 from orchestrator.config.motion import EXAMPLES
 from orchestrator.config.yaml.errors import did_you_mean
+from orchestrator.config.yaml.quantities import FROM_FILE
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Loc, Place, Report
 from sim_engine.action import ACTION_DIMENSIONS
@@ -35,9 +36,10 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
         )
         return None
     _cut_empty(data, place, report)
+    guessed: set[Loc] = set()
     while True:
         try:
-            section = model.model_validate(data)
+            section = model.model_validate(data, context=FROM_FILE)
         except ValidationError as error:
             # Deepest first and last items first, so that cutting does not move what is still to be cut.
             details = sorted(
@@ -46,17 +48,77 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
             locs = [_loc_in(data, detail["loc"]) for detail in details]
             cut = False
             for detail, loc in zip(details, locs, strict=True):
+                if detail["type"] == "union_tag_invalid" and isinstance(detail["input"], dict):
+                    _guess_variant(_sections_at(model, loc, data), detail["input"], place.at(*loc), report)
+                    guessed.add(loc)
+                    cut = True
+                    continue
                 unknown = detail["type"] == "extra_forbidden"
-                report.add(place.at(*loc), _message(model, detail, loc), key=unknown)
-                if unknown and (meant := _meant(model, loc)) is not None:
-                    # Nobody needs to hear that the key is also missing.
-                    report.broken.add((place.document.path, place.at(*loc[:-1], meant).loc))
+                if unknown and (owners := _owners(model, loc, data)):
+                    if loc[:-1] not in guessed:
+                        here = _variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1]))
+                        names = " and ".join(sorted({_tag(owner) for owner in owners}))
+                        text = f"belongs to {names}, not to {' or '.join(map(_tag, here))}; remove it"
+                        report.add(place.at(*loc), text, key=True)
+                else:
+                    report.add(place.at(*loc), _message(model, detail, loc, data), key=unknown)
+                    if unknown and (meant := _meant(model, loc, data)) is not None:
+                        # Nobody needs to hear that the key is also missing.
+                        report.broken.add((place.document.path, place.at(*loc[:-1], meant).loc))
                 cut = _cut(data, loc) or cut
             if not cut:
                 return None
             continue
         _note_missing(section, place, report)
         return section
+
+
+def _guess_variant(variants: set[type[Section]], data: dict[str, Any], place: Place, report: Report) -> None:
+    """Say that the key that tells variants apart is missing or wrong; go on with the one that has most of the keys."""
+    key, word = next(iter(variants)).tag, data.get(next(iter(variants)).tag)
+    words = sorted(map(_tag, variants))
+    if word is None:
+        examples = [section.required[key] for section in variants if key in section.required]
+        text = f"key '{key}' is missing; add for example '{key}: {sorted(examples)[-1]}'"
+        report.add(place, text, key=True)
+        report.broken.add((place.document.path, place.at(key).loc))
+    else:
+        expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
+        said = next(iter(variants)).unknown_tag(word) if isinstance(word, str) else ""
+        report.add(place.at(key), said or _one_of(word, expected))
+    data[key] = max(words, key=lambda w: len(data.keys() & next(v for v in variants if _tag(v) == w).written_keys()))
+
+
+def _tag(section: type[Section]) -> str:
+    """The word that tells a variant apart from its siblings."""
+    return section.variant or str(section.model_fields[section.tag].default)
+
+
+def _variant(sections: set[type[Section]], data: Any) -> set[type[Section]]:
+    """Of the sections that may stand somewhere, those that the data there are meant to be."""
+    if not isinstance(data, dict):
+        return sections
+    return {
+        section
+        for section in sections
+        if not section.tag
+        or (_tag(section) == data[section.tag] if section.tag in data else section.tag not in section.required)
+    }
+
+
+def _owners(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
+    """The variants that have a key which the one that was written has not."""
+    variants = {section for section in _sections_at(model, loc[:-1], data) if section.tag}
+    if not variants and len(loc) > 1 and any(section.variant for section in _sections_at(model, loc[:-1], data)):
+        for parent in _sections_at(model, loc[:-2], data):
+            variants |= {s for info in parent.model_fields.values() for s in sections_in(info.annotation) if s.variant}
+    return {section for section in variants if loc[-1] in section.written_keys()}
+
+
+def _node(data: Any, loc: Loc) -> Any:
+    for part in loc:
+        data = data[part]
+    return data
 
 
 def _cut(data: Any, loc: Loc) -> bool:
@@ -113,12 +175,12 @@ def _note_missing(section: Section, place: Place, report: Report) -> None:
                     _note_missing(item, place.at(key, i), report)
 
 
-def _message(model: type[Section], detail: ErrorDetails, loc: Loc) -> str:
+def _message(model: type[Section], detail: ErrorDetails, loc: Loc, data: Any) -> str:
     context = detail.get("ctx", {})
     value = detail["input"]
     match detail["type"]:
         case "extra_forbidden":
-            return _unknown_key(model, loc)
+            return _unknown_key(model, loc, data)
         case "literal_error":
             return _one_of(value, str(context["expected"]))
         case "string_pattern_mismatch":
@@ -139,7 +201,7 @@ def _message(model: type[Section], detail: ErrorDetails, loc: Loc) -> str:
             return f"{value} is too large; at most {context['le']:g}"
         case "list_type" | "tuple_type":
             return f"should be a list [...], got {_name(value)}"
-        case "model_type" | "model_attributes_type" | "dict_type":
+        case "model_type" | "model_attributes_type" | "dict_type" | "union_tag_invalid":
             return f"should be a mapping (key: value), got {_name(value)}"
         case "missing":
             return "has too few items; should be [r, z]" if loc and isinstance(loc[-1], int) else "is missing"
@@ -149,44 +211,49 @@ def _message(model: type[Section], detail: ErrorDetails, loc: Loc) -> str:
             return str(detail["msg"])
 
 
-def _unknown_key(model: type[Section], loc: Loc) -> str:
+def _unknown_key(model: type[Section], loc: Loc, data: Any) -> str:
     key = str(loc[-1])
-    guess = _meant(model, loc)
+    guess = _meant(model, loc, data)
     if guess is not None:
         return f"unknown key; did you mean '{guess}'?"
     if key in ACTION_DIMENSIONS:
         return f"unknown key here; fix it under 'motion: {{{key}: {EXAMPLES[key]}}}' or search it under 'actions'"
     if key in EXAMPLES:
         return f"unknown key here; it belongs under 'simulator: {{parameters: {{{key}: {EXAMPLES[key]}}}}}'"
-    return f"unknown key; known here: {', '.join(sorted(_known_keys(model, loc[:-1])))}"
+    known = _keys(_variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1])))
+    return f"unknown key; known here: {', '.join(sorted(known))}"
 
 
-def _known_keys(model: type[Section], loc: Loc) -> set[str]:
-    return {name for section in _sections_at(model, loc) for name in section.written_keys()}
+def _keys(sections: set[type[Section]]) -> set[str]:
+    return {name for section in sections for name in section.written_keys()}
 
 
-def _meant(model: type[Section], loc: Loc) -> str | None:
-    return did_you_mean(str(loc[-1]), _known_keys(model, loc[:-1]))
+def _meant(model: type[Section], loc: Loc, data: Any) -> str | None:
+    """The key that a misspelt one resembles most: of the variant that was written, or of another one."""
+    variants = _sections_at(model, loc[:-1], data)
+    own = _keys(_variant(variants, _node(data, loc[:-1])))
+    return did_you_mean(str(loc[-1]), own) or did_you_mean(str(loc[-1]), _keys(variants))
 
 
-def _sections_at(model: type[Section], loc: Loc) -> set[type[Section]]:
-    """The sections that may stand at a location (several where a union is possible)."""
+def _sections_at(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
+    """The sections that may stand at a location of the data (several where a union is possible)."""
     candidates: set[type[Section]] = {model}
     for part in loc:
-        if isinstance(part, int):
-            continue
-        below: set[type[Section]] = set()
-        for candidate in candidates:
-            if part in candidate.written_keys():
-                below |= _sections_in(candidate.model_fields[candidate.written_keys()[part]].annotation)
-        candidates = below
+        if not isinstance(part, int):
+            below: set[type[Section]] = set()
+            for candidate in _variant(candidates, data):
+                if part in candidate.written_keys():
+                    below |= sections_in(candidate.model_fields[candidate.written_keys()[part]].annotation)
+            candidates = below
+        data = data[part]
     return candidates
 
 
-def _sections_in(annotation: Any) -> set[type[Section]]:
+def sections_in(annotation: Any) -> set[type[Section]]:
+    """The sections that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return {annotation} if issubclass(annotation, Section) else set()
-    return {section for argument in typing.get_args(annotation) for section in _sections_in(argument)}
+    return {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
 
 
 def _one_of(value: Any, expected: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Generic, Literal, TypeVar, cast
 
 from actors.optimizer.core.problem import Point, Suggestion
 from orchestrator.errors import LearningError
@@ -17,12 +17,16 @@ from orchestrator.strategies.display import DisplayedMap, displayed_map
 from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.settings import CalibrationSettings
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, normalised_spillage
 
 MAP_RESOLUTION = 30
+
+S = TypeVar("S", bound=CalibrationSettings)
+"""Settings of a calibration."""
 
 
 class CalibrationTrial(Part):
@@ -110,14 +114,12 @@ class Calibrated(Learnt):
     """θ*; None until the end."""
 
 
-class Calibration(ABC):
+class Calibration(ABC, Generic[S]):
     """Base of C1 to C4. Subclasses say what to try next (`_next`) and what a simulation tells (`_discrepancy`).
 
     Only pours of the split 'train' are used. A simulation that failed, or poured too little for c_s to be defined, says
     nothing and is dropped.
     """
-
-    NAME = ""
 
     def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
         """Plan the campaign.
@@ -133,7 +135,8 @@ class Calibration(ABC):
                 f"{len(self._usable)} of {len(self._train)}; make more pours, or let them tilt farther (max_angle)"
             )
         self._plan = plan
-        self._seeds = SeedStream(seed, self.NAME)
+        self._settings = cast(S, plan.settings)
+        self._seeds = SeedStream(seed, plan.strategy)
         self._questions = Questions(self._seeds)
         self._trials = Trials()
         self._width_known = False
@@ -254,7 +257,7 @@ class Calibration(ABC):
     def result(self) -> Calibrated:
         """θ* with its expected discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
         return Calibrated(
-            strategy=self.NAME,
+            strategy=self._plan.strategy,
             simulations=self._trials.answered,
             lost=self._trials.lost,
             undefined=self._undefined,

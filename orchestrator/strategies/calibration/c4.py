@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
+from orchestrator.config.yaml.sections import PositiveCount
 from orchestrator.errors import LearningError
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
@@ -13,6 +15,9 @@ from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.posterior import PosteriorFound, central, left_open, posterior_found
 from orchestrator.strategies.calibration.prior import actions_of_prior
+from orchestrator.strategies.calibration.settings import Kappa, check_initial
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.settings import CalibrationSettings, Complaints
 from orchestrator.strategies.trials import Trial
 from sim_engine.losses import MINIMUM_POURED
 
@@ -25,7 +30,56 @@ LIVE_MAP_EVERY = 10
 LIVE_MAP_RESOLUTION = 20
 
 
-class ContinuousBayesianCalibration(Calibration):
+class C4Settings(CalibrationSettings):
+    """C4: Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
+
+    has_prior: ClassVar[bool] = True
+
+    strategy: Literal["C4"] = "C4"
+    """Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
+
+    simulations: PositiveCount | None = None
+    """Single simulated pours."""
+
+    initial: PositiveCount = 8
+    """Random parameters before the surrogate takes over."""
+
+    kappa: Kappa = 2.0
+    """κ of the lower confidence bound."""
+
+    averaging: Literal["context", "noise"] = "context"
+    """context: the surrogate knows which action was simulated; noise, the paper's: its influence is noise."""
+
+    @property
+    def budget(self) -> int:
+        """Simulations, once settled."""
+        assert self.simulations is not None, "settled settings have a budget"
+        return self.simulations
+
+    @property
+    def makes_posterior(self) -> bool:
+        """Only a surrogate that knows the actions tells what else fits the pours."""
+        return self.averaging == "context"
+
+    def settled(self, searched: tuple[str, ...], train: int, complaints: Complaints) -> Self | None:
+        """As they are."""
+        if self.simulations is None:
+            text = "key 'simulations' is missing; add for example 'simulations: 108'"
+            complaints.add(text, key=True, of="simulations")
+            return None
+        check_initial(self, self.initial, self.simulations, "simulations", "simulations", complaints)
+        return None if complaints.any else self
+
+    def simulations_on(self, train: int) -> int:
+        """One an iteration, however many pours there are."""
+        return self.budget
+
+    def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
+        """The strategy itself."""
+        return ContinuousBayesianCalibration(plan, pours, seed)
+
+
+class ContinuousBayesianCalibration(Calibration[C4Settings]):
     """C4: minimise O2(θ) = E_{a~g} |c_r(a) − c_s(a, θ)| with one simulation per iteration.
 
     The measured spillage is first regressed by a GP, so that a discrepancy can be formed at any action. Every iteration
@@ -36,10 +90,10 @@ class ContinuousBayesianCalibration(Calibration):
       covers g evenly.
     * The discrepancy varies far more over actions than over θ, and |·| folds away its sign. So the surrogate is a GP of
       the signed difference c_r − c_s over (θ, a), and what is minimised is the mean over g of the absolute
-      value that it predicts (the plan's `averaging`: 'context'). With 'noise', as in the paper, the surrogate sees
+      value that it predicts (the setting `averaging`: 'context'). With 'noise', as in the paper, the surrogate sees
       |c_r − c_s| over θ alone and takes the action's influence for noise; κ is a constant then, too.
 
-    g is uniform over the box of actions unless the plan has a `prior`, but limited to where c_r is defined: actions at
+    g is uniform over the box of actions unless they have a `prior`, but limited to where c_r is defined: actions at
     which less than 5 % is expected to be poured are left out. A simulation that failed, or poured too little for c_s to
     be defined, says nothing about its neighbours and is dropped.
 
@@ -55,19 +109,14 @@ class ContinuousBayesianCalibration(Calibration):
     can be said about θ beside θ*.
     """
 
-    NAME = "C4"
-
     def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
         """Plan the campaign; only pours of the split 'train' are used.
 
         Raises:
             LearningError: fewer than two usable pours.
-            ValueError: no budget.
         """
         super().__init__(plan, measured, seed)
-        if plan.simulations < 1:
-            raise ValueError(f"calibration needs a budget of simulations, got {plan.simulations}")
-        self._knows_actions = plan.averaging == "context"
+        self._knows_actions = self._settings.averaging == "context"
         self._started = False
         self._mapped = 0
         self._actions: tuple[Point, ...] = ()
@@ -87,7 +136,7 @@ class ContinuousBayesianCalibration(Calibration):
 
     def _ask_regression(self) -> None:
         """c_r(a), and whether it is defined, along the prior's sequence of actions."""
-        count, seed = 2 * self._plan.simulations, self._seeds.next()
+        count, seed = 2 * self._settings.budget, self._seeds.next()
         plan, encode = self._plan, self._plan.actions.encode
         sequence = actions_of_prior(plan.actions, count, seed, plan.constraints, plan.prior)
         spillage, poured = Data(), Data()
@@ -103,14 +152,14 @@ class ContinuousBayesianCalibration(Calibration):
                 i
                 for i in range(len(sequence))
                 if likely is None or likely.predictions[i] - likely.prediction_deviations[i] >= MINIMUM_POURED
-            ][: self._plan.simulations]
+            ][: self._settings.budget]
             if not keep:
                 raise LearningError(
                     f"at no action of the calibration's space would {MINIMUM_POURED:.0%} of the liquid be poured, as "
                     "far as the weighed pours tell; let it tilt farther (max_angle)"
                 )
             # few places may be left where c_r is defined: they are used again
-            order = [keep[i % len(keep)] for i in range(self._plan.simulations)]
+            order = [keep[i % len(keep)] for i in range(self._settings.budget)]
             self._actions = tuple(sequence[i] for i in order)
             self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
             self.decisions.append(
@@ -128,7 +177,7 @@ class ContinuousBayesianCalibration(Calibration):
 
     def _ask_parameters(self) -> None:
         """The next θ, or θ* once the budget is spent."""
-        remaining = self._plan.simulations - len(self._trials)
+        remaining = self._settings.budget - len(self._trials)
         if remaining <= 0:
             if self._trials.idle and self._knows_actions:
                 self._ask_posterior()
@@ -137,7 +186,7 @@ class ContinuousBayesianCalibration(Calibration):
                 self._questions.put(problem, "conclude", self._settle_at_minimum)
             return
         if len(self._trials) == 0:
-            count = min(max(self._plan.initial, 1), remaining)
+            count = min(max(self._settings.initial, 1), remaining)
             problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
             self._questions.put(problem, "start", self._queue)
         elif self._trials.ready:
@@ -194,7 +243,7 @@ class ContinuousBayesianCalibration(Calibration):
             data,
             pending=() if everything else self._trials.pending(),
             acquisition=acquisition,  # type: ignore[arg-type]
-            kappa=self._plan.kappa,
+            kappa=self._settings.kappa,
             map_resolution=resolution,
             context=self._actions[:CONTEXT_SIZE] if self._knows_actions else (),
             plain=not self._knows_actions,
@@ -227,7 +276,7 @@ class ContinuousBayesianCalibration(Calibration):
 
     @property
     def _budget(self) -> int:
-        return self._plan.simulations
+        return self._settings.budget
 
     def _row(self, number: int, trial: Trial) -> TriedOnce:
         action = trial.requests[0].action

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import TypeVar
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, TriedOnPours, described
 from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.calibration.settings import DesignSettings
 from orchestrator.strategies.trials import Trial
 
 LEAST_DEFINED = 0.5
@@ -20,7 +22,11 @@ MOST_MAPPED = 1_000
 """θ from which a map is drawn: a Gaussian process of more takes minutes."""
 
 
-class DiscrepancyOverPours(Calibration):
+S = TypeVar("S", bound=DesignSettings)
+"""Settings of a strategy that tries so many θ on all pours."""
+
+
+class DiscrepancyOverPours(Calibration[S]):
     """Base of C1, C2 and C3: O1(θ) = 1/n Σ_i |r_i − c_s(a_i, θ)| over the n training pours.
 
     A pour has the same seed under every θ, so that two θ don't differ by their initial positions. A θ that failed, or
@@ -39,13 +45,8 @@ class DiscrepancyOverPours(Calibration):
         }
 
     @property
-    @abstractmethod
-    def _thetas(self) -> int:
-        """How many θ are tried."""
-
-    @property
     def _budget(self) -> int:
-        return self._thetas * len(self._usable)
+        return self._settings.thetas * len(self._usable)
 
     def _trials_at_once(self, slots: int) -> int:
         return math.ceil(slots / len(self._usable))
@@ -86,7 +87,7 @@ class DiscrepancyOverPours(Calibration):
         )
 
 
-class BestOfDesign(DiscrepancyOverPours):
+class BestOfDesign(DiscrepancyOverPours[S]):
     """Base of C1 and C2: all θ are chosen beforehand, and θ* is the one with the least O1.
 
     An optimiser is asked only for the map. `predicted_deviation` is the standard error of θ*'s mean over the pours.
@@ -102,7 +103,8 @@ class BestOfDesign(DiscrepancyOverPours):
         if not self._trials.all:
             for point in self._design():
                 self._try(point)
-            text = f"{self.NAME}: {self._thetas} θ on {len(self._usable)} pours, {self._budget} simulations"
+            text = f"{self._plan.strategy}: {self._settings.thetas} θ on {len(self._usable)} pours"
+            text += f", {self._budget} simulations"
             self.decisions.append(Decision(text))
         elif self._trials.idle:
             self._conclude()

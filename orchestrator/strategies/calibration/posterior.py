@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from actors.optimizer.core.problem import Point, Posterior
 from orchestrator.strategies.learnt import Part
@@ -129,6 +128,8 @@ def central(posterior: Posterior) -> Point:
 
     Source: Kaufman & Rousseeuw, Clustering by means of medoids, 1987.
     """
+    from scipy.spatial.distance import cdist  # for those who only read results it takes long to load
+
     points = np.array(posterior.points)
     low, high = region(points)
     inside = points[np.all((points >= low) & (points <= high), axis=1)]

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Generic, TypeVar, cast
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
 from orchestrator.plan import DeploymentPlan
@@ -28,11 +28,13 @@ from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.deployment.pours import Foretold, PourTrial, former_pours, trust
+from orchestrator.strategies.deployment.settings import SearchSettings
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
 from orchestrator.strategies.display import displayed_action, displayed_map
 from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.settings import DeploymentSettings
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.action import Action, described
@@ -46,8 +48,11 @@ many simulations before others count against the budget."""
 
 MAP_RESOLUTION = 25
 
+S = TypeVar("S", bound=DeploymentSettings)
+"""Settings of a deployment."""
 
-class Deployment(ABC):
+
+class Deployment(ABC, Generic[S]):
     """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
 
     An action that can't be made, because the vessels touch or the arm can't reach, is refused before anything is
@@ -56,17 +61,14 @@ class Deployment(ABC):
     moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
     """
 
-    NAME = ""
-    LEARNS_ON_POURS = True
-    """Whether real pours, also those of before, enter its surrogate."""
-
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         self._plan = plan
-        self._data = plan.data if self.LEARNS_ON_POURS else None
+        self._settings = cast(S, plan.settings)
+        self._data = plan.data if plan.settings.learns_on_pours else None
         self._scene = scene
         self._parameters = parameters
         self._costing = Costing.of(plan, scene, parameters)
-        self._seeds = SeedStream(seed, f"{self.NAME} {scene.name}")
+        self._seeds = SeedStream(seed, f"{plan.strategy} {scene.name}")
         self._compromise = Compromise(self._costing, self._seeds.rng)
         self._questions = Questions(self._seeds)
         self._trials = Trials()
@@ -96,20 +98,26 @@ class Deployment(ABC):
         if not self._width_known and slots.simulations > 0:
             self._trials.width, self._width_known = slots.simulations, True
         simulations = self._trials.issue(slots.simulations)
-        pours: list[Pour] = []
-        if self._queued_pour is not None and slots.pours > 0:
-            pours, self._pouring, self._queued_pour = [self._queued_pour], self._queued_pour, None
+        pours = self._issued_pour(slots)
         if not self._finished and self._may_think and self._queued_pour is None:
             self._next(slots.simulations - len(simulations))
+            pours += self._issued_pour(slots)
         # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
         return [*self._questions.issue(), *pours, *simulations]
+
+    def _issued_pour(self, slots: Slots) -> list[Pour]:
+        """The queued pour, if there is one and the arm is free."""
+        if self._queued_pour is None or self._pouring is not None or slots.pours < 1:
+            return []
+        self._pouring, self._queued_pour = self._queued_pour, None
+        return [self._pouring]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """What came of a question, a simulation or a pour."""
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            avoided = self._avoids and request.pose_error is None  # under an error, touching is what may happen
+            avoided = request.pose_error is None  # under an error, touching is what may happen
             if avoided and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
                 self._trials.settle(request, None, refused=True)
             else:
@@ -147,8 +155,7 @@ class Deployment(ABC):
                 trial.mishap = kind == "pour_failed"
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
-        penalised = self._plan.on_failed_pour == "penalise"
-        if (not self._avoids) if trial.status == "refused" else penalised:
+        if trial.status == "failed" and self._settings.on_failed_pour == "penalise":
             trial.cost, trial.vector = self._costing.worst, self._costing.worst_vector
 
     # -- pieces for subclasses -------------------------------------------------------------------------------------
@@ -165,7 +172,7 @@ class Deployment(ABC):
         name, parameters = self._scene.name, self._parameters
         return tuple(Simulate(name, action, parameters, self._seeds.next(), purpose) for _ in range(repeats))
 
-    def _pour(self, suggestion: Suggestion, point: Point, prediction: Prediction | None) -> None:
+    def _pour(self, point: Point, prediction: Prediction | None) -> None:
         """Queue a pour."""
         values = self._plan.actions.decode(point)
         noise = 0.0 if prediction is None or prediction.scatter is None else prediction.scatter
@@ -191,7 +198,7 @@ class Deployment(ABC):
         if suggestion.means and not self._compromise.exploring:
             noise = suggestion.noises[0] if suggestion.noises else None
             known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise))
-        self._pour(suggestion, suggestion.points[0], known)
+        self._pour(suggestion.points[0], known)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
         """Standard deviation of one observation around the surrogate [the loss' unit]: from pour to pour, or in
@@ -225,13 +232,9 @@ class Deployment(ABC):
         return former + sum(p.status in ("weighed", "failed") for p in self._pours)
 
     @property
-    def _avoids(self) -> bool:
-        return self._plan.refusals == "avoid"
-
-    @property
     def _warned(self) -> bool:
         """Pours that went wrong are warnings of more near them; in the paper they are pours that lost everything."""
-        return self._avoids and not self._plan.plain
+        return True
 
     @property
     def _refused(self) -> int:
@@ -299,15 +302,16 @@ class Deployment(ABC):
             changes: fields of the problem.
         """
         trials = self._trials.counting(everything=everything)
+        if isinstance(self._settings, SearchSettings):
+            changes = {"kappa": self._settings.kappa} | changes
         return SuggestProblem(
             self._plan.actions,
             data,
-            kappa=self._plan.kappa,
             constraints=self._plan.constraints,
             infeasible=tuple(trial.point for trial in trials if trial.refused),
-            refused=tuple(p.point for p in self._pours if p.status == "refused") if self._avoids else (),
+            refused=tuple(p.point for p in self._pours if p.status == "refused"),
             failed=tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
-            noise=self._plan.noise,
+            noise=self._settings.noise,
             **changes,
         )
 
@@ -333,13 +337,13 @@ class Deployment(ABC):
         names, front = self._compromise.names, self._compromise.front
         latest = self._final or self._latest_map
         return Deployed(
-            strategy=self.NAME,
+            strategy=self._plan.strategy,
             scene=self._scene.name,
             loss=self._plan.loss_name,
             simulations=self._trials.answered,
             simulations_lost=self._trials.lost,
             simulations_refused=sum(trial.refused for trial in self._trials.all),
-            pours=tuple(p.row(names) for p in self._pours if p.status != "pouring"),
+            pours=tuple(p.row(names, self._scene.liquid) for p in self._pours if p.status != "pouring"),
             simulated=tuple(
                 SimulatedAction(action_si=self._plan.actions.decode(trial.point), loss=trial.cost)
                 for trial in self._trials.all

@@ -5,14 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
+from orchestrator.config.yaml.sections import Count, PositiveCount
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.deployment.window import SafeWindow, WindowFound
+from orchestrator.strategies.deployment.risk import Disturbances, Draw, RiskSettings
+from orchestrator.strategies.deployment.settings import SearchSettings
+from orchestrator.strategies.deployment.window import SafeWindow, WindowFound, WindowSettings
 from orchestrator.strategies.progress import Progress
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.settings import Complaints, Premises
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial
 from sim_engine.action import Action, described
@@ -26,7 +31,76 @@ FEWEST_CHECKS = 2
 """Simulations of an action that is to lie inside the safe window; `simulations_per_iteration` where that is more."""
 
 
-class OneShotPlanning(Deployment):
+class D1Settings(SearchSettings):
+    """D1: plan in simulation, then pour once."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "D1"}
+    learns_on_pours: ClassVar[bool] = False
+
+    strategy: Literal["D1"] = "D1"
+    """Plan in simulation, then pour once."""
+
+    pours: Count = 1
+    """Whether it pours what it has planned; 0 only plans."""
+
+    iterations: PositiveCount | None = None
+    """Iterations of the optimiser; 15 unless given, 30 with 'risk'."""
+
+    simulations_per_iteration: PositiveCount = 2
+    """Simulations averaged in each, under 'risk' one as planned and the others under errors."""
+
+    risk: RiskSettings | None = None
+    """Errors of execution, and of θ, that the action has to bear."""
+
+    window: WindowSettings | None = None
+    """Look for the safe window around the action, and check it by simulations."""
+
+    @property
+    def rounds(self) -> int:
+        """Iterations of the optimiser."""
+        return self.iterations or (15 if self.risk is None else 30)
+
+    @property
+    def needs_posterior(self) -> bool:
+        """If the action has to bear not knowing θ."""
+        return self.risk is not None and self.risk.theta == "posterior"
+
+    @property
+    def simulations(self) -> int:
+        """Those of all iterations."""
+        return self.rounds * self.simulations_per_iteration
+
+    @property
+    def spending(self) -> str:
+        """What it spends into one receiver, in words."""
+        return f"{self.rounds} iterations of {self.simulations_per_iteration} simulations, one pour"
+
+    def check(self, premises: Premises, complaints: Complaints) -> None:
+        """Risk and window are about a loss, and risk names something that could go wrong."""
+        for key, value in (("risk", self.risk), ("window", self.window)):
+            if value is not None and premises.objectives:
+                complaints.add("is about a loss; it can't be combined with 'objectives'", key, key=True)
+        if self.risk is None:
+            return
+        self.risk.check(complaints)
+        if self.simulations_per_iteration == 1:
+            text = "one simulation of each action is made as planned, so that with 'risk' at least 2 are needed"
+            complaints.add(text, "simulations_per_iteration")
+
+    def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
+        """Errors and θ that the action had to bear."""
+        if self.risk is None:
+            return ()
+        return Disturbances(self.risk, plan.actions, parameters, seed, plan.thetas).draws(count)
+
+    def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
+        """The strategy itself."""
+        from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+
+        return (OneShotPlanning if self.risk is None else RobustPlanning)(plan, scene, parameters, seed)
+
+
+class OneShotPlanning(Deployment[D1Settings]):
     """D1: minimise the simulated loss, then pour once. Needs no sensor.
 
     Bayesian optimisation of f̄_s(a) = 1/m1 Σ_j f_s(a, seed_j), with m1 simulations an iteration, started at Sobol points
@@ -37,9 +111,6 @@ class OneShotPlanning(Deployment):
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D1); that m1 simulations are averaged is our reading.
     Limitations: an error of the simulator is an error of the plan.
     """
-
-    NAME = "D1"
-    LEARNS_ON_POURS = False
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
@@ -65,8 +136,8 @@ class OneShotPlanning(Deployment):
             self._spillages[request] = normalised_spillage(outcome.outcome.fractions)
 
     def _next(self, free_simulations: int) -> None:
-        done, wanted = self._spent, max(self._plan.iterations, 1)
-        repeats = max(self._plan.simulations_per_iteration, 1)
+        done, wanted = self._spent, self._settings.rounds
+        repeats = self._settings.simulations_per_iteration
         if self._width_known and self._trials.all == []:
             # slots count simulations, a trial takes `repeats` of them
             self._trials.width = math.ceil(self._trials.width / repeats)
@@ -80,12 +151,12 @@ class OneShotPlanning(Deployment):
         elif self._final is not None:
             if self._pouring is not None:
                 return
-            if self._counted == 0 and self._avoids and self._pours_left:  # it was refused
+            if self._counted == 0 and self._pours_left:  # it was refused
                 self._recommend_again()
             else:  # the one pour has been weighed
                 self._finish()
         elif len(self._trials) == 0:
-            count = min(max(self._plan.initial, 1), max(wanted - 1, 1))
+            count = min(max(self._settings.initial, 1), max(wanted - 1, 1))
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif done < wanted - 1:
             if self._trials.ready:
@@ -110,10 +181,11 @@ class OneShotPlanning(Deployment):
         self._final, self._searched = suggestion, list(self._trials.all)
         if suggestion.best_point is None:
             self._finish()  # too few simulations succeeded; the result says how many were lost
-        elif self._plan.tolerance is None:
+        elif self._settings.window is None:
             self._use(suggestion)
         else:
-            window = SafeWindow(self._plan.actions, suggestion.best_point, self._tolerated(self._plan.tolerance))
+            tolerated = self._tolerated(self._settings.window.tolerated)
+            window = SafeWindow(self._plan.actions, suggestion.best_point, tolerated)
             problem = replace(self._model(everything=True, count=0), predict_at=window.places)
 
             self._questions.put(problem, "window", lambda outline: self._outlined(window, problem, outline))
@@ -123,7 +195,7 @@ class OneShotPlanning(Deployment):
         if self._plan.pours < 1 or suggestion.best_point is None:
             self._finish()
         else:
-            self._pour(suggestion, suggestion.best_point, self._prediction(suggestion))
+            self._pour(suggestion.best_point, self._prediction(suggestion))
 
     def _prediction(self, suggestion: Suggestion) -> Prediction | None:
         """Of the pour of what is recommended."""
@@ -168,7 +240,7 @@ class OneShotPlanning(Deployment):
     @property
     def _checks(self) -> int:
         """Simulations of one place."""
-        return max(self._plan.simulations_per_iteration, FEWEST_CHECKS)
+        return max(self._settings.simulations_per_iteration, FEWEST_CHECKS)
 
     def _checking(self, action: Action, worst: Sequence[int], repeats: int) -> tuple[Simulate, ...]:
         """Simulations that tell whether an action is inside the window; `worst`: see `RiskAnswer`."""
@@ -177,15 +249,15 @@ class OneShotPlanning(Deployment):
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
         """Of a single seed: what is observed here are means of m1 of them."""
         of_means = super()._scatter(suggestion, noise)
-        return None if of_means is None else of_means * math.sqrt(max(self._plan.simulations_per_iteration, 1))
+        return None if of_means is None else of_means * math.sqrt(self._settings.simulations_per_iteration)
 
     def progress(self) -> Progress:
         """Simulations and pours done, and in all."""
-        repeats = max(self._plan.simulations_per_iteration, 1)
+        repeats = self._settings.simulations_per_iteration
         pours = 1 if self._plan.pours else 0
         answered = self._trials.answered - repeats * self._unspent
         checks = 0 if self._window is None else sum(len(t.requests) for t in self._trials.all[len(self._searched) :])
-        return Progress(answered, max(self._plan.iterations, 1) * repeats + checks, self._counted, pours)
+        return Progress(answered, self._settings.rounds * repeats + checks, self._counted, pours)
 
     def _spillage(self, point: Point) -> Spread | None:
         """These seeds took part in choosing the action; `orchestrator.strategies.repeats` has fresh ones."""

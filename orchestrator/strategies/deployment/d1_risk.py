@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from actors.optimizer.core.problem import Data, Point, Risk, Suggestion, SuggestProblem
-from orchestrator.plan import DeploymentPlan, RiskPlan
+from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Failed, Outcome, Prediction, Request, Simulate
 from orchestrator.strategies.deployment.base import MAX_REFUSED, Deployment
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
@@ -45,11 +45,11 @@ class RobustPlanning(OneShotPlanning):
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        assert plan.risk is not None
-        self._risk: RiskPlan = plan.risk
-        self._disturbances = Disturbances(plan.risk, plan.actions, parameters, self._seeds.next())
-        trials = max(plan.iterations, 1) + MAX_REFUSED
-        self._sequence = self._disturbances.draws(trials * max(plan.simulations_per_iteration, 1))
+        assert self._settings.risk is not None
+        self._risk = self._settings.risk
+        self._disturbances = Disturbances(self._risk, plan.actions, parameters, self._seeds.next(), plan.thetas)
+        trials = self._settings.rounds + MAX_REFUSED
+        self._sequence = self._disturbances.draws(trials * self._settings.simulations_per_iteration)
         self._used = 0
         self._draws: dict[Simulate, Draw] = {}
         self._touching: set[Action] = set()
@@ -77,7 +77,7 @@ class RobustPlanning(OneShotPlanning):
 
     @property
     def _checks(self) -> int:
-        return max(self._plan.simulations_per_iteration, FEWEST_DRAWS)
+        return max(self._settings.simulations_per_iteration, FEWEST_DRAWS)
 
     @property
     def _check_draws(self) -> list[Draw]:
@@ -173,5 +173,5 @@ class RobustPlanning(OneShotPlanning):
             value=final.best_mean,
             expected=known[0],
             spread=known[1],
-            thetas=len(self._risk.thetas) if self._risk.theta == "posterior" else 0,
+            thetas=len(self._plan.thetas) if self._risk.theta == "posterior" else 0,
         )

@@ -2,11 +2,35 @@
 
 from __future__ import annotations
 
+from typing import ClassVar, Literal
+
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
+from orchestrator.plan import DeploymentPlan
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment.settings import SearchSettings
+from orchestrator.strategies.protocol import Strategy
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import Scene
 
 
-class RealOnly(Deployment):
+class D2Settings(SearchSettings):
+    """D2: learn on real pours."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "D2"}
+    simulates: ClassVar[bool] = False
+
+    strategy: Literal["D2"] = "D2"
+    """Learn on real pours."""
+
+    mean: Literal["constant", "zero"] = "constant"
+    """Prior mean of the surrogate; the paper's is 'zero'."""
+
+    def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
+        """The strategy itself."""
+        return RealOnly(plan, scene, parameters, seed)
+
+
+class RealOnly(Deployment[D2Settings]):
     """D2: Bayesian optimisation on weighed pours, without simulation: the baseline.
 
     The surrogate has a constant mean by default; `mean: zero` is the paper's. On a cost in [0, 1] that is minimised, a
@@ -15,28 +39,26 @@ class RealOnly(Deployment):
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D2).
     """
 
-    NAME = "D2"
-
     def _next(self, free_simulations: int) -> None:
         if self._pouring is not None:
             return
         self._compromise.weigh(exploring=self._pours_left)
         if self._pours_left:
-            made = [p for p in self._pours if not (self._avoids and p.status == "refused")]
+            made = [p for p in self._pours if p.status != "refused"]
             known = [*(point for point, _ in self._former), *(p.point for p in made)]
-            if len(known) < min(self._plan.initial, self._plan.pours):
+            if len(known) < min(self._settings.initial, self._plan.pours):
                 # one Sobol sequence, point by point, each far from those poured
                 tried = Data(tuple(known), tuple(0.0 for _ in known))
                 self._questions.put(self._problem(tried, acquisition="sobol"), "start", self._start)
             else:
-                problem = self._problem(self._real(), mean=self._plan.mean, map_resolution=MAP_RESOLUTION)
+                problem = self._problem(self._real(), mean=self._settings.mean, map_resolution=MAP_RESOLUTION)
                 self._questions.put(problem, "pour", self._pour_first)
         else:
-            problem = self._problem(self._real(), mean=self._plan.mean, count=0, map_resolution=MAP_RESOLUTION)
+            problem = self._problem(self._real(), mean=self._settings.mean, count=0, map_resolution=MAP_RESOLUTION)
             self._questions.put(problem, "conclude", self._conclude)
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
-        return self._problem(poured, mean=self._plan.mean)
+        return self._problem(poured, mean=self._settings.mean)
 
     def _start(self, suggestion: Suggestion) -> None:
-        self._pour(suggestion, suggestion.points[0], None)
+        self._pour(suggestion.points[0], None)

@@ -3,26 +3,106 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from actors.optimizer.core.problem import Data, MeanName, Suggestion, SuggestProblem
-from orchestrator.plan import DeploymentPlan, ModelName
+from orchestrator.config.yaml.sections import Count, CountOrFree
+from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
 from orchestrator.strategies.deployment.pours import Foretold, PourTrial
-from orchestrator.strategies.deployment.trust import Compared, TrustCheck
+from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.deployment.settings import SearchSettings
+from orchestrator.strategies.deployment.trust import Compared, TrustCheck, TrustOrAlways, TrustSettings
 from orchestrator.strategies.progress import Progress
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.settings import Complaints, Premises
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
-MEANS: dict[ModelName, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
+if TYPE_CHECKING:
+    from orchestrator.flights import Order
+
+MEANS: dict[str, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
 """How the optimiser calls the models."""
 
 WIDENING = 3.0
 """Factor on the noise that simulations are expected to have, once they were found wrong."""
 
 
-class Hybrid(Deployment):
+class D3Settings(SearchSettings):
+    """D3: real pours with a simulated prior."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "D3"}
+
+    strategy: Literal["D3"] = "D3"
+    """Real pours with a simulated prior."""
+
+    prior_simulations: Count = 37
+    """Simulations before the first pour; with 'per_pour: free' at most so many."""
+
+    per_pour: CountOrFree = 2
+    """Simulations told between two pours; 'free': for as long as they are worth it."""
+
+    prices: PricesSettings | None = None
+    """With 'per_pour: free': what a pour and a simulation cost."""
+
+    model: Literal["residual", "pooled", "scaled"] = "scaled"
+    """How simulations enter the surrogate of pours; 'residual' is the paper's."""
+
+    trust: TrustOrAlways = TrustSettings()
+    """When the first pours say that the simulator is wrong, and what follows; 'always' believes it, as the paper."""
+
+    @property
+    def beside(self) -> int | None:
+        """Simulations told between two pours; None: for as long as a pour takes."""
+        return None if self.per_pour == "free" else int(self.per_pour)
+
+    @property
+    def plain(self) -> bool:
+        """Simulations before the first pour are chosen as in the paper, with a constant κ, and warn of nothing."""
+        return self.model == "residual"
+
+    @property
+    def order(self) -> Order:
+        """Only where simulations go on for as long as a pour takes does the clock decide what is asked for."""
+        return "completion" if self.beside is None else "logical"
+
+    @property
+    def simulations(self) -> int:
+        """Those before the first pour and beside all."""
+        return self.prior_simulations + (self.pours or 0) * self.simulations_beside
+
+    @property
+    def simulations_before(self) -> int:
+        """Those of the prior."""
+        return self.prior_simulations
+
+    @property
+    def simulations_beside(self) -> int:
+        """Those told between two pours."""
+        return self.beside or 0
+
+    @property
+    def spending(self) -> str:
+        """What it spends into one receiver, in words."""
+        return f"{self.prior_simulations} simulations, then {self.pours} pours with {self.per_pour} beside each"
+
+    def check(self, premises: Premises, complaints: Complaints) -> None:
+        """Prices decide only where simulations go on for as long as they are worth it."""
+        super().check(premises, complaints)
+        if self.prices is not None and self.beside is not None:
+            text = f"decides nothing with 'per_pour: {self.per_pour}'; write 'per_pour: free', or remove it"
+            complaints.add(text, "prices", key=True)
+
+    def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
+        """The strategy itself."""
+        from orchestrator.strategies.deployment.d3_free import FreeHybrid
+
+        return (FreeHybrid if self.beside is None else Hybrid)(plan, scene, parameters, seed)
+
+
+class Hybrid(Deployment[D3Settings]):
     """D3: as D2, but the surrogate's prior mean is learnt from m2 simulations, and goes on learning between pours.
 
     First, Bayesian optimisation in simulation chooses m2 actions. Their surrogate becomes the prior of the real
@@ -31,9 +111,9 @@ class Hybrid(Deployment):
 
     With `per_pour = k`, one question answers with the next pour and k places where a simulation would matter
     most, which are simulated beside the pour and enter the prior: learning from real trials interleaved with planning
-    in a model (Dyna). With `per_pour = None`, simulations go on for as long as the pour takes.
+    in a model (Dyna). With `per_pour = 'free'`, simulations go on for as long as the pour takes.
 
-    Where the plan says so, the first pours are compared with the simulations (`TrustCheck`). One that is wrong is
+    Unless `trust` is 'always', the first pours are compared with the simulations (`TrustCheck`). One that is wrong is
     then forgotten, believed less, or put to a person. `model` says how simulations enter the surrogate; the above is
     'residual', the paper's.
 
@@ -41,11 +121,10 @@ class Hybrid(Deployment):
     Limitations: a prior from an untrustworthy simulator is worse than none; pours made before that is known are lost.
     """
 
-    NAME = "D3"
-
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        self._check = None if plan.trust is None else TrustCheck(plan.trust, self._costing.worst)
+        trust = self._settings.trust
+        self._check = TrustCheck(trust, self._costing.worst) if isinstance(trust, TrustSettings) else None
         self._unasked: Ask | None = None
         self._asked: Ask | None = None
 
@@ -71,13 +150,13 @@ class Hybrid(Deployment):
     def _next(self, free_simulations: int) -> None:
         if self._check is not None and self._pouring is None and (pours := self._check.due(self._pours)):
             self._compare(self._check, pours)
-        elif self._spent < self._plan.prior_simulations and not self._pours:
+        elif self._spent < self._settings.prior_simulations and not self._pours:
             self._next_prior()
         elif self._pouring is not None:
-            if self._plan.per_pour is None and free_simulations > 0 and self._followed != "D2":
+            if self._settings.beside is None and free_simulations > 0 and self._followed != "D2":
                 self._refine(free_simulations)
         elif self._pours_left:
-            if self._trials.idle or (self._plan.per_pour is None and self._pours):
+            if self._trials.idle or (self._settings.beside is None and self._pours):
                 self._next_pour()
         elif self._trials.idle:
             self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
@@ -113,18 +192,18 @@ class Hybrid(Deployment):
             self._simulate(suggestion, "prior")
 
         if len(self._trials) == 0:
-            count = min(max(self._plan.initial, 1), self._plan.prior_simulations)
+            count = min(max(self._settings.initial, 1), self._settings.prior_simulations)
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif self._trials.ready:
             self._compromise.weigh(exploring=True)
-            known, pending, plain = self._simulated(), self._trials.pending(), self._plan.plain
+            known, pending, plain = self._simulated(), self._trials.pending(), self._settings.plain
             problem = self._problem(known, everything=False, pending=pending, plain=plain)
             self._questions.put(problem, "prior", simulate)
 
     def _next_pour(self) -> None:
         """The next pour, and with it the simulations that run beside it."""
         problem = self._hybrid(
-            count=1 + (0 if self._followed == "D2" else self._plan.per_pour or 0),
+            count=1 + (0 if self._followed == "D2" else self._settings.simulations_beside),
             acquisition="lcb" if self._pours or self._former else "posterior_minimum",
             map_resolution=MAP_RESOLUTION,
         )
@@ -156,10 +235,14 @@ class Hybrid(Deployment):
             case "widen":
                 return self._problem(poured, mean="pooled", widening=WIDENING, simulated=simulated, **changes)
             case _:
-                return self._problem(poured, mean=MEANS[self._plan.model], simulated=simulated, **changes)
+                return self._problem(poured, mean=MEANS[self._settings.model], simulated=simulated, **changes)
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
         return self._informed(poured, simulated)
+
+    @property
+    def _warned(self) -> bool:
+        return not self._settings.plain
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -168,9 +251,9 @@ class Hybrid(Deployment):
 
     def progress(self) -> Progress:
         """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
-        simulations = self._plan.prior_simulations + self._plan.pours * (self._plan.per_pour or 0)
+        simulations = self._settings.prior_simulations + self._plan.pours * self._settings.simulations_beside
         answered = self._trials.answered - self._unspent
-        done = min(answered, simulations) if self._plan.per_pour is None else answered
+        done = min(answered, simulations) if self._settings.beside is None else answered
         if self._followed == "D2":  # those that will not be made any more
             simulations = done
         return Progress(done, simulations, min(self._counted, self._plan.pours), self._plan.pours)

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from actors.optimizer.core.problem import Data, Effort, Point, Suggestion, SuggestProblem
-from orchestrator.plan import DeploymentPlan, PricesPlan
+from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Decision, Outcome, Pour, Request, Simulate, Simulated
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.prices import Prices
+from orchestrator.strategies.deployment.prices import Prices, PricesSettings
 from orchestrator.strategies.deployment.thinning import thinned
 from orchestrator.strategies.progress import Progress
 from sim_engine.action import described
@@ -50,7 +50,7 @@ class FreeHybrid(Hybrid):
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        self._prices = Prices(plan.prices or PricesPlan(), self._costing.worst)
+        self._prices = Prices(self._settings.prices or PricesSettings(), self._costing.worst)
         self._out: set[str] = set()
         self._awaited: int | None = None
         self._rested_at: int | None = None
@@ -128,12 +128,12 @@ class FreeHybrid(Hybrid):
             self._refine(self._trials.width)
 
     def _next_prior(self) -> None:
-        plan, trials = self._plan, self._trials
-        if len(trials) == 0 and plan.prior_simulations > 0:
-            count = min(max(plan.initial, trials.width), plan.prior_simulations)
+        settings, trials = self._settings, self._trials
+        if len(trials) == 0 and settings.prior_simulations > 0:
+            count = min(max(settings.initial, trials.width), settings.prior_simulations)
             question = self._problem(Data(), acquisition="sobol", count=count)
             self._put(question, "start", lambda suggestion: self._simulate(suggestion, "prior"))
-        elif len(trials) >= plan.prior_simulations:
+        elif len(trials) >= settings.prior_simulations:
             self._decide_to_pour("all prior simulations are asked for")
         elif trials.answered >= min(2, len(trials)) and trials.waiting < trials.width:
 
@@ -145,7 +145,7 @@ class FreeHybrid(Hybrid):
                         return
                 self._simulate(suggestion, "prior")
 
-            self._ask_knowledge(min(trials.width, plan.prior_simulations - len(trials)), "prior", weighed)
+            self._ask_knowledge(min(trials.width, settings.prior_simulations - len(trials)), "prior", weighed)
 
     def _decide_to_pour(self, why: str, one: float = 0.0, pour: float = 0.0) -> None:
         self._awaited = len(self._trials)
@@ -264,7 +264,7 @@ class FreeHybrid(Hybrid):
 
     def progress(self) -> Progress:
         """As D3; simulations that were not worth their time count as made."""
-        simulations = self._plan.prior_simulations
+        simulations = self._settings.prior_simulations
         begun = self._awaited is not None or bool(self._pours)
         done = simulations if begun else min(self._trials.answered, simulations)
         return Progress(done, simulations, min(self._counted, self._plan.pours), self._plan.pours)

@@ -4,42 +4,161 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import Section
 from sim_engine.action import Action
 from sim_engine.motion import turn
 from sim_engine.outcome import Fractions
 from sim_engine.space import Space
 from sim_engine.task import Scene
 
-ObjectiveName = Literal["spillage", "retained", "time", "target_volume"]
+if TYPE_CHECKING:
+    from orchestrator.strategies.settings import Complaints
 
 Vector = tuple[float, ...]
 """One number for each objective, smaller is better."""
 
+STOPS = ("max_angle", "hold_time")
+"""Dimensions of an action that end a pour before the pourer is empty."""
 
-@dataclass(frozen=True)
-class Objective:
-    """One thing wanted. All are dimensionless, and about 1 where they are bad.
 
-    * `spillage`: spilled / loaded.
-    * `retained`: retained / loaded.
-    * `time`: duration of the motion / `scale`.
-    * `target_volume`: max(|poured − V| − `tolerance`, 0) / loaded + spilled / loaded, in volumes. The tilt has to stop
-      at the right place (`max_angle`, `hold_time`); what still drips afterwards is in the outcome.
+class Objective(Section):
+    """One thing wanted of a pour: dimensionless, and about 1 where it is bad.
 
-    Attributes:
-        weight: in the weighted sum.
-        scale: of `time` [s].
-        volume: V of `target_volume` [m³].
-        tolerance: of `target_volume` [m³].
+    A class derived from it is one objective: its settings, its equation, its worst value. It is registered at the door
+    `decant.objectives` under its `name`, a literal. It must follow from fractions, action and scene alone.
     """
 
-    name: ObjectiveName
-    weight: float = 1.0
-    scale: float = 10.0
-    volume: float = 0.0
-    tolerance: float = 0.0
+    tag: ClassVar[str] = "name"
+    required: ClassVar[dict[str, str]] = {"name": "spillage"}
+
+    name: str = ""
+    """Which objective."""
+
+    weight: Annotated[float, Quantity("1", "1.0", 1e-6, 1e6)] = 1.0
+    """In the weighted sum."""
+
+    def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
+        """f of a pour that delivers enough."""
+        raise NotImplementedError
+
+    def worst(self, scene: Scene, actions: Space) -> float:
+        """Largest f of a pour that delivers enough."""
+        return 1.0
+
+    def wanted(self, scene: Scene) -> float:
+        """Share of the load that should arrive."""
+        return 1.0
+
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+        """Complain of what does not make sense in a scene, or beside the other objectives."""
+
+    @classmethod
+    def unknown_tag(cls, word: str) -> str:
+        """Which plug-in would have it, if it could be loaded."""
+        from orchestrator.strategies.doors import OBJECTIVES
+
+        return next((str(broken) for broken in OBJECTIVES.broken if broken.name == word), "")
+
+
+class Spillage(Objective):
+    """spilled / loaded."""
+
+    name: Literal["spillage"] = "spillage"
+    """Share of the load that is spilled."""
+
+    def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
+        """The share that is spilled."""
+        return fractions.spilled
+
+
+class Retained(Objective):
+    """retained / loaded."""
+
+    name: Literal["retained"] = "retained"
+    """Share of the load that stays in the pourer."""
+
+    def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
+        """The share that is retained."""
+        return fractions.retained
+
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+        """It contradicts a volume to stop at."""
+        if "target_volume" in beside:
+            text = "wants the pourer to be emptied, and target_volume what is over to stay in it; keep one of them"
+            complaints.add(text)
+
+
+class Time(Objective):
+    """Duration of the motion / scale."""
+
+    name: Literal["time"] = "time"
+    """Duration of the motion."""
+
+    scale: Annotated[float, Quantity("s", "10 s", 0.01, 3600.0)] = 10.0
+    """A duration that is as bad as spilling everything."""
+
+    def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
+        """The duration in units of the scale."""
+        return duration(action) / self.scale
+
+    def worst(self, scene: Scene, actions: Space) -> float:
+        """That of the slowest corner of the action space."""
+        corners = itertools.product((0.0, 1.0), repeat=actions.dimension)
+        return max(duration(scene.action(actions.decode(corner))) for corner in corners) / self.scale
+
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+        """The hold has to last a known time."""
+        if "hold_time" not in actions.names and scene.fixed.get("hold_time") is None:
+            text = "needs a hold that lasts a known time; search hold_time, or fix it under motion ('hold_time: 1.5 s')"
+            complaints.add(text)
+
+
+class TargetVolume(Objective):
+    """max(|poured − V| − tolerance, 0) / loaded + spilled / loaded, in volumes.
+
+    The tilt has to stop at the right place (`max_angle`, `hold_time`); what still drips afterwards is in the outcome.
+    """
+
+    name: Literal["target_volume"] = "target_volume"
+    """Pour so much, and stop."""
+
+    volume: Annotated[float, Quantity("m^3", "150 mL", 1e-7, 0.1)] | None = None
+    """What should be poured; must be given."""
+
+    tolerance: Annotated[float, Quantity("m^3", "2 mL", 0.0, 0.1)] = 0.0
+    """By how much it may be missed."""
+
+    def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
+        """What is poured beside the target, and spilled."""
+        off = abs(fractions.poured - self.wanted(scene)) - self.tolerance / scene.liquid.volume
+        return max(off, 0.0) + fractions.spilled
+
+    def worst(self, scene: Scene, actions: Space) -> float:
+        """Nothing poured or everything, whichever is farther off, and all of it spilled."""
+        share = self.wanted(scene)
+        return max(share, 1.0 - share) + 1.0
+
+    def wanted(self, scene: Scene) -> float:
+        """The target's share of the load."""
+        assert self.volume is not None, "checked"
+        return self.volume / scene.liquid.volume
+
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+        """The target is loaded, and an action can stop there."""
+        if self.volume is None:
+            text = "key 'volume' is missing; add for example 'volume: 150 mL'"
+            complaints.add(text, key=True, of="volume")
+        elif self.volume > scene.liquid.volume:
+            loaded = f"{scene.liquid.volume * 1e6:.4g} mL"
+            complaints.add(f"is {self.volume * 1e6:g} mL, and only {loaded} are loaded (liquid.mass)", "volume")
+        elif self.tolerance >= self.volume:
+            complaints.add("is as much as the volume: not pouring would do", "tolerance")
+        if not set(STOPS) & set(actions.names):
+            text = "needs an action that stops the pour; search max_angle or hold_time ('hold_time: [0 s, 3 s]')"
+            complaints.add(text)
 
 
 @dataclass(frozen=True)
@@ -76,50 +195,20 @@ class Objectives:
             missing = 1.0 - delivered / least
             return tuple((1.0 + missing) * value for value in worst)
         return tuple(
-            min(_value(part, fractions, action, scene), value) for part, value in zip(self.parts, worst, strict=True)
+            min(part.cost(fractions, action, scene), value) for part, value in zip(self.parts, worst, strict=True)
         )
 
     def worst(self, scene: Scene, actions: Space) -> Vector:
         """Largest f_j of a pour that delivers enough."""
-        corners = itertools.product((0.0, 1.0), repeat=actions.dimension)
-        longest = max(duration(scene.action(actions.decode(corner))) for corner in corners) if self._timed else 0.0
-        values = []
-        for part in self.parts:
-            if part.name == "time":
-                values.append(longest / part.scale)
-            elif part.name == "target_volume":
-                share = part.volume / scene.liquid.volume
-                values.append(max(share, 1.0 - share) + 1.0)
-            else:
-                values.append(1.0)
-        return tuple(values)
+        return tuple(part.worst(scene, actions) for part in self.parts)
 
     def total(self, vector: Vector) -> float:
         """Σ w_j f_j."""
         return sum(part.weight * value for part, value in zip(self.parts, vector, strict=True))
 
-    @property
-    def _timed(self) -> bool:
-        return any(part.name == "time" for part in self.parts)
-
     def _wanted(self, scene: Scene) -> float:
         """Share of the load that should arrive."""
-        targets = [part.volume / scene.liquid.volume for part in self.parts if part.name == "target_volume"]
-        return min(targets, default=1.0)
-
-
-def _value(part: Objective, fractions: Fractions, action: Action, scene: Scene) -> float:
-    match part.name:
-        case "spillage":
-            return fractions.spilled
-        case "retained":
-            return fractions.retained
-        case "time":
-            return duration(action) / part.scale
-        case "target_volume":
-            loaded = scene.liquid.volume
-            off = abs(fractions.poured - part.volume / loaded) - part.tolerance / loaded
-            return max(off, 0.0) + fractions.spilled
+        return min(part.wanted(scene) for part in self.parts)
 
 
 def duration(action: Action) -> float:

@@ -14,6 +14,7 @@ from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.learnt import Part
+from sim_engine.liquid import Liquid
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
 from sim_engine.space import Space
@@ -69,6 +70,12 @@ class PourRow(Part):
     retained_g: float | None
     """Left in the pourer."""
 
+    delivered_g: float | None = None
+    """In the receiver: what is neither beside it nor left in the pourer."""
+
+    delivered_ml: float | None = None
+    """The same by the liquid's density."""
+
 
 class Foretold(Part):
     """How far the first pours were from what was predicted."""
@@ -102,8 +109,8 @@ class PourTrial:
     measurement: PourMeasurement | None = None
     vector: Vector | None = None
 
-    def row(self, objectives: tuple[str, ...]) -> PourRow:
-        """As results have it; `objectives` are their names, where there are any."""
+    def row(self, objectives: tuple[str, ...], liquid: Liquid) -> PourRow:
+        """As results have it; `objectives` are their names, where there are any, `liquid` is what was poured."""
         weighed, predicted = self.measurement, self.predicted
         return PourRow(
             number=self.number,
@@ -119,6 +126,8 @@ class PourTrial:
             spillage=None if weighed is None else normalised_spillage(weighed.fractions),
             spilled_g=None if weighed is None else weighed.spilled * 1e3,
             retained_g=None if weighed is None else weighed.retained * 1e3,
+            delivered_g=None if weighed is None else weighed.delivered * 1e3,
+            delivered_ml=None if weighed is None else liquid.millilitres(weighed.delivered),
         )
 
 

@@ -6,13 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated, Literal
 
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import qmc
 
 from actors.optimizer.core.problem import Disturbance, Point, Risk
-from orchestrator.plan import RiskPlan
+from orchestrator.config.pose import PoseNoiseSection
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import Section
+from orchestrator.strategies.settings import Complaints
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
@@ -31,6 +33,50 @@ lengthscales, 0.35, is then 2.8 of them: an error of one changes the spillage sm
 
 FEWEST, MOST, IN_TAIL = 32, 256, 6
 """Draws over which the surrogate's measure is formed: at least, at most, and so many in the tail of CVaR."""
+
+
+EXACT = PoseError(speed_factor=0.0)
+"""Standard deviations of errors that are none."""
+
+
+class RiskSettings(Section):
+    """Plan for a robot that misses, and for not knowing θ, in place of one pour that goes exactly as planned."""
+
+    measure: Literal["expected", "cvar"] = "expected"
+    """expected: mean loss over the errors; cvar: mean over the worst share 1 − level of them."""
+
+    level: Annotated[float, Quantity("1", "0.9", 0.01, 0.99)] | None = None
+    """cvar: between 0, the mean of all, and 1, the very worst; 0.9 unless given."""
+
+    pose_error: PoseNoiseSection = PoseNoiseSection()
+    """Standard deviations of the errors, normal and independent."""
+
+    theta: Literal["best", "posterior"] = "best"
+    """best: θ* alone; posterior: draws of what else fits the weighed pours, from C4 or from `--parameters`."""
+
+    @property
+    def tail(self) -> float:
+        """β, and 0 for the mean, which is CVaR at level 0."""
+        return (0.9 if self.level is None else self.level) if self.measure == "cvar" else 0.0
+
+    @property
+    def errors(self) -> PoseError:
+        """Standard deviations of the errors [m, rad, 1]."""
+        return PoseError(**self.pose_error.model_dump())
+
+    def check(self, complaints: Complaints) -> None:
+        """A level belongs to CVaR, and something has to be uncertain."""
+        if self.level is not None and self.measure != "cvar":
+            complaints.add(
+                "belongs to 'measure: cvar'; remove it, or ask for cvar", "risk", "level", key=True, of="risk"
+            )
+        if self.errors == EXACT and self.theta == "best":
+            complaints.add(
+                "names nothing that could go wrong; add 'pose_error: {x: 3 mm, speed_factor: 0.02}', or "
+                "'theta: posterior'",
+                "risk",
+                key=True,
+            )
 
 
 @dataclass(frozen=True)
@@ -58,16 +104,25 @@ class Disturbances:
     Source: quasi-random normal draws: Glasserman, Monte Carlo methods in financial engineering, 2003, chapter 5.
     """
 
-    def __init__(self, plan: RiskPlan, actions: Space, best: SimulationParameters, seed: int) -> None:
+    def __init__(
+        self,
+        risk: RiskSettings,
+        actions: Space,
+        best: SimulationParameters,
+        seed: int,
+        thetas: tuple[SimulationParameters, ...] = (),
+    ) -> None:
         """Draw.
 
         Args:
             best: θ*.
             seed: of the draws.
+            thetas: draws of a posterior, equally likely, used if `risk` asks for them.
         """
-        self._plan, self._actions, self._best, self._seed = plan, actions, best, seed
-        self._thetas = plan.thetas if plan.theta == "posterior" else ()
-        self.errors = tuple(name for name in ERRORS if getattr(plan.pose_error, name) > 0.0)
+        self._tail, self._deviations = risk.tail, risk.errors
+        self._actions, self._best, self._seed = actions, best, seed
+        self._thetas = thetas if risk.theta == "posterior" else ()
+        self.errors = tuple(name for name in ERRORS if getattr(self._deviations, name) > 0.0)
         folded = {name: _folded(name, actions) for name in self.errors}
         self._moves = {name: axis for name, axis in folded.items() if axis is not None}
 
@@ -86,13 +141,17 @@ class Disturbances:
         dimension = len(self.errors) + bool(self._thetas)
         if dimension == 0:
             return [self.nominal] * count
+        from scipy.stats import qmc
+
         sampler = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng([self._seed, stream]))
         uniform = sampler.random_base2(max(math.ceil(math.log2(count)), 0))[:count]
         return [self._draw(row) for row in uniform]
 
     def _draw(self, row: Sequence[float]) -> Draw:
+        from scipy.special import ndtri
+
         z = tuple(float(np.clip(ndtri(u), -FARTHEST, FARTHEST)) for u in row[: len(self.errors)])
-        drawn = {name: getattr(self._plan.pose_error, name) * value for name, value in zip(self.errors, z, strict=True)}
+        drawn = {name: getattr(self._deviations, name) * value for name, value in zip(self.errors, z, strict=True)}
         drawn["speed_factor"] = min(max(1.0 + drawn.get("speed_factor", 0.0), SLOWEST), FASTEST)
         parameters = self._best
         if self._thetas:
@@ -104,9 +163,9 @@ class Disturbances:
     @cached_property
     def risk(self) -> Risk:
         """What a question minimises: the same disturbances whichever the action is."""
-        wanted = IN_TAIL / (1.0 - self._plan.tail)
+        wanted = IN_TAIL / (1.0 - self._tail)
         count = min(max(2 ** math.ceil(math.log2(wanted)), FEWEST), MOST)
-        return Risk(tuple(self.disturbance(draw) for draw in self.tried(count)), self._plan.tail)
+        return Risk(tuple(self.disturbance(draw) for draw in self.tried(count)), self._tail)
 
     def tried(self, count: int) -> list[Draw]:
         """The draws that `risk` is made of, in its order."""

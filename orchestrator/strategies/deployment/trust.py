@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from actors.optimizer.core.problem import Suggestion
-from orchestrator.plan import PolicyName, TrustPlan
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import Section, word_or
 from orchestrator.requests import Ask, Decision
 from orchestrator.strategies.deployment.pours import PourTrial
 from orchestrator.strategies.learnt import Part
@@ -28,6 +32,23 @@ _MEANING: dict[str, str] = {
     "widen": "the simulations are believed less: what they lack is taken for noise of theirs, and much of it",
     GO_ON: "the simulations are used as before",
 }
+
+
+class TrustSettings(Section):
+    """D3: when the first pours say that the simulator is wrong, and what follows."""
+
+    pours: Annotated[int, Field(strict=True, ge=FEWEST_POURS, le=10)] = 4
+    """Weighed pours that are compared with the simulations, from the third on."""
+
+    limit: Annotated[float, Quantity("1", "2.5", 0.5, 100.0)] = 2.5
+    """Mean of max(z, 0) above which the simulator is called wrong."""
+
+    policy: Literal["ask", "D2", "widen"] = "D2"
+    """D2: its simulations are forgotten; widen: they are believed less; ask: the campaign pauses with a question."""
+
+
+TrustOrAlways: Any = word_or("always", TrustSettings)
+"""When the simulator is called wrong, or 'always', if it never is."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +112,8 @@ class TrustCheck:
     believes them.
     """
 
-    def __init__(self, plan: TrustPlan, worst: float) -> None:
-        self._plan, self._worst = plan, worst
+    def __init__(self, settings: TrustSettings, worst: float) -> None:
+        self._settings, self._worst = settings, worst
         self._compared = 0
         self.comparisons: list[Comparison] = []
         self.policy: str | None = None
@@ -100,16 +121,16 @@ class TrustCheck:
 
     def due(self, pours: Sequence[PourTrial]) -> list[PourTrial]:
         """The pours to be compared now; empty: nothing new, or it has been decided."""
-        weighed = [p for p in pours if p.status == "weighed" and p.cost is not None][: self._plan.pours]
+        weighed = [p for p in pours if p.status == "weighed" and p.cost is not None][: self._settings.pours]
         return self._new(weighed)
 
     def foreseen(self, pours: Sequence[PourTrial]) -> list[PourTrial]:
         """The pours to be compared once the one that is under way has been weighed (now, if none is)."""
         weighed = [p for p in pours if p.status == "pouring" or (p.status == "weighed" and p.cost is not None)]
-        return self._new(weighed[: self._plan.pours])
+        return self._new(weighed[: self._settings.pours])
 
     def _new(self, pours: list[PourTrial]) -> list[PourTrial]:
-        if self.alarm or len(pours) < min(FEWEST_POURS, self._plan.pours) or len(pours) <= self._compared:
+        if self.alarm or len(pours) < min(FEWEST_POURS, self._settings.pours) or len(pours) <= self._compared:
             return []
         return pours
 
@@ -125,9 +146,9 @@ class TrustCheck:
             spread = math.hypot(deviation, scatter, TOLERANCE * self._worst)
             self.comparisons.append(Comparison(trial.number, min(max(mean, 0.0), self._worst), spread, trial.cost))
         if self.alarm:
-            if self._plan.policy != "ask":
-                self.settle(self._plan.policy)
-        elif len(pours) == self._plan.pours:
+            if self._settings.policy != "ask":
+                self.settle(self._settings.policy)
+        elif len(pours) == self._settings.pours:
             verdict = "pours are better than simulated" if self.better else "the simulator is borne out"
             self.decisions.append(Decision(f"{verdict}: {self._text}", {"mean_z": self.mean_z}))
 
@@ -139,12 +160,12 @@ class TrustCheck:
     @property
     def alarm(self) -> bool:
         """The simulator promised too much here."""
-        return self.mean_z > self._plan.limit
+        return self.mean_z > self._settings.limit
 
     @property
     def better(self) -> bool:
         """The simulator promised too little, by as much as would be an alarm the other way."""
-        return sum(max(-one.z, 0.0) for one in self.comparisons) > self._plan.limit * len(self.comparisons) > 0.0
+        return sum(max(-one.z, 0.0) for one in self.comparisons) > self._settings.limit * len(self.comparisons) > 0.0
 
     @property
     def question(self) -> Ask | None:
@@ -154,8 +175,8 @@ class TrustCheck:
         meaning = "; ".join(f"{option}: {_MEANING[option]}" for option in OPTIONS)
         return Ask(f"The simulator is wrong here: {self._text}. How to go on? {meaning}.", OPTIONS)
 
-    def settle(self, policy: PolicyName | str) -> None:
-        """How to go on, by the plan or by an answer to `question`."""
+    def settle(self, policy: str) -> None:
+        """How to go on, by the settings or by an answer to `question`."""
         self.policy = policy
         text = f"trust alarm: {self._text}; {_MEANING[policy]}"
         self.decisions.append(Decision(text, {"mean_z": self.mean_z}, urgent=True))
@@ -165,7 +186,7 @@ class TrustCheck:
         pairs = ", ".join(
             f"{one.weighed:.3g} for {one.simulated:.3g} ± {one.deviation:.2g}" for one in self.comparisons
         )
-        worse = f"worse by {self.mean_z:.1f} deviations in the mean, limit {self._plan.limit:g}"
+        worse = f"worse by {self.mean_z:.1f} deviations in the mean, limit {self._settings.limit:g}"
         return f"weighed for simulated {pairs}; {worse}"
 
     def result(self) -> Compared:
@@ -175,8 +196,8 @@ class TrustCheck:
             alarm=self.alarm,
             better=self.better,
             mean_z=self.mean_z,
-            limit=self._plan.limit,
-            policy=self._plan.policy,
+            limit=self._settings.limit,
+            policy=self._settings.policy,
             followed=self.policy,
             pours=tuple(self.comparisons),
             text=self._text if self.comparisons else "",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
 from actors.optimizer.core.problem import Point
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import Section
 from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.learnt import Part
 from sim_engine.space import Space
@@ -19,6 +21,21 @@ ROUNDS = 4
 
 Way = Literal["low", "high"]
 _WAYS: tuple[Way, Way] = ("low", "high")
+
+
+class WindowSettings(Section):
+    """How far one may miss the planned action, in each dimension, before too much is spilled."""
+
+    required: ClassVar[dict[str, str]] = {"tolerance": "2 %"}
+
+    tolerance: Annotated[float, Quantity("1", "2 %", 1e-4, 1.0)] | None = None
+    """Largest loss, as a share of what spilling the whole load would cost."""
+
+    @property
+    def tolerated(self) -> float:
+        """The tolerance, which settings without a complaint have."""
+        assert self.tolerance is not None, "required"
+        return self.tolerance
 
 
 class WindowEnds(Part):

@@ -11,7 +11,6 @@ import numpy as np
 
 from orchestrator.report import style
 from orchestrator.report.units import LossUnit, deployment_unit, largest_loss
-from orchestrator.study.cells import deployment_simulations
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.drawing import Drawn, Look, colour, legend, log_axis, look
 from orchestrator.study.report.gather import Gathered, Key, at_pour, mean
@@ -290,14 +289,9 @@ def _spent(
     study: StudyPlan, found: Gathered, level: str, receivers: list[str], arm: str, simulation: float, pour: float
 ) -> tuple[list[float], list[float]]:
     """Total time after each pour, and the least loss so far, averaged over receivers."""
-    plan = study.deployment(arm).plan
+    settings = study.deployment(arm).plan.settings
     curves = [curve for name in receivers for curve in found.best_so_far(Key(level, name, arm))]
     length = max((len(curve) for curve in curves), default=0)
-    if plan.strategy == "D1":
-        before, each = deployment_simulations(plan) * simulation, pour
-    elif plan.strategy == "D3":
-        before, each = plan.prior_simulations * simulation, max(pour, (plan.per_pour or 0) * simulation)
-    else:
-        before, each = 0.0, pour
+    before, each = settings.simulations_before * simulation, max(pour, settings.simulations_beside * simulation)
     numbers = range(1, length + 1)
     return [before + n * each for n in numbers], [mean(at_pour(curves, n)) for n in numbers]

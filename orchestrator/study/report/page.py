@@ -116,21 +116,18 @@ def _summary(study: StudyPlan, found: Gathered) -> str:
 
 def _settings(study: StudyPlan) -> list[str]:
     lines = [f"Seed {study.seed}; {study.pour_count} calibration pours, {study.holdout} of them for testing."]
+    train = study.pour_count - study.holdout
     for arm in study.calibrations:
         axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in arm.plan.parameters.axes)
         lines.append(
-            f"{arm.label}: {arm.plan.simulations} simulations, {arm.repetitions} repetitions, searching "
-            f"{axes}; at {', '.join(arm.levels)} mismatch{_AS_IN_THE_PAPER.get(arm.label, '')}."
+            f"{arm.label}: {arm.plan.settings.simulations_on(train)} simulations, {arm.repetitions} repetitions, "
+            f"searching {axes}; at {', '.join(arm.levels)} mismatch{_AS_IN_THE_PAPER.get(arm.label, '')}."
         )
     for each in study.deployments:
-        plan = each.plan
-        what = {
-            "D1": f"{plan.iterations} iterations of {plan.simulations_per_iteration} simulations, one pour",
-            "D2": f"{plan.pours} pours",
-            "D3": f"{plan.prior_simulations} simulations, then {plan.pours} pours with {plan.per_pour} beside each",
-        }[plan.strategy]
         paper = _AS_IN_THE_PAPER.get(each.label, "")
-        lines.append(f"{each.label}: {what}; {each.repetitions} repetitions into each receiver{paper}.")
+        lines.append(
+            f"{each.label}: {each.plan.settings.spending}; {each.repetitions} repetitions into each receiver{paper}."
+        )
     if study.confirm and study.deployments:
         lines.append(f"Each deployment's recommended action is poured {study.confirm} more times.")
     return [*lines, *(_level(level) for level in study.levels)]

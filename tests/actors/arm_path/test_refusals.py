@@ -66,8 +66,11 @@ def test_a_wrist_that_loses_a_direction():
 
 def test_a_way_through_a_singularity_is_told_as_that_and_not_by_the_speeds_it_would_need():
     text = refusal(open_cell(direction=35 * DEG))
-    assert "into the approach: wrist 2 0.0 deg from where joints 4 and 6" in text
+    assert "home holds the pourer as for a direction of 90 deg, and cell.direction is 35 deg" in text
+    assert "turned by 55 deg on its way, through a place where two joints turn about one axis" in text
+    assert "joint 6 (wrist 3) would have to race; set cell.direction nearer to 90 deg" in text
     assert "would turn at" not in text
+    assert "into the approach" not in text
 
 
 def test_a_joint_that_would_turn_too_fast_is_named_with_its_speed():

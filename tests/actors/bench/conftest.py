@@ -19,7 +19,7 @@ from actors.balance.spec import SerialBalanceSpec
 from actors.bench.device_stand_ins import DeviceStandIns
 from actors.bench.pouring_bench import PouringBench
 from actors.bench.things import Things
-from actors.bench.virtual_bench import VirtualBench
+from actors.bench.virtual_bench import FollowedBench, VirtualBench
 from actors.bench.virtual_operator import VirtualOperator
 from actors.laboratory import InProcessLaboratory
 from actors.operator import OperatorSpec, Question
@@ -122,7 +122,7 @@ class Stage:
         ask = self.operator.ask
 
         async def attended(question: Question) -> str:
-            state = await self.site.fault("state")
+            state = await self._seen()
             if question.hands and (state["runtime_state"] != "STOPPED" or max(map(abs, state["speeds"])) > 1e-3):
                 self.unsafe.append(question.about)
             if (hook := self.before.pop(question.about, None)) is not None:
@@ -132,6 +132,12 @@ class Stage:
             return answer
 
         self.operator.ask = attended  # type: ignore[method-assign]
+
+    async def _seen(self) -> dict[str, Any]:
+        """What the controller knows of itself; an arm without one never runs a program."""
+        if not isinstance(self.bench.nature, FollowedBench):
+            return {"runtime_state": "STOPPED", "speeds": [0.0], "time": 0.0}
+        return await self.site.fault("state")
 
     @property
     def heard(self) -> list[str]:
@@ -152,7 +158,7 @@ class Stage:
 
     async def now(self) -> float:
         """Of the controller [s]; it goes on counting when the controller's clock begins anew."""
-        return self.unwrapped(float((await self.site.fault("state"))["time"]))
+        return self.unwrapped(float((await self._seen())["time"]))
 
     def unwrapped(self, clock: float) -> float:
         if clock < self.clock:

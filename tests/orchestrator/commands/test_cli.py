@@ -323,6 +323,8 @@ def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
     assert prediction["received"]["deviation"] > 0.0
     assert abs(prediction["received"]["mean"] - outcome["received"]) < 5 * prediction["received"]["deviation"] + 1e-9
     assert outcome["regimes"]["lip"]["weber"][0] < outcome["regimes"]["lip"]["weber"][1]
+    assert outcome["delivered_g"] == pytest.approx(100.0 * outcome["prediction"]["received"]["mean"])
+    assert outcome["delivered_ml"] == pytest.approx(outcome["delivered_g"] / 0.998)
     assert outcome["not_covered"] == []
     assert "not simulated" not in simulated.stderr
 
@@ -334,6 +336,7 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert done.returncode == 0, done.stderr
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
     assert "mean ± standard deviation, 2 seeds" in done.stdout
+    assert re.search(r"delivered \d+\.\d g, \d+\.\d mL", done.stdout)
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
 
 
@@ -385,7 +388,7 @@ def test_a_full_disk_ends_a_run_with_its_name_and_advises_no_resuming_of_what_ha
     result = invoke("run small.yaml")
     assert isinstance(result.exception, SystemExit), result.exception
     assert result.exit_code == 1
-    assert "No space left on device: 'campaign.rrd'" in result.stderr
+    assert "MB are free there. A run needs" in result.stderr
     assert "nothing had begun" in result.stderr
     assert "--resume" not in result.stderr
 
@@ -399,7 +402,7 @@ HELP = {
     "plan": ["--receiver vase.yaml", "deg/s, mm and s", "Nothing is poured"],
     "simulate": ["--set x_offset=90   # deg/s and mm", "'angular_velocity=0.7 rad/s'", "in_flight", "--seeds"],
     "validate": ["decant validate configs/campaigns/*.yaml", "units, bounds"],
-    "schema": ["decant schema vessel > vessel.json"],
+    "schema": ["decant schema result > result.json"],
 }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from textwrap import dedent
@@ -11,15 +10,16 @@ import pytest
 
 from actors.arm.geometry import Plane, Pose
 from actors.arm.spec import UrArmSpec
-from orchestrator.config.laboratory.arm import ArmSection, CellSection, arm_as_file, resolve_arm
+from orchestrator.config.laboratory.arm import CellSection, UrArmSection, resolve_arm
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
+from tests.orchestrator.good_files import written_out
 
 
 class Laboratory(Section):
-    arm: ArmSection | None = None
+    arm: UrArmSection | None = None
     """As in a laboratory's file."""
 
     cell: CellSection | None = None
@@ -100,7 +100,7 @@ def test_every_key_reaches_the_arm():
 )
 def test_the_resolved_arm_loads_to_the_same(text, mode):
     spec = load(text, mode)
-    assert load(json.dumps(arm_as_file(spec)), mode) == spec
+    assert load(written_out(Laboratory, text), mode) == spec
 
 
 @pytest.mark.parametrize("address", ["10.0.0.7", "ur10.lab.example", "robot-1", "127.0.0.1"])
@@ -164,5 +164,5 @@ def test_keys_are_typed_in_the_sections_that_say_them():
     def sentences(model: type[Section]) -> list[str | None]:
         return [field.description for field in model.model_fields.values()]
 
-    assert all(sentences(ArmSection))
+    assert all(sentences(UrArmSection))
     assert all(sentences(CellSection))

@@ -45,7 +45,7 @@ BAD_CAMPAIGNS = {
     ),
     "misspelt unit": (CAMPAIGN, "120 deg/s", "120 dge/s", "unknown unit 'dge/s'; did you mean 'deg/s'?"),
     "no quantity at all": (CAMPAIGN, "200 g", "plenty", "liquid.mass: 'plenty' is not a quantity; should be a mass"),
-    "not positive": (CAMPAIGN, "200 g", "0 g", "liquid.mass: 0 g should be above 0"),
+    "not positive": (CAMPAIGN, "200 g", "0 g", "liquid.mass: 0 g is outside 0.1 … 20000 g"),
     "out of bounds": (CAMPAIGN, "120 deg/s", "720 deg/s", "720 deg/s is outside 1 … 360 deg/s"),
     "reversed bounds": (CAMPAIGN, "[15 deg/s, 120 deg/s]", "[120 deg/s, 15 deg/s]", "bounds should increase"),
     "range with one end": (CAMPAIGN, "[15 deg/s, 120 deg/s]", "[15 deg/s]", "a range has two ends: [lowest, highest]"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from textwrap import dedent
 
@@ -13,21 +12,21 @@ from actors.balance.settling import SettlingRule
 from actors.balance.spec import BalanceSpec, SerialBalanceSpec
 from actors.balance.virtual_serial.scale import ScaleSettings
 from orchestrator.config.laboratory.balance import (
-    BalanceDeviceSection,
+    SerialSection,
     SettlingSection,
     VirtualScaleSection,
-    balance_as_file,
     resolve_balance,
 )
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
+from tests.orchestrator.good_files import written_out
 
 
 def load(text: str, mode: str = "hardware") -> BalanceSpec:
     report = Report()
     place = Place(Document.parse(dedent(text), Path("lab.yaml").resolve()))
-    section = validate(BalanceDeviceSection, place, report)
+    section = validate(SerialSection, place, report)
     spec = None if section is None else resolve_balance(section, place, report, mode=mode)
     report.raise_if_any()
     assert spec is not None
@@ -93,12 +92,12 @@ def test_where_the_operator_types_there_is_no_line():
                                             ("placement: manual", "hardware")])  # fmt: skip
 def test_the_resolved_balance_loads_to_the_same(text, mode):
     spec = load(text, mode)
-    assert load(json.dumps(balance_as_file(spec)), mode) == spec
+    assert load(written_out(SerialSection, text), mode) == spec
 
 
 def test_the_page_on_balances_names_every_key():
     page = (Path(__file__).parents[3] / "docs" / "balances.md").read_text(encoding="utf-8")
-    for model in (BalanceDeviceSection, SettlingSection, VirtualScaleSection):
+    for model in (SerialSection, SettlingSection, VirtualScaleSection):
         for key in model.written_keys():
             assert f"`{key}`" in page
 

@@ -14,7 +14,12 @@ from actors.spec import RaySpec
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import PricesPlan
+from orchestrator.strategies.calibration.c4 import C4Settings
+from orchestrator.strategies.deployment.d1 import D1Settings
+from orchestrator.strategies.deployment.d2 import D2Settings
+from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.settings import DeploymentSettings
 from sim_engine.action import DEG
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -167,6 +172,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           simulations: 33
           initial: 5
           kappa: 1.5
+          averaging: noise
           random_baseline: 4
         deployment:
           strategy: D3
@@ -181,6 +187,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           kappa: 3
           initial: 4
           on_failed_pour: ignore
+          noise: varying
         on_unknown: repeat
         parallel_simulations: 5
         outputs: {{directory: here, rrd: false, figures: false, record_rate: 4 1/s, recorded_simulations: 2}}
@@ -226,15 +233,21 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         ("angular_velocity", "log"),
         ("max_angle", "linear"),
     ]
-    budgets = (calibration.pour_count, calibration.holdout, calibration.simulations, calibration.initial)
-    assert budgets == (9, 3, 33, 5)
-    assert (calibration.kappa, calibration.random_baseline) == (1.5, 4)
+    assert (calibration.pour_count, calibration.holdout, calibration.random_baseline) == (9, 3, 4)
+    assert calibration.settings == C4Settings(simulations=33, initial=5, kappa=1.5, averaging="noise")
     assert [s.receiver.name for s in deployment.scenes] == ["narrow", "mug"]
     assert deployment.scenes[0].fixed["return_velocity"] == pytest.approx(30 * DEG)
     assert (deployment.loss.name, deployment.loss.retained_weight) == ("spilled_and_retained", 0.5)
-    assert (deployment.pours, deployment.prior_simulations, deployment.per_pour) == (6, 11, None)
-    assert deployment.prices == PricesPlan(pour=75.0, simulation=4.0, worth=0.01)
-    assert (deployment.kappa, deployment.initial, deployment.on_failed_pour) == (3.0, 4, "ignore")
+    assert deployment.settings == D3Settings(
+        pours=6,
+        prior_simulations=11,
+        per_pour="free",
+        prices=PricesSettings(pour=75.0, simulation=4.0, worth=0.01),
+        kappa=3.0,
+        initial=4,
+        on_failed_pour="ignore",
+        noise="varying",
+    )
     (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
     again = load_campaign(tmp_path / "again.json")
     assert dataclasses.replace(again, source=plan.source) == plan
@@ -243,25 +256,26 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
-        ("strategy: D1", ("D1", 1, 15, 2, 0)),
-        ("strategy: D1\n  pours: 0\n  iterations: 7\n  simulations_per_iteration: 3", ("D1", 0, 7, 3, 0)),
-        ("strategy: D2\n  pours: 9\n  mean: zero", ("D2", 9, 15, 2, 0)),
-        ("strategy: D3\n  pours: 9\n  per_pour: 0", ("D3", 9, 15, 2, 0)),
-        ("strategy: D3\n  pours: 9", ("D3", 9, 15, 2, 2)),
-        ("strategy: D3\n  pours: 9\n  per_pour: free", ("D3", 9, 15, 2, None)),
+        ("strategy: D1", D1Settings()),
+        (
+            "strategy: D1\n  pours: 0\n  iterations: 7\n  simulations_per_iteration: 3",
+            D1Settings(pours=0, iterations=7, simulations_per_iteration=3),
+        ),
+        ("strategy: D2\n  pours: 9\n  mean: zero", D2Settings(pours=9, mean="zero")),
+        ("strategy: D3\n  pours: 9\n  per_pour: 0", D3Settings(pours=9, per_pour=0)),
+        ("strategy: D3\n  pours: 9", D3Settings(pours=9, per_pour=2, prior_simulations=37, model="scaled")),
+        ("strategy: D3\n  pours: 9\n  per_pour: free", D3Settings(pours=9, per_pour="free")),
+        ("strategy: D3\n  pours: 9\n  trust: always", D3Settings(pours=9, trust="always")),
     ],
 )
-def test_strategies_have_their_own_budgets(keys: str, expected: tuple[object, ...], tmp_path: Path) -> None:
+def test_strategies_have_their_own_budgets(keys: str, expected: DeploymentSettings, tmp_path: Path) -> None:
     text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
     head, tail = re.split(r"  prior_simulations: \d+\n", text)
     tail = tail[tail.index("on_unknown") :]
     (tmp_path / "campaign.yaml").write_text(head.replace("strategy: D3", keys) + tail)
     plan = load_campaign(tmp_path / "campaign.yaml").deployment
     assert plan is not None
-    budgets = (plan.strategy, plan.pours, plan.iterations, plan.simulations_per_iteration, plan.per_pour)
-    assert budgets == expected
-    assert plan.prices == (PricesPlan() if plan.per_pour is None else None)
-    assert plan.mean == ("zero" if "zero" in keys else "constant")
+    assert plan.settings == expected
 
 
 def test_section_overrides_the_motion_of_the_campaign(tmp_path: Path) -> None:

@@ -17,8 +17,10 @@ from orchestrator.config.load import load_campaign
 from orchestrator.config.schema import campaign_schema
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
+from orchestrator.strategies.deployment.d1 import D1Settings
 from sim_engine.action import DEG
 from sim_engine.task import PoseError
+from tests.orchestrator import plans
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -50,25 +52,28 @@ def test_a_risk_is_read_as_it_was_meant_and_can_be_read_again(tmp_path: Path) ->
     jsonschema.validate(yaml.safe_load(path.read_text(encoding="utf-8")), campaign_schema())
     plan = load_campaign(path)
     assert plan.deployment is not None
-    risk = plan.deployment.risk
+    settings = plan.deployment.settings
+    assert isinstance(settings, D1Settings)
+    risk = settings.risk
     assert risk is not None
     assert (risk.measure, risk.level, risk.tail, risk.theta) == ("cvar", 0.9, 0.9, "posterior")
-    assert risk.pose_error == PoseError(3e-3, 3e-3, pytest.approx(0.5 * DEG), 0.02)  # type: ignore[arg-type]
-    assert plan.deployment.tolerance == pytest.approx(0.02)
-    assert (plan.deployment.iterations, plan.deployment.simulations_per_iteration) == (30, 2)
+    assert risk.errors == PoseError(3e-3, 3e-3, pytest.approx(0.5 * DEG), 0.02)  # type: ignore[arg-type]
+    assert settings.window is not None
+    assert settings.window.tolerance == pytest.approx(0.02)
+    assert (settings.rounds, settings.simulations_per_iteration) == (30, 2)
     again = tmp_path / "again.yaml"
     again.write_text(json.dumps(plan.resolved), encoding="utf-8")
     loaded = load_campaign(again)
     assert loaded.deployment == plan.deployment
 
 
-def test_a_run_without_a_risk_has_the_fingerprint_that_it_always_had(tmp_path: Path) -> None:
+def test_a_run_may_not_be_gone_on_with_under_another_risk_or_window(tmp_path: Path) -> None:
     plain, risky = (load_campaign(written(tmp_path, d)) for d in ({}, {"risk": RISK, "window": {"tolerance": "2 %"}}))
-    assert not {"risk", "tolerance"} & set(fingerprint(plain)["deployment"])
-    assert fingerprint(risky)["deployment"]["risk"]["measure"] == "cvar"
+    assert fingerprint(risky)["deployment"]["settings"]["risk"]["measure"] == "cvar"
     assert plain.deployment is not None
-    assert (plain.deployment.iterations, plain.deployment.simulations_per_iteration) == (15, 2)
-    other = replace(plain.deployment, tolerance=0.02)
+    assert isinstance(plain.deployment.settings, D1Settings)
+    assert (plain.deployment.settings.rounds, plain.deployment.settings.simulations_per_iteration) == (15, 2)
+    other = plain.deployment.with_settings(window=plans.window(0.02))
     assert fingerprint(replace(plain, deployment=other)) != fingerprint(plain)
 
 
@@ -125,7 +130,6 @@ def test_planning_takes_the_posterior_from_parameters_and_nowhere_else(tmp_path:
     theta.write_text(json.dumps({"theta": {"cohesion": 0.02}, "posterior": rows}), encoding="utf-8")
     planning = campaigns.planning_plan(plan, theta, None, None, None)
     assert planning.deployment is not None
-    assert planning.deployment.risk is not None
-    drawn = [one.cohesion for one in planning.deployment.risk.thetas]
+    drawn = [one.cohesion for one in planning.deployment.thetas]
     assert drawn.count(0.01) == 3 * drawn.count(0.05) > 0
     assert planning.parameters.cohesion == 0.02

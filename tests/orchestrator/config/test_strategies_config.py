@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -46,26 +47,27 @@ def refusal(folder: Path, text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("keys", "simulations", "grid", "thetas"),
+    ("keys", "simulations", "settled"),
     [
-        ("strategy: C1\n  grid: {particles: 5, cohesion: 6}", 840, {"particles": 5, "cohesion": 6}, 0),
-        ("strategy: C1\n  per_axis: 10", 2800, {"particles": 10, "cohesion": 10}, 0),
-        ("strategy: C1\n  simulations: 504", 448, {"particles": 4, "cohesion": 4}, 0),
-        ("strategy: C2\n  samples: 18", 504, {}, 18),
-        ("strategy: C2\n  simulations: 520", 504, {}, 18),
-        ("strategy: C3\n  iterations: 59", 1652, {}, 59),
-        ("strategy: C3\n  simulations: 1652", 1652, {}, 59),
-        ("strategy: C4\n  simulations: 108", 108, {}, 0),
-        ("simulations: 108", 108, {}, 0),
+        ("strategy: C1\n  grid: {particles: 5, cohesion: 6}", 840, {"grid": {"particles": 5, "cohesion": 6}}),
+        ("strategy: C1\n  per_axis: 10", 2800, {"grid": {"particles": 10, "cohesion": 10}}),
+        ("strategy: C1\n  simulations: 504", 448, {"grid": {"particles": 4, "cohesion": 4}}),
+        ("strategy: C2\n  samples: 18", 504, {"samples": 18}),
+        ("strategy: C2\n  simulations: 520", 504, {"samples": 18}),
+        ("strategy: C3\n  iterations: 59", 1652, {"iterations": 59}),
+        ("strategy: C3\n  simulations: 1652", 1652, {"iterations": 59}),
+        ("strategy: C4\n  simulations: 108", 108, {"simulations": 108}),
+        ("simulations: 108", 108, {"simulations": 108}),
     ],
 )
 def test_budgets_count_single_simulated_pours(
-    keys: str, simulations: int, grid: dict[str, int], thetas: int, tmp_path: Path
+    keys: str, simulations: int, settled: dict[str, Any], tmp_path: Path
 ) -> None:
     plan = load(tmp_path, f"{CALIBRATED}  {keys}\n")
     assert plan.calibration is not None
     found = plan.calibration
-    assert (found.simulations, found.grid, found.thetas) == (simulations, grid, thetas)
+    assert found.simulations == simulations
+    assert {name: getattr(found.settings, name) for name in settled} == settled
     (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
     assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
 
@@ -95,13 +97,6 @@ def test_budgets_count_single_simulated_pours(
 )
 def test_a_budget_that_makes_no_sense_is_refused(keys: str, expected: str, tmp_path: Path) -> None:
     assert expected in refusal(tmp_path, f"{CALIBRATED}  {keys}\n")
-
-
-def test_runs_from_before_the_other_strategies_can_be_gone_on_with(tmp_path: Path) -> None:
-    old = fingerprint(load(tmp_path, f"{CALIBRATED}  simulations: 108\n"))
-    assert not {"grid", "thetas"} & old["calibration"].keys()
-    new = fingerprint(load(tmp_path, f"{CALIBRATED}  strategy: C2\n  samples: 18\n"))
-    assert new["calibration"]["thetas"] == 18
 
 
 # -- losses and objectives -----------------------------------------------------------------------------------------
@@ -166,7 +161,7 @@ def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None
     assert plan.deployment.loss_name == "objectives"
     (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
     assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
-    assert "objectives" not in fingerprint(load(tmp_path, DEPLOYED))["deployment"]
+    assert fingerprint(plan) != fingerprint(load(tmp_path, DEPLOYED))
     assert fingerprint(plan)["deployment"]["objectives"]["floor"] == 0.3
 
 
@@ -206,3 +201,33 @@ def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None
 )
 def test_objectives_that_make_no_sense_are_refused(text: str, expected: str, tmp_path: Path) -> None:
     assert expected in refusal(tmp_path, text)
+
+
+DEPLOYED = f"""\
+name: test
+laboratory: {CONFIGS}/laboratories/virtual.yaml
+liquid: {{name: water, mass: 200 g}}
+pourer: {CONFIGS}/vessels/beaker.yaml
+receiver: {CONFIGS}/vessels/tumbler.yaml
+motion: {{max_angle: 110 deg, height: 90 mm}}
+deployment:
+  strategy: D1
+  actions: {{angular_velocity: [60 deg/s, 120 deg/s], x_offset: [90 mm, 120 mm]}}
+  pours: 0
+  confirm: 3
+"""
+
+
+def test_confirming_pours_are_part_of_the_plan_whatever_the_strategy(tmp_path: Path) -> None:
+    for strategy, text in (("D1", DEPLOYED), ("D2", DEPLOYED.replace("D1", "D2").replace("pours: 0", "pours: 4"))):
+        plan = load(tmp_path, text)
+        assert plan.deployment is not None
+        assert (plan.deployment.strategy, plan.deployment.confirm) == (strategy, 3)
+    without = load(tmp_path, DEPLOYED.replace("  confirm: 3\n", ""))
+    assert without.deployment is not None
+    assert without.deployment.confirm == 0
+
+
+def test_confirming_pours_need_a_bench(tmp_path: Path) -> None:
+    problem = refusal(tmp_path, DEPLOYED.replace("laboratories/virtual.yaml", "laboratories/planning.yaml"))
+    assert "campaign.yaml:11:12: deployment.confirm: laboratory 'planning' has no bench to pour on" in problem

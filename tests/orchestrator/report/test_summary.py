@@ -22,6 +22,8 @@ from orchestrator.report.summary import (
 from orchestrator.report.table import print_summary, summary_table
 from orchestrator.results import decode_results
 from orchestrator.strategies.deployment.pours import Foretold
+from orchestrator.strategies.repeats import Foreseen
+from sim_engine.spread import Spread
 from tests.orchestrator import watched
 from tests.orchestrator.reported import changed, shown
 
@@ -87,12 +89,45 @@ def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_ev
     results: dict[str, Any],
 ) -> None:
     trust = Foretold(z_scores=(9.0, 9.0, 9.0), alarm=True)
-    poured = changed(results["narrow cup"], failed_pours=2, trust=trust)
+    pours = [*results["narrow cup"].pours]
+    for index, why in ((1, "pour_failed: the gripper slipped"), (2, "pour_unknown: declared lost by the operator")):
+        pours[index] = changed(pours[index], status="failed", reason=why)
+    poured = changed(results["narrow cup"], failed_pours=2, trust=trust, pours=tuple(pours))
     plan = watched.campaign()
     text = shown(summary_table(plan, summarise(plan, {"narrow cup": poured}, dropped_events=12)))
     assert "the simulator may not fit this vessel" in text
-    assert "2 pour(s) failed" in text
+    assert (
+        "narrow: 2 pours failed: pour 2: pour_failed: the gripper slipped; "
+        "pour 3: pour_unknown: declared lost by the operator"
+    ) in " ".join(text.split())
     assert "lacks 12 events" in text
+
+
+def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(results: dict[str, Any]) -> None:
+    plan = watched.campaign()
+    assert plan.deployment is not None
+    liquid = plan.deployment.scenes[0].liquid
+    deployed = results["narrow cup"]
+    best = deployed.best
+    for pour in deployed.weighed:
+        assert pour.delivered_g == pytest.approx(1e3 * liquid.mass - pour.spilled_g - pour.retained_g, abs=1e-9)
+        assert pour.delivered_ml == pytest.approx(pour.delivered_g / liquid.density * 1e3)
+    foreseen = Foreseen(
+        scene="narrow cup",
+        simulations=2,
+        simulations_lost=0,
+        thetas=0,
+        touching=0,
+        over_seeds={"received": Spread(0.9, 0.01, 2), "spilled": Spread(0.1, 0.01, 2)},
+    )
+    summary = summarise(plan, {"narrow cup": deployed, "prediction:narrow cup": foreseen})
+    receiver = summary.receivers["narrow cup"]
+    assert (receiver.best_delivered_g, receiver.best_delivered_ml) == (best.delivered_g, best.delivered_ml)
+    assert receiver.predicted_delivered_g == pytest.approx(900.0 * liquid.mass)
+    assert receiver.predicted_delivered_ml == pytest.approx(900.0 * liquid.mass / liquid.density * 1e3)
+    text = shown(summary_table(plan, summary))
+    assert f"{best.delivered_g:.1f} g, {best.delivered_ml:.1f} mL" in text
+    assert f"delivered {900.0 * liquid.mass:.1f} g" in " ".join(text.split())
 
 
 def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results: dict[str, Any]) -> None:

@@ -12,19 +12,18 @@ import yaml
 from actors.optimizer.core.problem import SuggestProblem
 from orchestrator.commands.campaigns import RunOptions, run
 from orchestrator.commands.speaking import RefusalError
-from orchestrator.config.campaign.resolved import campaign_as_file
 from orchestrator.config.load import load_campaign
 from orchestrator.config.study.sections import load_study
 from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import as_begun, fingerprint
+from orchestrator.fingerprint import fingerprint
 from orchestrator.plan import CampaignPlan, DeploymentPlan
 from orchestrator.requests import Suggest
 from orchestrator.stages import calibration_stages
 from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
 from orchestrator.study.cells import cells_of
 from orchestrator.study.folder import finished_results, read_result
-from orchestrator.study.plan import StudyPlan, study_fingerprint
+from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.calibrations import draw_calibrations
 from orchestrator.study.report.deployments import draw_deployments
 from orchestrator.study.report.drawing import colour
@@ -51,7 +50,8 @@ def questions(strategy: RealOnly | Hybrid, purpose: str) -> list[SuggestProblem]
 
 def on_the_toy(plan: DeploymentPlan | None) -> DeploymentPlan:
     assert plan is not None
-    return replace(plan, scenes=(SCENE,), actions=ACTIONS, pours=1, prior_simulations=8)
+    plan = plan.with_settings(pours=1, prior_simulations=8)
+    return replace(plan, scenes=(SCENE,), actions=ACTIONS)
 
 
 @pytest.mark.parametrize(("keys", "plain"), [("model: residual", True), ("model: scaled", False)])
@@ -63,19 +63,6 @@ def test_the_simulations_before_the_first_pour_keep_kappa_in_the_papers_model_al
     assert len(asked) > 2
     assert {problem.mean for problem in asked} == {"constant"}
     assert {problem.plain for problem in asked} == {plain}
-
-
-def test_a_run_that_began_before_goes_on_asking_as_it_began(folder: Path) -> None:
-    today = campaign(folder, "strategy: D3\n  model: residual")
-    assert today.deployment is not None
-    before = replace(today, deployment=replace(today.deployment, plain=False))
-    old = fingerprint(before)
-    assert "plain" not in old["deployment"]  # as it was written then
-    assert as_begun(today, old) == before
-    assert as_begun(today, fingerprint(today)) is today
-    scaled = campaign(folder, "strategy: D3")
-    assert "plain" not in fingerprint(scaled)["deployment"]
-    assert as_begun(scaled, fingerprint(scaled)) is scaled
 
 
 # -- C4 ----------------------------------------------------------------------------------------------------------------
@@ -90,7 +77,8 @@ def calibration(folder: Path, keys: str = "") -> CampaignPlan:
 def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, keys: str, paper: bool) -> None:
     plan = calibration(folder, keys).calibration
     assert plan is not None
-    plan = replace(plan, scene=SCENE, simulations=8, initial=4, actions=CALIBRATION_ACTIONS, parameters=PARAMETERS)
+    plan = plan.with_settings(simulations=8, initial=4)
+    plan = replace(plan, scene=SCENE, actions=CALIBRATION_ACTIONS, parameters=PARAMETERS)
     results: dict[str, Any] = {}
     for stage in calibration_stages(plan)[:2]:
         played = Play(calibration_spill, weighed)(strategy := stage.build(results, 3))
@@ -106,9 +94,9 @@ def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, 
 def test_how_c4_averages_is_written_down_and_may_not_change_under_a_run(folder: Path) -> None:
     usual, paper = calibration(folder), calibration(folder, "  averaging: noise\n")
     before = fingerprint(usual)
-    assert "averaging" not in before["calibration"]  # as it was written before there was a choice
-    assert fingerprint(paper)["calibration"]["averaging"] == "noise"
-    again = load_campaign(write(folder, "again.yaml", yaml.safe_dump(campaign_as_file(paper))))
+    assert before["calibration"]["settings"]["averaging"] == "context"
+    assert fingerprint(paper)["calibration"]["settings"]["averaging"] == "noise"
+    again = load_campaign(write(folder, "again.yaml", yaml.safe_dump(paper.resolved)))
     assert fingerprint(again) == fingerprint(paper)
 
 
@@ -149,13 +137,15 @@ def study(folder: Path, **changes: Any) -> StudyPlan:
 def test_a_study_has_the_papers_methods_beside_ours(tmp_path: Path) -> None:
     plan = study(tmp_path, mismatch=read("quick")["mismatch"])
     ours, papers = plan.calibration("C4").plan, plan.calibration("C4-paper").plan
-    assert (ours.averaging, papers.averaging) == ("context", "noise")
-    assert replace(papers, averaging="context") == ours
+    assert papers.with_settings(averaging="context") == ours != papers
     ours, papers = (plan.deployment(label).plan for label in ("D2", "D2-paper"))
-    assert (ours.mean, papers.mean) == ("constant", "zero")
-    ours, papers = (plan.deployment(label).plan for label in ("D3", "D3-paper"))
-    assert (ours.model, ours.per_pour, ours.plain) == ("scaled", 2, False)
-    assert (papers.model, papers.per_pour, papers.plain, papers.trust) == ("residual", 0, True, None)
+    assert papers.with_settings(mean="constant") == ours != papers
+    own, papers_own = (plan.deployment(label).plan.settings for label in ("D3", "D3-paper"))
+    assert isinstance(own, D3Settings)
+    assert isinstance(papers_own, D3Settings)
+    assert (own.model, own.per_pour, own.plain) == ("scaled", 2, False)
+    assert (papers_own.model, papers_own.per_pour, papers_own.plain) == ("residual", 0, True)
+    assert papers_own.trust == "always"
     cells = {cell.id: cell for cell in cells_of(plan)}
     assert "calibration.small.C4-paper.01" in cells
     assert "calibration.large.C4-paper.01" not in cells, "it is compared at one level, and nobody uses its θ*"
@@ -188,10 +178,3 @@ def test_the_papers_methods_run_and_stand_in_figures_and_tables(tmp_path: Path) 
 def test_arms_are_told_apart_in_figures() -> None:
     for family in (("C1", "C2", "C3", "C4", "C4-paper"), ("D1-15", "D2", "D2-paper", "D3", "D3-paper")):
         assert len({colour(arm) for arm in family}) == len(family)
-
-
-def test_a_study_without_them_is_written_down_as_before(tmp_path: Path) -> None:
-    written_down = study_fingerprint(load_study(written(tmp_path, read("quick"))))
-    assert list(written_down["calibrations"]) == ["C1", "C2", "C3", "C4"]
-    arms = [*written_down["calibrations"].values(), *written_down["deployments"].values()]
-    assert not any({"averaging", "prior", "plain"} & set(arm) for arm in arms)

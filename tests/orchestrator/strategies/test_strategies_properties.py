@@ -21,7 +21,7 @@ from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
 from orchestrator.errors import LearningError
 from orchestrator.events import Event, RequestFinished
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, PricesPlan, RiskPlan
+from orchestrator.plan import CampaignPlan
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulated, Suggest
 from orchestrator.results import encode_result
 from orchestrator.strategies.calibration.c1 import UniformGrid
@@ -34,12 +34,14 @@ from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.d3_free import FreeHybrid
-from orchestrator.strategies.deployment.objectives import Objective, Objectives
+from orchestrator.strategies.deployment.objectives import Objectives, Retained, Spillage
+from orchestrator.strategies.deployment.prices import PricesSettings
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
 from tests.depth import examples
+from tests.orchestrator import plans
 from tests.orchestrator.play import (
     CALIBRATION_ACTIONS,
     SCENE,
@@ -56,13 +58,13 @@ from tests.orchestrator.toys import calibration_spill, narrow_cup, weighed
 
 CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
     "C1": (UniformGrid, {"grid": {"particles": 2, "cohesion": 3}}),
-    "C2": (StratifiedSampling, {"thetas": 6}),
-    "C3": (BayesianCalibration, {"thetas": 6, "initial": 4}),
+    "C2": (StratifiedSampling, {"samples": 6}),
+    "C3": (BayesianCalibration, {"iterations": 6, "initial": 4}),
     "C4": (ContinuousBayesianCalibration, {"simulations": 12, "initial": 6}),
 }
-BOTH = Objectives((Objective("spillage"), Objective("retained")), pareto=True)
-RISK = RiskPlan("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
-FREE = {"pours": 3, "prior_simulations": 12, "per_pour": None, "prices": PricesPlan(), "model": "scaled"}
+BOTH = Objectives((Spillage(), Retained()), pareto=True)
+RISK = plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
+FREE = {"pours": 3, "prior_simulations": 12, "per_pour": "free", "prices": PricesSettings(), "model": "scaled"}
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 6}),
     "D1, risk": (RobustPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),
@@ -198,22 +200,19 @@ class Optimizer:
 def campaign(directory: Path, name: str) -> CampaignPlan:
     if name in CALIBRATIONS:
         changes = GRID if name == "C1" else CALIBRATIONS[name][1]
-        values: dict[str, Any] = {"simulations": 12} | changes
-        calibration = CalibrationPlan(
-            strategy=name,  # type: ignore[arg-type]
+        calibration = plans.calibration(
+            name,
             scene=TOY,
             actions=SPACE,
             parameters=TOY_PARAMETERS,
             fixed_parameters={"particles": 700},
             pour_count=4,
             holdout=1,
-            records=None,
-            transfer=None,
-            **values,
+            **changes,
         )
         return toy_plan(directory, calibration=calibration, deployment=None, on_unknown="repeat")
     values = {"pours": 3} | DEPLOYMENTS[name][1]
-    deployment = DeploymentPlan(name[:2], (TOY,), SPACE, Loss(), **values)  # type: ignore[arg-type]
+    deployment = plans.deployment(name[:2], scenes=(TOY,), actions=SPACE, loss=Loss(), **values)
     return toy_plan(directory, deployment=deployment, on_unknown="repeat")
 
 

@@ -14,17 +14,14 @@ from ruamel.yaml import YAML
 from orchestrator.config.campaign.check import touch
 from orchestrator.config.study.sections import load_study
 from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.errors import RunError
-from orchestrator.stages import deployment_stages
-from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.posterior import PosteriorFound, RemainingDiscrepancy
+from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import cells_of
-from orchestrator.study.plan import StudyPlan
 from sim_engine.vessel.build import build_vessel
+from tests.orchestrator import plans
 from tests.orchestrator.study_files import ROOT, STUDIES, read, small, without, written
 
 
@@ -121,40 +118,23 @@ def risky(folder: Path, **arm: Any) -> Path:
     return written(folder, {**data, "campaign": str(folder / "campaign.yaml")})
 
 
-def known_posterior(study: StudyPlan, thetas: tuple[dict[str, float], ...]) -> Calibrated:
-    """What a calibration would have learnt that found these θ to fit."""
-    nothing = RemainingDiscrepancy(low=0.0, median=0.0, high=0.0)
-    posterior = PosteriorFound(
-        level=0.9, mean={}, region={}, open=(), correlation=(), directions=(), remaining_discrepancy=nothing,
-        effective=3.0, thetas=thetas,
-    )  # fmt: skip
-    found = CalibratedTheta(
-        theta=study.base.parameters, searched=("cohesion",), predicted_discrepancy=0.0, predicted_deviation=0.0,
-        hyperparameters=None, map=None, posterior=posterior,
-    )  # fmt: skip
-    return Calibrated(strategy="C4", simulations=0, lost=0, undefined=0, training_pours=2, trials=(), found=found)
-
-
 def test_risk_of_the_campaign_is_that_of_d1_and_leaves_the_others_what_they_are(tmp_path: Path) -> None:
     study = load_study(risky(tmp_path))
-    plans = {arm.label: arm.plan for arm in study.deployments}
-    assert plans["D1-2"].risk is not None
-    assert plans["D1-2"].tolerance == pytest.approx(0.02)
-    assert {plans[label].risk for label in ("D2", "D3")} == {plans[label].tolerance for label in ("D2", "D3")} == {None}
-    known = {"calibration": known_posterior(study, tuple({"cohesion": 0.01 * i} for i in range(3)))}
+    planned = study.deployment("D1-2").plan.settings
+    assert isinstance(planned, D1Settings)
+    assert planned.risk is not None
+    assert planned.window is not None
+    assert planned.window.tolerance == pytest.approx(0.02)
+    known = {"calibration": plans.calibrated(study.base.parameters, [{"cohesion": 0.01 * i} for i in range(3)])}
     made = {}
     for cell in cells_of(study):
         if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":
             plan, stages = campaign_of(study, cell, lambda name: known, tmp_path)
             made[cell.arm] = stages[0].build({}, 1)
             assert plan.deployment is not None
-            if plan.deployment.risk is not None:
-                assert [one.cohesion for one in plan.deployment.risk.thetas] == [0.0, 0.01, 0.02]
+            drawn = [one.cohesion for one in plan.deployment.thetas]
+            assert drawn == ([0.0, 0.01, 0.02] if cell.arm == "D1-2" else [])
     assert {arm: type(one) for arm, one in made.items()} == {"D1-2": RobustPlanning, "D2": RealOnly, "D3": Hybrid}
-    for arm in ("D2", "D3"):
-        wrong = replace(plans[arm], risk=plans["D1-2"].risk)
-        with pytest.raises(RunError, match=f"risk: belongs to D1, not to {arm}"):
-            deployment_stages(study.base, wrong)
     with pytest.raises(ConfigError, match="at least 2 are needed"):
         load_study(risky(tmp_path / "few", simulations_per_iteration=1))
 

@@ -15,7 +15,7 @@ from tests.orchestrator.play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
 
 STRATEGIES = {"C1": UniformGrid, "C2": StratifiedSampling, "C3": BayesianCalibration}
-BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"thetas": 18}, "C3": {"thetas": 16}}
+BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"samples": 18}, "C3": {"iterations": 16}}
 
 
 def measured(seed=0, count=12, holdout=2):
@@ -110,7 +110,7 @@ def test_theta_star_of_c1_is_the_grid_point_with_the_least_mean_discrepancy():
 
 
 def test_c3_learns_from_every_theta_before_the_next_one():
-    played = Play(calibration_spill, slots=2)(make("C3", thetas=12))
+    played = Play(calibration_spill, slots=2)(make("C3", iterations=12))
     questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "calibrate"]
     assert [len(q.data) for q in questions] == [8, 9, 10, 11]
 
@@ -122,7 +122,8 @@ def test_c3_comes_closer_than_as_many_stratified_theta():
         Play(calibration_spill)(evaluation)
         return evaluation.discrepancy("theta", "train")
 
-    scores = {name: np.mean([score(make(name, seed, thetas=18)) for seed in range(4)]) for name in ("C2", "C3")}
+    of_each = (("C2", "samples"), ("C3", "iterations"))
+    scores = {name: np.mean([score(make(name, seed, **{key: 18})) for seed in range(4)]) for name, key in of_each}
     assert scores["C3"] < 0.8 * scores["C2"]
 
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from orchestrator.config.campaign.check import touch
-from orchestrator.fingerprint import as_begun, fingerprint
-from orchestrator.plan import TrustPlan
 from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
 from orchestrator.results import encode_result
 from orchestrator.strategies.deployment.base import MAX_REFUSED
@@ -23,7 +20,6 @@ from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.build import build_vessel
 from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, unit
-from tests.orchestrator.toy import toy_plan
 from tests.orchestrator.toys import narrow_cup
 
 STRATEGIES: dict[str, Any] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
@@ -32,7 +28,7 @@ NEAREST = 0.122
 
 
 def make(name: str, seed: int = 0, **changes: Any) -> Any:
-    plan = deployment_plan(strategy=name, refusals="avoid", **changes)
+    plan = deployment_plan(strategy=name, **changes)
     return STRATEGIES[name](plan, SCENE, THETA, seed)
 
 
@@ -67,17 +63,6 @@ def test_a_refusal_has_no_cost_takes_no_budget_and_its_place_is_told(name: str) 
     assert result.simulations_lost == 0
     assert {row.loss for row in result.pours if row.status == "refused"} <= {None}
     json.dumps(encode_result(result), allow_nan=False)
-
-
-def test_beside_a_boundary_pours_come_closer_than_where_refusals_cost_the_worst() -> None:
-    least = {}
-    for refusals in ("avoid", "penalise"):
-        found = []
-        for seed in range(12):
-            plan = deployment_plan(strategy="D2", pours=8, refusals=refusals)
-            found.append(min(Play(touching)(RealOnly(plan, SCENE, THETA, seed)).real_spills))
-        least[refusals] = float(np.mean(found))
-    assert least["avoid"] < least["penalise"]
 
 
 def out_of_reach(request: Request) -> Outcome | None:
@@ -132,7 +117,7 @@ def test_where_nothing_can_be_made_it_ends(name: str) -> None:
 def test_real_vessels_that_touch_are_learnt_in_a_few_refusals() -> None:
     scene = replace(SCENE, fixed={"height": 0.0})
     vessels = build_vessel(scene.pourer), build_vessel(scene.receiver)
-    spaces = deployment_plan(strategy="D2", pours=8, refusals="avoid")
+    spaces = deployment_plan(strategy="D2", pours=8)
 
     def spill(action: Action, theta: SimulationParameters, rng: np.random.Generator) -> float:
         if (contact := touch(scene, action, *vessels)) is not None:
@@ -147,23 +132,3 @@ def test_real_vessels_that_touch_are_learnt_in_a_few_refusals() -> None:
         refusals.append(strategy.result().refused_pours)
         assert len(played.real_spills) == 8
     assert 0 < sum(refusals) <= 16  # type: ignore[operator]
-
-
-def test_a_run_from_before_goes_on_with_what_it_began_with(tmp_path: Path) -> None:
-    plan = toy_plan(tmp_path)
-    assert plan.deployment is not None
-    today = replace(plan.deployment, model="scaled", trust=TrustPlan(), refusals="avoid")
-    written = {
-        "with model and trust": replace(today, refusals="penalise"),
-        "older": replace(today, refusals="penalise", model="residual", trust=None),
-        "today": today,
-    }
-    for name, begun in written.items():
-        old = fingerprint(replace(plan, deployment=begun))
-        assert fingerprint(as_begun(replace(plan, deployment=today), old)) == old, name
-    before = fingerprint(replace(plan, deployment=written["with model and trust"]))["deployment"]
-    assert not {"noise", "refusals"} & set(before)  # as it was written then
-    asked_for = replace(plan, deployment=replace(today, noise="varying"))
-    for begun in written.values():  # and is refused, as any change is
-        old = fingerprint(replace(plan, deployment=begun))
-        assert fingerprint(as_begun(asked_for, old)) != old

@@ -10,31 +10,29 @@ import pytest
 
 from orchestrator.codec import decode_request, encode_request
 from orchestrator.errors import RunError
-from orchestrator.plan import RiskPlan
 from orchestrator.requests import Failed, Simulate, Suggest
 from orchestrator.results import decode_result, encode_result
 from orchestrator.stages import with_posterior
-from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.posterior import PosteriorFound, RemainingDiscrepancy
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
-from orchestrator.strategies.deployment.risk import Disturbances
+from orchestrator.strategies.deployment.risk import Disturbances, RiskSettings
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.action import DEG
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
+from tests.orchestrator import plans
 from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, executed, replay
 from tests.orchestrator.toys import quiet_valleys, two_valleys
 
 ERRORS = PoseError(x=8e-3, speed_factor=0.03)
 
 
-def risky(seed: int = 0, *, risk: RiskPlan | None = None, **changes: Any) -> RobustPlanning:
+def risky(seed: int = 0, *, risk: RiskSettings | None = None, **changes: Any) -> RobustPlanning:
     values = {"pours": 0, "iterations": 12, "simulations_per_iteration": 3, **changes}
-    plan = deployment_plan(strategy="D1", risk=risk or RiskPlan("expected", pose_error=ERRORS), **values)
+    plan = deployment_plan(strategy="D1", risk=risk or plans.risk("expected", pose_error=ERRORS), **values)
     return RobustPlanning(plan, SCENE, THETA, seed)
 
 
@@ -53,7 +51,7 @@ def test_under_errors_the_broad_valley_is_chosen_and_without_them_the_narrow_one
     plain = OneShotPlanning(deployment_plan(strategy="D1", pours=0, iterations=18, initial=6), SCENE, THETA, 2)
     Play(two_valleys)(plain)
     assert abs(place(plain) - 0.25) < 0.06
-    for risk in (RiskPlan("expected", pose_error=ERRORS), RiskPlan("cvar", 0.9, ERRORS)):
+    for risk in (plans.risk("expected", pose_error=ERRORS), plans.risk("cvar", 0.9, ERRORS)):
         strategy = risky(2, risk=risk)
         Play(two_valleys)(strategy)
         assert abs(place(strategy) - 0.7) < 0.1, risk.measure
@@ -61,7 +59,7 @@ def test_under_errors_the_broad_valley_is_chosen_and_without_them_the_narrow_one
 
 @pytest.mark.parametrize("level", [0.0, 0.8])
 def test_what_is_promised_under_errors_is_what_comes(level: float) -> None:
-    strategy = risky(1, risk=RiskPlan("cvar" if level else "expected", level or 0.9, ERRORS))
+    strategy = risky(1, risk=plans.risk("cvar" if level else "expected", level or 0.9, ERRORS))
     Play(two_valleys)(strategy)
     result: Any = strategy.result()
     losses = np.sort(true_losses(result.recommended.action_si))
@@ -94,7 +92,7 @@ def test_all_actions_are_compared_under_the_same_errors() -> None:
 
 def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
     def play(order: str = "first") -> Play:
-        return Play(two_valleys, order=order, slots=3)(risky(3, iterations=6, pours=1, tolerance=0.3))
+        return Play(two_valleys, order=order, slots=3)(risky(3, iterations=6, pours=1, window=plans.window(0.3)))
 
     first = play()
     assert first.pours
@@ -102,7 +100,7 @@ def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
     late = play("last")
     assert (late.simulations, late.pours) == (first.simulations, first.pours)
     assert [r for r in late.asked if isinstance(r, Suggest)] == [r for r in first.asked if isinstance(r, Suggest)]
-    assert replay(risky(3, iterations=6, pours=1, tolerance=0.3), first) == first.asked
+    assert replay(risky(3, iterations=6, pours=1, window=plans.window(0.3)), first) == first.asked
     written = [json.loads(json.dumps(encode_request(request))) for request in first.asked]
     assert [decode_request(one) for one in written] == first.asked
 
@@ -151,9 +149,9 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
     assert plain.best_values["x_offset"] < strategy.best_values["x_offset"]
 
 
-@pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG)])
+@pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG, speed_factor=0.0)])
 def test_where_every_action_touches_nothing_is_recommended(errors: PoseError) -> None:
-    strategy = risky(iterations=4, pours=1, tolerance=0.1, risk=RiskPlan("expected", pose_error=errors))
+    strategy = risky(iterations=4, pours=1, window=plans.window(0.1), risk=plans.risk("expected", pose_error=errors))
     played = Play(touching_below(1.0))(strategy)
     assert not played.pours
     assert strategy.best_values is None
@@ -164,7 +162,7 @@ def test_lost_simulations_are_left_out() -> None:
     def flaky(action: Any, theta: Any, rng: np.random.Generator) -> float:
         return float("nan") if rng.random() < 0.3 else two_valleys(action, theta, rng)
 
-    strategy = risky(4, tolerance=0.5)
+    strategy = risky(4, window=plans.window(0.5))
     Play(flaky)(strategy)
     assert strategy.best_values is not None
 
@@ -172,21 +170,21 @@ def test_lost_simulations_are_left_out() -> None:
 def test_errors_and_thetas_are_drawn_as_they_were_said_to_be() -> None:
     thetas = tuple(SimulationParameters(cohesion=0.01 * i, particles=500 * 2**i) for i in range(4))
     errors = PoseError(x=2e-3, y=1e-3, tilt=1 * DEG, speed_factor=0.02)
-    plan = RiskPlan("expected", pose_error=errors, theta="posterior", thetas=thetas)
-    draws = Disturbances(plan, ACTIONS, THETA, 5).draws(512)
+    plan = plans.risk("expected", pose_error=errors, theta="posterior")
+    draws = Disturbances(plan, ACTIONS, THETA, 5, thetas).draws(512)
     for name, centre in (("x", 0.0), ("y", 0.0), ("tilt", 0.0), ("speed_factor", 1.0)):
         values = np.array([getattr(draw.error, name) for draw in draws])
         spread = getattr(errors, name)
         assert values.mean() == pytest.approx(centre, abs=0.05 * spread)
         assert values.std() == pytest.approx(spread, rel=0.05)
     assert [sum(draw.parameters == theta for draw in draws) for theta in thetas] == [128] * 4
-    again = Disturbances(plan, ACTIONS, THETA, 5).draws(8)
+    again = Disturbances(plan, ACTIONS, THETA, 5, thetas).draws(8)
     assert again == draws[:8]
-    assert Disturbances(plan, ACTIONS, THETA, 6).draws(8) != again
+    assert Disturbances(plan, ACTIONS, THETA, 6, thetas).draws(8) != again
 
 
 def test_an_error_is_to_the_surrogate_the_action_that_was_executed() -> None:
-    plan = RiskPlan("expected", pose_error=PoseError(x=5e-3, y=1e-3, speed_factor=0.1))
+    plan = plans.risk("expected", pose_error=PoseError(x=5e-3, y=1e-3, speed_factor=0.1))
     values = {"angular_velocity": 60 * DEG, "x_offset": 0.11, "y_offset": 0.01}
     sideways = Space((*ACTIONS.axes, Axis("y_offset", -0.02, 0.02)))
     logarithmic = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG, "log"), *sideways.axes[1:]))
@@ -199,7 +197,7 @@ def test_an_error_is_to_the_surrogate_the_action_that_was_executed() -> None:
 
 
 def test_an_error_of_what_is_not_searched_is_a_coordinate_beside_the_action() -> None:
-    plan = RiskPlan("expected", pose_error=PoseError(y=1e-3, tilt=1 * DEG, speed_factor=0.0))
+    plan = plans.risk("expected", pose_error=PoseError(y=1e-3, tilt=1 * DEG, speed_factor=0.0))
     disturbances = Disturbances(plan, ACTIONS, THETA, 0)
     for draw in disturbances.draws(8):
         assert draw.error is not None
@@ -212,38 +210,16 @@ def test_thetas_of_the_calibration_before_are_borne_and_a_campaign_without_says_
     def spill(action: Any, theta: SimulationParameters, rng: np.random.Generator) -> float:
         return min(two_valleys(action, theta, rng) + 4.0 * theta.cohesion, 1.0)
 
-    plan = deployment_plan(strategy="D1", pours=0, risk=RiskPlan(pose_error=ERRORS, theta="posterior"))
-    rows = tuple({"cohesion": 0.001 * i} for i in range(100))
-    posterior = PosteriorFound(
-        level=0.9,
-        mean={},
-        region={},
-        open=(),
-        correlation=(),
-        directions=(),
-        remaining_discrepancy=RemainingDiscrepancy(low=0.0, median=0.0, high=0.0),
-        effective=100.0,
-        thetas=rows,
-    )
-    found = CalibratedTheta(
-        theta=THETA,
-        searched=("cohesion",),
-        predicted_discrepancy=0.0,
-        predicted_deviation=0.0,
-        hyperparameters=None,
-        map=None,
-        posterior=posterior,
-    )
-    calibrated = Calibrated(strategy="C4", simulations=0, lost=0, undefined=0, training_pours=2, trials=(), found=found)
+    plan = deployment_plan(strategy="D1", pours=0, risk=plans.risk(pose_error=ERRORS, theta="posterior"))
+    calibrated = plans.calibrated(THETA, [{"cohesion": 0.001 * i} for i in range(100)])
     informed = with_posterior(plan, {"calibration": calibrated})
-    assert informed.risk is not None
-    assert 50 <= len(informed.risk.thetas) <= 100
-    strategy = risky(risk=informed.risk)
+    assert 50 <= len(informed.thetas) <= 100
+    strategy = risky(risk=informed.settings.risk, thetas=informed.thetas)  # type: ignore[attr-defined]
     played = Play(spill)(strategy)
     assert len({request.parameters.cohesion for request in played.simulations}) > 10
     result: Any = strategy.result()
     assert result.risk.expected > true_losses(result.recommended.action_si).mean() + 0.1  # mean cohesion costs 0.2
-    pointless = calibrated.model_copy(update={"found": found.model_copy(update={"posterior": None})})
+    pointless = plans.calibrated(THETA)
     with pytest.raises(RunError, match="C4"):
         with_posterior(plan, {"calibration": pointless})
 

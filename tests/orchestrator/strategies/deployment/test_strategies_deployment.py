@@ -133,7 +133,7 @@ def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
 
 
 def test_d3_simulates_freely_while_a_pour_is_under_way():
-    strategy = make("D3", pours=3, per_pour=None)
+    strategy = make("D3", pours=3, per_pour="free")
     played = Play(narrow_cup, slots=2, beside=9)(strategy)
     assert len(played.pours) == 3
     assert sum(r.purpose == "refine" for r in played.simulations) > 8
@@ -168,7 +168,12 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
 
 @pytest.mark.parametrize(
     ("name", "changes", "warns"),
-    [("D2", {}, True), ("D3", {}, True), ("D2", {"plain": True}, False), ("D2", {"on_failed_pour": "ignore"}, False)],
+    [
+        ("D2", {}, True),
+        ("D3", {"model": "scaled"}, True),
+        ("D3", {"model": "residual"}, False),
+        ("D2", {"on_failed_pour": "ignore"}, False),
+    ],
 )
 def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_paper(name, changes, warns):
     def second_touches_third_is_not_weighed(request):
@@ -176,7 +181,7 @@ def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_pape
         nothing = PourMeasurement(SCENE.liquid.mass, math.nan, 0.0)
         return {2: Failed("pour_failed", "cups touch after all"), 3: Poured(nothing)}.get(number)
 
-    strategy = make(name, pours=5, refusals="avoid", **changes)
+    strategy = make(name, pours=5, **changes)
     played = Play(narrow_cup, answer=second_touches_third_is_not_weighed)(strategy)
     assert [pour.status for pour in strategy.result().pours].count("failed") == 2
     second = ACTIONS.encode(played.pours[1].action.values())
@@ -196,9 +201,9 @@ def test_touching_vessels_are_avoided_and_cost_no_pour():
     assert result.refused_pours > 0
     assert len(played.real_spills) == 8
     assert [r.number for r in result.pours if r.status == "weighed"] == list(range(1, 9))
-    hybrid = make("D3", 1, pours=4)
+    hybrid = make("D3", 1, pours=4, model="scaled")
     Play(touches_when_near)(hybrid)
-    assert hybrid.result().refused_pours == 0  # simulation has told it already
+    assert hybrid.result().refused_pours <= 1  # simulations have told most of it
     assert hybrid.best_values["x_offset"] >= 0.10
 
 

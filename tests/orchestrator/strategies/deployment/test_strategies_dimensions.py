@@ -117,13 +117,12 @@ def make(name: str, dimension: int) -> Any:
             iterations=6,
             prior_simulations=7,
             per_pour=1,
-            refusals="avoid",
             noise="varying",
             model="scaled",
         )
         return KINDS[name](deployment, SCENE, THETA, 5)
     grid = {parameter: 2 if i < 3 else 1 for i, parameter in enumerate(parameters.names)}
-    budgets = {"C1": {"grid": grid}, "C2": {"thetas": 6}, "C3": {"thetas": 6}, "C4": {"simulations": 12}}
+    budgets = {"C1": {"grid": grid}, "C2": {"samples": 6}, "C3": {"iterations": 6}, "C4": {"simulations": 12}}
     calibration: CalibrationPlan = calibration_plan(
         strategy=name, actions=actions, parameters=parameters, fixed_parameters={}, initial=4, **budgets[name]
     )

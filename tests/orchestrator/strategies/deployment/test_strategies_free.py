@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 
 from actors.optimizer.core.problem import Data
-from orchestrator.fingerprint import as_begun, fingerprint
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.occupancy import RESTS, Occupancy, occupancies
-from orchestrator.plan import PricesPlan, TrustPlan
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.strategies.deployment.d3_free import MOST_SIMULATIONS, FreeHybrid
-from orchestrator.strategies.deployment.prices import Prices
+from orchestrator.strategies.deployment.prices import Prices, PricesSettings
 from orchestrator.strategies.deployment.thinning import thinned
+from orchestrator.strategies.deployment.trust import TrustSettings
 from tests.orchestrator.killed import die_at, finished_times
 from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan
 from tests.orchestrator.test_stages import campaign, laboratory
@@ -30,9 +29,9 @@ from tests.orchestrator.toy import logical_record, run_toy
 from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
 
 
-def free(seed: int = 0, prices: PricesPlan | None = None, **changes: Any) -> FreeHybrid:
-    changes = {"pours": 3, "prior_simulations": 20, "model": "scaled", "trust": TrustPlan(), **changes}
-    plan = deployment_plan(per_pour=None, prices=prices or PricesPlan(), **changes)
+def free(seed: int = 0, prices: PricesSettings | None = None, **changes: Any) -> FreeHybrid:
+    changes = {"pours": 3, "prior_simulations": 20, "model": "scaled", "trust": TrustSettings(), **changes}
+    plan = deployment_plan(per_pour="free", prices=prices or PricesSettings(), **changes)
     return FreeHybrid(plan, SCENE, THETA, seed)
 
 
@@ -66,20 +65,20 @@ def played(strategy: FreeHybrid, simulated: Any = narrow_cup, real: Any = None, 
 
 def test_the_first_pour_comes_when_it_is_worth_more_per_second_than_a_simulation() -> None:
     def before_first(seconds: float) -> int:
-        play, _ = played(free(prices=PricesPlan(pour=seconds), pours=1))
+        play, _ = played(free(prices=PricesSettings(pour=seconds), pours=1))
         return next(i for i, r in enumerate(r for r in play.asked if not isinstance(r, Suggest)) if isinstance(r, Pour))
 
     assert before_first(0.02) < 10  # a pour costs less than a simulation
-    assert 20 <= before_first(1e6) <= 24  # as many as it may make, and those that fill the slots meanwhile
-    strategy = free(prices=PricesPlan(pour=0.02), pours=1)
+    assert 20 <= before_first(86400.0) <= 24  # as many as it may make, and those that fill the slots meanwhile
+    strategy = free(prices=PricesSettings(pour=0.02), pours=1)
     played(strategy)
     texts = [decision.text for decision in strategy.decisions]
     assert any(text.startswith("pour now, after") and "a simulation promises" in text for text in texts)
 
 
 def test_the_pool_rests_when_simulations_promise_nothing_and_goes_on_when_something_is_new() -> None:
-    tireless = free(prices=PricesPlan(worth=0.0), pours=2, prior_simulations=10)
-    lazy = free(prices=PricesPlan(worth=1.0), pours=2, prior_simulations=10)
+    tireless = free(prices=PricesSettings(worth=0.0), pours=2, prior_simulations=10)
+    lazy = free(prices=PricesSettings(worth=1.0), pours=2, prior_simulations=10)
     many, few = played(tireless)[0], played(lazy)[0]
     assert len(many.simulations) > 45
     assert len(few.simulations) < 25
@@ -91,7 +90,7 @@ def test_the_pool_rests_when_simulations_promise_nothing_and_goes_on_when_someth
 
 
 def test_the_price_of_a_simulation_is_what_outcomes_say() -> None:
-    prices = Prices(PricesPlan(pour=90.0, simulation=2.0), worst=1.0)
+    prices = Prices(PricesSettings(pour=90.0, simulation=2.0), worst=1.0)
     assert prices.simulation(2) == 1.0
     for seconds in (10.0, 500.0, 12.0, 0.0):
         prices.learn(seconds)
@@ -106,7 +105,7 @@ def test_a_simulator_that_fails_for_ever_is_let_alone() -> None:
     def broken(action: Any, theta: Any, rng: np.random.Generator) -> float:
         return math.nan
 
-    strategy = free(prices=PricesPlan(worth=0.0), prior_simulations=4, pours=2)
+    strategy = free(prices=PricesSettings(worth=0.0), prior_simulations=4, pours=2)
     play, _ = played(strategy, broken, narrow_cup, beside=200)
     assert len(play.pours) == 2
     assert len(play.simulations) < 80
@@ -131,7 +130,7 @@ def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_p
     def wrong(action: Any, theta: Any, rng: np.random.Generator) -> float:
         return 1.0 - narrow_cup(action, theta, rng)
 
-    strategy = free(pours=4, trust=TrustPlan(policy="ask"))
+    strategy = free(pours=4, trust=TrustSettings(policy="ask"))
     log = Log(strategy)
     play = Play(wrong, narrow_cup, beside=10, answer=lambda r: Answered("widen") if isinstance(r, Ask) else None)
     play(log)
@@ -144,7 +143,7 @@ def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_p
 
 
 def test_a_slot_that_falls_free_beside_a_pour_has_its_next_simulation_at_once() -> None:
-    _, log = played(free(prices=PricesPlan(worth=0.0), pours=2), slots=3)
+    _, log = played(free(prices=PricesSettings(worth=0.0), pours=2), slots=3)
     pouring, with_room, served = False, 0, 0
     for step in log.steps:
         if isinstance(step[0], Slots):
@@ -160,7 +159,7 @@ def test_a_slot_that_falls_free_beside_a_pour_has_its_next_simulation_at_once() 
 
 def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
     """No fit from scratch, no picture, no thousand points, and nothing else first: not even the check of trust."""
-    _, log = played(free(prices=PricesPlan(worth=0.0), pours=4, prior_simulations=36), narrow_cup, beside=25)
+    _, log = played(free(prices=PricesSettings(worth=0.0), pours=4, prior_simulations=36), narrow_cup, beside=25)
     followed = 0
     for i, step in enumerate(log.steps[:-1]):
         if not isinstance(step[0], Pour) or step[0].number == 4:
@@ -213,18 +212,13 @@ def test_told_the_same_in_the_same_order_it_asks_for_the_same(model: Any) -> Non
     assert again.result() == log.strategy.result()
 
 
-def _plan(directory: Path, prices: PricesPlan | None = None) -> Any:
+def _plan(directory: Path, prices: PricesSettings | None = None) -> Any:
     plan = campaign(directory, calibration=None)
     assert plan.deployment is not None
-    deployment = replace(
-        plan.deployment,
-        per_pour=None,
-        prices=prices or PricesPlan(),
-        scenes=(TOY_SCENE,),
-        prior_simulations=8,
-        model="scaled",
+    deployment = plan.deployment.with_settings(
+        per_pour="free", prices=prices or PricesSettings(), prior_simulations=8, model="scaled"
     )
-    return replace(plan, deployment=deployment)
+    return replace(plan, deployment=replace(deployment, scenes=(TOY_SCENE,)))
 
 
 def _run(directory: Path, pour: float, resume: bool = False) -> Any:
@@ -233,7 +227,7 @@ def _run(directory: Path, pour: float, resume: bool = False) -> Any:
     room.bench.pauses = lambda: pour
     room.simulators.pauses = lambda: 0.005
     return asyncio.run(
-        run_toy(directory, room, plan=_plan(directory, PricesPlan(worth=0.0)), stages=None, resume=resume)
+        run_toy(directory, room, plan=_plan(directory, PricesSettings(worth=0.0)), stages=None, resume=resume)
     )
 
 
@@ -256,16 +250,6 @@ def test_killed_in_the_middle_of_free_simulations_it_goes_on_from_its_journal(tm
         (found,) = occupancies(journal.entries(), 2).values()
     assert found.fraction is not None
     assert 0.0 < found.fraction <= 1.0
-
-
-def test_a_run_from_before_there_were_prices_goes_on_without() -> None:
-    today = _plan(Path("somewhere"))
-    old = fingerprint(replace(today, deployment=replace(today.deployment, prices=None)))
-    assert "prices" not in old["deployment"]
-    assert fingerprint(as_begun(today, old)) == old
-    assert as_begun(today, fingerprint(today)) is today
-    asked_for = replace(today, deployment=replace(today.deployment, prices=PricesPlan(pour=30.0)))
-    assert as_begun(asked_for, old) is asked_for  # and is refused, as any change is
 
 
 # -- how busy it was -------------------------------------------------------------------------------------------------

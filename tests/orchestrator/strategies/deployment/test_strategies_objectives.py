@@ -22,7 +22,15 @@ from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.front import scalarised, undominated
-from orchestrator.strategies.deployment.objectives import Objective, Objectives, duration
+from orchestrator.strategies.deployment.objectives import (
+    Objective,
+    Objectives,
+    Retained,
+    Spillage,
+    TargetVolume,
+    Time,
+    duration,
+)
 from sim_engine.action import DEG, Action
 from sim_engine.losses import Loss
 from sim_engine.motion import plan_motion
@@ -41,8 +49,8 @@ ACTIONS = Space(
     )
 )
 LITRE = 1e-3
-SPILLAGE, RETAINED, TIME = Objective("spillage"), Objective("retained"), Objective("time", scale=8.0)
-TARGET = Objective("target_volume", volume=0.12 * LITRE, tolerance=0.002 * LITRE)
+SPILLAGE, RETAINED, TIME = Spillage(), Retained(), Time(scale=8.0)
+TARGET = TargetVolume(volume=0.12 * LITRE, tolerance=0.002 * LITRE)
 
 SETS = {
     "spillage": (SPILLAGE,),
@@ -52,8 +60,8 @@ SETS = {
     "spillage and retained": (SPILLAGE, RETAINED),
     "all of the load": (SPILLAGE, RETAINED, TIME),
     "a volume": (TARGET,),
-    "a volume, quickly": (TARGET, replace(TIME, weight=0.3)),
-    "hurry above all": (replace(SPILLAGE, weight=0.01), replace(TIME, weight=100.0)),
+    "a volume, quickly": (TARGET, TIME.model_copy(update={"weight": 0.3})),
+    "hurry above all": (SPILLAGE.model_copy(update={"weight": 0.01}), TIME.model_copy(update={"weight": 100.0})),
 }
 
 

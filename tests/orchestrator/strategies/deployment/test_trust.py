@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 
 from actors.optimizer.core.problem import Suggestion
-from orchestrator.fingerprint import as_begun, fingerprint
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.plan import DeploymentPlan, TrustPlan
 from orchestrator.report.trust import draw_trust, trust_line
 from orchestrator.report.units import deployment_unit
 from orchestrator.requests import Suggest
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.pours import PourTrial
-from orchestrator.strategies.deployment.trust import TrustCheck
+from orchestrator.strategies.deployment.trust import TrustCheck, TrustSettings
 from orchestrator.unknown import OperatorNeededError
 from sim_engine.losses import Loss
+from tests.orchestrator import plans
 from tests.orchestrator.play import SCENE as PLAYED
 from tests.orchestrator.play import THETA, Play, deployment_plan
 from tests.orchestrator.reported import is_picture
@@ -44,7 +43,7 @@ def without_noise(values: dict[str, float]) -> float:
 
 
 def hybrid(seed: int = 1, policy: Any = "D2", **changes: Any) -> Hybrid:
-    return Hybrid(deployment_plan(trust=TrustPlan(policy=policy), **changes), PLAYED, THETA, seed)
+    return Hybrid(deployment_plan(trust=TrustSettings(policy=policy), **changes), PLAYED, THETA, seed)
 
 
 def weighed(*costs: float) -> list[PourTrial]:
@@ -61,19 +60,19 @@ def said(*means: float, deviation: float = 0.0, noise: float = 0.03) -> Suggesti
 
 
 def test_the_alarm_is_for_pours_far_from_simulation_in_its_own_deviations() -> None:
-    check = TrustCheck(TrustPlan(limit=2.5), worst=1.0)
+    check = TrustCheck(TrustSettings(limit=2.5), worst=1.0)
     check.compare(weighed(0.5, 0.3, 0.4), said(0.1, 0.1, 0.1, deviation=0.04))
     spread = np.hypot(np.hypot(0.04, 0.03), 0.01)
     assert check.result().z_scores == pytest.approx(np.array([0.4, 0.2, 0.3]) / spread)
     assert check.alarm
     assert check.policy == "D2"
-    doubtful = TrustCheck(TrustPlan(limit=2.5), worst=1.0)
+    doubtful = TrustCheck(TrustSettings(limit=2.5), worst=1.0)
     doubtful.compare(weighed(0.5, 0.3, 0.4), said(0.1, 0.1, 0.1, deviation=0.3))
     assert not doubtful.alarm
 
 
 def test_two_pours_say_nothing_and_later_ones_are_compared_until_there_are_enough() -> None:
-    check = TrustCheck(TrustPlan(pours=4), worst=1.0)
+    check = TrustCheck(TrustSettings(pours=4), worst=1.0)
     assert check.due(weighed(0.9, 0.9)) == []
     pours = weighed(0.1, 0.1, 0.1, 0.1, 0.9)
     assert len(check.due(pours[:3])) == 3
@@ -87,7 +86,7 @@ def test_two_pours_say_nothing_and_later_ones_are_compared_until_there_are_enoug
 
 
 def test_an_error_that_nobody_cares_about_raises_no_alarm() -> None:
-    check = TrustCheck(TrustPlan(), worst=1.0)
+    check = TrustCheck(TrustSettings(), worst=1.0)
     check.compare(weighed(0.02, 0.02, 0.02), said(0.0, 0.0, 0.0, noise=1e-4))
     assert not check.alarm
 
@@ -128,7 +127,7 @@ def test_a_simulator_that_promised_too_little_is_not_forgotten_and_people_are_to
 
 
 def test_one_pour_that_is_better_does_not_excuse_those_that_are_worse() -> None:
-    check = TrustCheck(TrustPlan(limit=2.5), worst=1.0)
+    check = TrustCheck(TrustSettings(limit=2.5), worst=1.0)
     check.compare(weighed(0.05, 0.5, 0.5), said(0.9, 0.1, 0.1))
     assert check.alarm
 
@@ -164,7 +163,7 @@ def test_on_a_wrong_simulator_d3_ends_no_worse_than_d2_and_on_a_right_one_it_is_
         assert wrong.mean() - real.mean() < 0.01 + 2 * np.hypot(real.std(), wrong.std()) / np.sqrt(len(seeds))
         first = [np.min(Play(narrow_cup)(hybrid(seed, pours=3, model=model)).real_spills) for seed in seeds]
         of_d2 = [
-            np.min(Play(narrow_cup)(RealOnly(replace(plan, pours=3), PLAYED, THETA, seed)).real_spills)
+            np.min(Play(narrow_cup)(RealOnly(plan.with_settings(pours=3), PLAYED, THETA, seed)).real_spills)
             for seed in seeds
         ]
         assert np.mean(first) < 0.5 * np.mean(of_d2)
@@ -174,8 +173,14 @@ def test_on_a_wrong_simulator_d3_ends_no_worse_than_d2_and_on_a_right_one_it_is_
 
 
 def asking(directory: Path, policy: Any = "ask") -> Any:
-    deployment = DeploymentPlan(
-        "D3", (SCENE,), SPACE, Loss(), pours=5, prior_simulations=6, per_pour=1, trust=TrustPlan(policy=policy)
+    deployment = plans.deployment(
+        scenes=(SCENE,),
+        actions=SPACE,
+        loss=Loss(),
+        pours=5,
+        prior_simulations=6,
+        per_pour=1,
+        trust=TrustSettings(policy=policy),
     )
     return toy_plan(directory, deployment=deployment)
 
@@ -251,23 +256,11 @@ def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
     assert next(iter(result.results.values())).trust.followed == "widen"
 
 
-# -- runs of before, pictures ----------------------------------------------------------------------------------------
-
-
-def test_a_run_of_before_goes_on_as_it_began(tmp_path: Path) -> None:
-    today = asking(tmp_path, "D2")
-    today = replace(today, deployment=replace(today.deployment, model="scaled", trust=TrustPlan()))
-    before = replace(today, deployment=replace(today.deployment, model="residual", trust=None))
-    old = fingerprint(before)
-    assert not {"model", "trust"} & set(old["deployment"])  # as it was written then
-    assert fingerprint(as_begun(today, old)) == old
-    assert as_begun(today, fingerprint(today)) is today
-    asked_for = replace(today, deployment=replace(today.deployment, model="pooled"))
-    assert as_begun(asked_for, old) is asked_for  # and is refused, as any change is
+# -- pictures ----------------------------------------------------------------------------------------
 
 
 def test_an_alarm_is_drawn_and_told(tmp_path: Path) -> None:
-    check = TrustCheck(TrustPlan(), worst=1.0)
+    check = TrustCheck(TrustSettings(), worst=1.0)
     check.compare(weighed(0.5, 0.3, 0.4), said(0.1, 0.1, 0.1))
     trust = check.result()
     plan = toy_plan(tmp_path)
@@ -277,6 +270,6 @@ def test_an_alarm_is_drawn_and_told(tmp_path: Path) -> None:
     line = trust_line(trust)
     assert line is not None
     assert "after pour 3 its simulations were forgotten" in line
-    nothing = TrustCheck(TrustPlan(), worst=1.0).result()
+    nothing = TrustCheck(TrustSettings(), worst=1.0).result()
     with pytest.raises(ValueError, match="no pour was compared"):
         draw_trust(tmp_path / "nothing.png", nothing, unit=deployment_unit(plan.deployment), receiver="cup")

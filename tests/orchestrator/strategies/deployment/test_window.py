@@ -12,17 +12,17 @@ import pytest
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
-from orchestrator.plan import DeploymentPlan, RiskPlan
 from orchestrator.report.campaign import draw_figures
 from orchestrator.report.risk import risk_line, window_line
 from orchestrator.report.units import loss_unit
 from orchestrator.requests import Failed, Simulate
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.strategies.deployment.risk import RiskSettings
 from orchestrator.strategies.deployment.window import ROUNDS, SafeWindow
 from sim_engine.losses import Loss
 from sim_engine.task import PoseError
-from tests.orchestrator import toy
+from tests.orchestrator import plans, toy
 from tests.orchestrator.killed import die_at
 from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, executed
 from tests.orchestrator.reported import changed, is_picture
@@ -33,16 +33,16 @@ ERRORS = PoseError(x=8e-3, speed_factor=0.03)
 CENTRE = (0.5, 0.7)
 
 
-def planned(seed: int, tolerance: float, risk: RiskPlan | None = None, spill: Any = two_valleys) -> dict[str, Any]:
+def planned(seed: int, tolerance: float, risk: RiskSettings | None = None, spill: Any = two_valleys) -> dict[str, Any]:
     plan = deployment_plan(
-        strategy="D1", pours=0, iterations=12, simulations_per_iteration=3, risk=risk, tolerance=tolerance
+        strategy="D1", pours=0, iterations=12, simulations_per_iteration=3, risk=risk, window=plans.window(tolerance)
     )
     strategy = (RobustPlanning if risk else OneShotPlanning)(plan, SCENE, THETA, seed)
     Play(spill)(strategy)
     return strategy.result()
 
 
-def true_loss(values: dict[str, float], risk: RiskPlan | None) -> float:
+def true_loss(values: dict[str, float], risk: RiskSettings | None) -> float:
     action = SCENE.action(values)
     if risk is None:
         return quiet_valleys(action)
@@ -56,13 +56,13 @@ def true_loss(values: dict[str, float], risk: RiskPlan | None) -> float:
     ("tolerance", "risk", "slack"),
     [
         (0.2, None, 0.01),
-        (0.3, RiskPlan("expected", pose_error=ERRORS), 0.04),
-        (0.7, RiskPlan("cvar", 0.8, ERRORS), 0.08),
+        (0.3, plans.risk("expected", pose_error=ERRORS), 0.04),
+        (0.7, plans.risk("cvar", 0.8, ERRORS), 0.08),
     ],
     ids=["executed exactly", "expected", "cvar"],
 )
 def test_the_window_lies_within_the_true_one_and_is_no_sliver_of_it(
-    tolerance: float, risk: RiskPlan | None, slack: float
+    tolerance: float, risk: RiskSettings | None, slack: float
 ) -> None:
     result = planned(1, tolerance, risk)
     window, action = result.window, result.recommended.action_si
@@ -138,7 +138,7 @@ def test_the_luck_of_few_errors_is_allowed_for() -> None:
 
 
 def test_cups_that_touch_are_outside() -> None:
-    plan = deployment_plan(strategy="D1", pours=0, iterations=8, tolerance=0.9)
+    plan = deployment_plan(strategy="D1", pours=0, iterations=8, window=plans.window(0.9))
     strategy = OneShotPlanning(plan, SCENE, THETA, 1)
 
     def touching(request: Any) -> Any:
@@ -150,12 +150,12 @@ def test_cups_that_touch_are_outside() -> None:
     assert window.axes["x_offset"].high <= 0.135
     touched = [check for check in window.checks if check.action_si["x_offset"] > 0.135]
     assert touched
-    assert all(check.loss == 1.0 and not check.inside for check in touched)
+    assert all(check.loss is None and not check.inside for check in touched)
 
 
 def test_a_plan_without_a_window_asks_for_what_it_always_did() -> None:
     def asked(tolerance: float | None) -> list[Any]:
-        plan = deployment_plan(strategy="D1", pours=0, iterations=6, tolerance=tolerance)
+        plan = deployment_plan(strategy="D1", pours=0, iterations=6, window=plans.window(tolerance))
         return Play(two_valleys)(OneShotPlanning(plan, SCENE, THETA, 1)).asked
 
     plain, checked = asked(None), asked(0.3)
@@ -164,13 +164,13 @@ def test_a_plan_without_a_window_asks_for_what_it_always_did() -> None:
 
 
 def test_the_window_is_told_and_drawn(tmp_path: Path) -> None:
-    result = planned(1, 0.5, RiskPlan("cvar", 0.5, ERRORS))
+    result = planned(1, 0.5, plans.risk("cvar", 0.5, ERRORS))
     text = window_line(result.window, loss_unit(Loss()))
     assert f"checked by {result.window.simulations} simulations" in text
     low, high = (1e3 * getattr(result.window.axes["x_offset"], way) for way in ("low", "high"))
     assert f"x offset {low:.4g} … {high:.4g} mm" in text
     assert "CVaR 50 %" in risk_line(result.risk, loss_unit(Loss()))
-    deployment = deployment_plan(strategy="D1", pours=0, tolerance=0.3)
+    deployment = deployment_plan(strategy="D1", pours=0, window=plans.window(0.3))
     plan = toy_plan(tmp_path, deployment=deployment)
     drawn = draw_figures(tmp_path, plan, {"deployment:cup": result})
     assert is_picture(drawn["safe window cup"])
@@ -187,8 +187,17 @@ class ProposingOptimizer(toy.ToyOptimizer):
 
 
 def run_risk(directory: Path, *, resume: bool = False) -> Any:
-    risk = RiskPlan("cvar", 0.8, ERRORS)
-    deployment = DeploymentPlan("D1", (toy.SCENE,), toy.SPACE, Loss(), pours=1, iterations=4, risk=risk, tolerance=0.3)
+    risk = plans.risk("cvar", 0.8, ERRORS)
+    deployment = plans.deployment(
+        "D1",
+        scenes=(toy.SCENE,),
+        actions=toy.SPACE,
+        loss=Loss(),
+        pours=1,
+        iterations=4,
+        risk=risk,
+        window=plans.window(0.3),
+    )
     plan = toy_plan(directory, deployment=deployment, on_unknown="repeat")
     laboratory = ToyLaboratory(optimizer=ProposingOptimizer())
     return asyncio.run(toy.run_toy(directory, laboratory, plan=plan, stages=None, resume=resume))

@@ -1,0 +1,42 @@
+"""All doors for packages from outside, and what stands in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sim_engine.doors import Broken, Door
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """One thing that an installed package adds.
+
+    Attributes:
+        group: entry-point group that it is registered in.
+        name: that files use.
+        package: that registers it, with its version.
+    """
+
+    group: str
+    name: str
+    package: str
+
+
+def doors() -> tuple[Door[Any], ...]:
+    """Every door; nothing behind them has been loaded before somebody looks."""
+    from actors.balance.doors import BALANCES
+    from orchestrator.strategies.doors import STRATEGIES
+    from sim_engine.vessel.spec import VESSELS
+
+    return STRATEGIES, BALANCES, VESSELS
+
+
+def installed() -> list[Plugin]:
+    """What is usable, ours as everybody's, by door and name."""
+    return [Plugin(door.group, name, door.package(name)) for door in doors() for name in door.names]
+
+
+def broken() -> list[Broken]:
+    """What is registered and can't be used, with the reason."""
+    return [one for door in doors() for one in door.broken]

@@ -1,0 +1,94 @@
+"""What the run of a cell keeps of its campaign: the base campaign's record with what the cell has otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from orchestrator.config.campaign.sections import CalibrationSection, LearningSection
+from orchestrator.config.laboratory.sections import HiddenLiquid
+from orchestrator.config.motion import Parameters
+from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
+from orchestrator.config.yaml.dump import as_file
+from orchestrator.config.yaml.references import References
+from orchestrator.config.yaml.sections import Section
+from orchestrator.config.yaml.source import Document, Place, Report
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+
+
+def cell_record(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
+    """The campaign of a cell in the language of campaign files, JSON-ready.
+
+    Loading it gives the cell's plan; weighed pours, which it reads from the journal of another cell, to the last bits.
+
+    Args:
+        base: the record of the base campaign.
+        plan: of the cell.
+    """
+    record = {key: value for key, value in base.items() if key not in ("calibration", "deployment")}
+    outputs = {**asdict(plan.outputs), "record_rate": f"{plan.outputs.record_rate!r} 1/s"}
+    record |= {
+        "name": plan.name,
+        "seed": plan.seed,
+        "on_unknown": plan.on_unknown,
+        "outputs": {**outputs, "directory": str(plan.outputs.directory)},
+        "laboratory": _laboratory(base["laboratory"], plan),
+        "simulator": {"parameters": _parameters(plan)},
+    }
+    if plan.calibration is not None:
+        record["calibration"] = _calibration(base["calibration"], plan.calibration)
+    if plan.deployment is not None:
+        record["deployment"] = _deployment(base, plan.deployment)
+    return record
+
+
+def _laboratory(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
+    bench = plan.laboratory.bench
+    if bench is None:
+        return dict(base)
+    changed = {
+        "liquid": written(HiddenLiquid(**bench.liquid.model_dump())),
+        "pose_error": written(PoseErrorSection(**asdict(bench.pose_error))),
+        "pose_noise": written(PoseNoiseSection(**asdict(bench.pose_noise))),
+        "time_scale": bench.time_scale,
+    }
+    return {**base, "bench": {**base["bench"], **changed}}
+
+
+def _parameters(plan: CampaignPlan) -> dict[str, Any]:
+    values: dict[str, Any] = plan.parameters.model_dump()
+    for axis in () if plan.calibration is None else plan.calibration.parameters.axes:
+        values[axis.name] = {"range": [axis.lower, axis.upper], "scale": axis.scale}
+    return written(Parameters.model_validate(values))
+
+
+def _calibration(base: Mapping[str, Any], plan: CalibrationPlan) -> dict[str, Any]:
+    pours: dict[str, Any] = {"count": plan.pour_count, "holdout": plan.holdout}
+    if plan.records is not None:
+        pours = {"from_run": str(plan.records.path.parent)}
+    own = {"pours": pours, "random_baseline": plan.random_baseline, **written(plan.settings)}
+    return {**_common(base, CalibrationSection), **own}
+
+
+def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]:
+    section = base["deployment"]
+    named = next(table for table in (section, base) if "receivers" in table or "receiver" in table)
+    receivers = named["receivers"] if "receivers" in named else [named["receiver"]]
+    wanted = {scene.receiver.name for scene in plan.scenes}
+    common = {key: value for key, value in _common(section, LearningSection).items() if key != "receiver"}
+    if plan.data is None:
+        common.pop("data", None)
+    common["confirm"] = plan.confirm
+    return {**common, "receivers": [one for one in receivers if one["name"] in wanted], **written(plan.settings)}
+
+
+def _common(base: Mapping[str, Any], section: type[Section]) -> dict[str, Any]:
+    """What of a section is not its strategy's."""
+    return {key: value for key, value in base.items() if key in section.written_keys()}
+
+
+def written(section: Section) -> dict[str, Any]:
+    """A section that stands in no file, as a file would have it."""
+    return as_file(section, Place(Document(Path.cwd() / "written")), References(Report()))

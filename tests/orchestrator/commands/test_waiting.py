@@ -1,0 +1,39 @@
+"""People who wait are told what for: soon at a terminal, now and then in a file, never if they want it quiet."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+
+from orchestrator.commands import speaking
+from orchestrator.commands.waiting import Waiting
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def waited(out: io.StringIO, at: list[float]) -> str:
+    """What is shown if something is told at these times [s]."""
+    now = 0.0
+    with Waiting(out, lambda: now) as doing:
+        for now in at:
+            doing(f"at {now:g} s")
+    return out.getvalue()
+
+
+def test_a_terminal_shows_one_line_after_two_seconds_and_cleans_up() -> None:
+    assert waited(Terminal(), [0.5, 1.9]) == ""
+    assert waited(Terminal(), [1.0, 2.5, 3.0]) == "\r\x1b[Kat 2.5 s …\r\x1b[Kat 3 s …\r\x1b[K"
+
+
+def test_a_file_gets_a_line_now_and_then() -> None:
+    assert waited(io.StringIO(), [2.5, 9.0]) == ""
+    assert waited(io.StringIO(), [11.0, 12.0, 22.0]) == "at 11 s …\nat 22 s …\n"
+
+
+def test_nobody_is_told_who_wants_it_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speaking, "_quiet", True)
+    assert waited(Terminal(), [5.0]) == ""

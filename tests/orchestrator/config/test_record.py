@@ -1,0 +1,199 @@
+"""What a run keeps of its campaign loads to the same plan: shipped campaigns, cells of studies, and generated ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import annotated_types
+import pytest
+import yaml
+from hypothesis import assume, event, given, settings
+from hypothesis import strategies as st
+
+from orchestrator.config.campaign.sections import CALIBRATIONS, DEPLOYMENTS, CalibrationSection, DeploymentSection
+from orchestrator.config.load import load_campaign
+from orchestrator.config.study.sections import load_study
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.config.yaml.quantities import Quantity
+from orchestrator.config.yaml.sections import Section
+from orchestrator.fingerprint import fingerprint
+from orchestrator.plan import CampaignPlan
+from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.study.campaigns import campaign_of
+from orchestrator.study.cells import cells_of
+from tests.depth import examples
+from tests.orchestrator import plans
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+SHIPPED = sorted((CONFIGS / "campaigns").glob("*.yaml"))
+
+
+def reloaded(plan: CampaignPlan, folder: Path) -> CampaignPlan:
+    """The plan of a run's record, which knows nothing of the file that the campaign was read from."""
+    path = folder / "elsewhere" / "resolved.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(plan.resolved), encoding="utf-8")
+    again = load_campaign(path)
+    assert again.resolved == plan.resolved, "a record's record is the record"
+    return dataclasses.replace(again, source=plan.source)
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_campaigns_are_kept_whole(path: Path, tmp_path: Path) -> None:
+    plan = load_campaign(path)
+    assert reloaded(plan, tmp_path) == plan
+
+
+@pytest.mark.parametrize("name", ["quick", "paper"])
+def test_cells_of_a_study_are_kept_in_the_language_of_campaigns(name: str, tmp_path: Path) -> None:
+    study = load_study(CONFIGS / "studies" / f"{name}.yaml")
+    theta = study.base.parameters.model_copy(update={"cohesion": 0.0123456789})
+    kinds: set[tuple[str, str]] = set()
+    for cell in cells_of(study):
+        if cell.kind in ("calibration", "uncalibrated") or (cell.kind, cell.arm) in kinds:
+            continue  # those read pours from a journal
+        kinds.add((cell.kind, cell.arm))
+        stage = f"deployment:{cell.receiver.removeprefix('deployment-')}"
+        needed = {"calibration": plans.calibrated(theta), stage: Deployed.model_construct(recommended=None)}
+        plan, _ = campaign_of(study, cell, lambda other, needed=needed: needed, tmp_path / cell.id)  # type: ignore[misc]
+        assert reloaded(plan, tmp_path) == plan, cell.id
+    assert len(kinds) > 4
+
+
+# -- generated campaigns -----------------------------------------------------------------------------------------------
+
+
+def value_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> st.SearchStrategy[Any]:
+    """Anything that may be written for a setting, from its declaration alone."""
+    if (quantity := next((m for m in metadata if isinstance(m, Quantity)), None)) is not None:
+        number = st.floats(max(quantity.lower, -10.0), min(quantity.upper, 500.0), exclude_min=quantity.positive)
+        return number if quantity.unit == "1" else number.map(lambda value: f"{value!r} {quantity.unit}")
+    origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return value_of(inner[0], (*inner[1:], *metadata))
+    if origin in (typing.Union, types.UnionType):
+        return st.one_of([value_of(part) for part in inner if part is not type(None)])
+    if origin is Literal:
+        return st.sampled_from(inner)
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return section_of(annotation)
+    if annotation is int:
+        flat = [deep for m in metadata for deep in getattr(m, "metadata", [m])]
+        least = max((m.ge for m in flat if isinstance(m, annotated_types.Ge)), default=0)
+        most = min((m.le for m in flat if isinstance(m, annotated_types.Le)), default=40)
+        return st.integers(int(least), int(most))  # type: ignore[call-overload]
+    if origin is dict:
+        return st.fixed_dictionaries({name: st.integers(1, 4) for name in ("particles", "cohesion", "viscosity")})
+    raise NotImplementedError(annotation)
+
+
+def section_of(model: type[Section], without: frozenset[str] = frozenset()) -> st.SearchStrategy[dict[str, Any]]:
+    """A section with any of its keys, and all that must be there."""
+    needed, free = {}, {}
+    for key, name in model.written_keys().items():
+        if name not in without:
+            info = model.model_fields[name]
+            (needed if key in model.required else free)[key] = value_of(info.annotation, tuple(info.metadata))
+    return st.fixed_dictionaries(needed, optional=free)
+
+
+def strategy_of(variants: Mapping[str, type[Section]], common: type[Section]) -> st.SearchStrategy[dict[str, Any]]:
+    """The own keys of one of the strategies that are installed."""
+
+    def of(name: str) -> st.SearchStrategy[dict[str, Any]]:
+        own = section_of(variants[name], without=frozenset({*common.model_fields, "strategy", "data"}))
+        return own.map(lambda keys: {**keys, "strategy": name})
+
+    return st.sampled_from(sorted(variants)).flatmap(of)
+
+
+def sensible(section: dict[str, Any]) -> dict[str, Any]:
+    """What doesn't make sense together left out, so that most of what is generated can be asked for."""
+    kept = dict(section)
+    if kept["strategy"] in ("D2", "D3"):
+        kept["pours"] = max(kept.get("pours", 1), 1)
+    if kept.get("per_pour") != "free":
+        kept.pop("prices", None)
+    if (risk := kept.get("risk")) is not None:
+        kept["simulations_per_iteration"] = max(kept.get("simulations_per_iteration", 2), 2)
+        kept["risk"] = {key: value for key, value in risk.items() if key != "level"} | {"theta": "posterior"}
+    wanted = {"C1": ("grid", "per_axis"), "C2": ("samples",), "C3": ("iterations",), "C4": ("simulations",)}
+    if own := wanted.get(kept["strategy"]):
+        first = next((key for key in own if key in kept), own[-1])
+        kept = {key: value for key, value in kept.items() if key not in (*own, "simulations")}
+        kept |= {first: section.get(first, 9)}
+        kept["initial"] = min(kept.get("initial", 8), kept[first]) if "initial" in kept or own[0] != "grid" else 0
+        if kept["strategy"] in ("C1", "C2"):
+            del kept["initial"]
+    return kept
+
+
+LOSSES = st.sampled_from(
+    [
+        {},
+        {"loss": {"retained_weight": 0.123456789}},
+        {"loss": {"name": "spilled_and_retained"}},
+        {"objectives": [{"name": "spillage", "weight": 0.3}, {"name": "retained"}], "floor": 0.7, "pareto": True},
+    ]
+)
+MOTIONS = st.sampled_from([{}, {"hold_time": "0.3 s"}, {"hold_cap": "3.3 s", "pivot": {"x": "3 mm", "z": "4 mm"}}])
+
+
+def quickstart() -> dict[str, Any]:
+    path = CONFIGS / "campaigns" / "quickstart.yaml"
+    content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for section, key in ((content, "laboratory"), (content, "pourer")):
+        section[key] = str((path.parent / section[key]).resolve())
+    for section in (content["calibration"], content["deployment"]):
+        section["receiver"] = str((path.parent / section["receiver"]).resolve())
+    return content
+
+
+COMMON = ("receiver", "motion", "actions", "pours")
+
+
+@given(
+    calibration=strategy_of(CALIBRATIONS, CalibrationSection),
+    deployment=strategy_of(DEPLOYMENTS, DeploymentSection),
+    more=LOSSES,
+    motion=MOTIONS,
+)
+@settings(max_examples=examples(160), deadline=None)
+def test_whatever_is_asked_for_is_kept(
+    calibration: dict[str, Any],
+    deployment: dict[str, Any],
+    more: dict[str, Any],
+    motion: dict[str, Any],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    content, folder = quickstart(), tmp_path_factory.mktemp("campaign")
+    content["motion"] = {**content.get("motion", {}), **motion}
+    content["calibration"] = {key: content["calibration"][key] for key in COMMON if key in content["calibration"]}
+    deployment = sensible(deployment)
+    more = {} if {"risk", "window"} & deployment.keys() else more
+    content["calibration"] |= sensible(calibration)
+    content["deployment"] = {key: content["deployment"][key] for key in COMMON[:3]} | deployment | more
+    (folder / "campaign.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    try:
+        plan = load_campaign(folder / "campaign.yaml")
+    except ConfigError:
+        assume(False)
+        raise
+    event(f"{plan.calibration and plan.calibration.strategy} {plan.deployment and plan.deployment.strategy}")
+    again = reloaded(plan, folder)
+    assert again == plan
+    assert fingerprint(again) == fingerprint(plan)
+    assert plan.deployment is not None
+    for key, written in deployment.items():
+        kept = getattr(plan.deployment.settings, key)
+        if isinstance(written, float):
+            assert math.isclose(kept, written), key
+        elif isinstance(kept, str | int) and not isinstance(written, str):
+            assert kept == written, key

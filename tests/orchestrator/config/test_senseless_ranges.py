@@ -1,0 +1,70 @@
+"""What can be run and makes little sense is told, with what would: offsets that no stream bridges, tilts too fast."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orchestrator.config.campaign.check import check_campaign
+from orchestrator.config.load import load_campaign
+from orchestrator.config.yaml.errors import Problem
+from tests.orchestrator.good_files import CAMPAIGN, RECORDED, write
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+QUICKSTART = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+
+INTO_NARROW = "bad.yaml:36:15: deployment.actions.x_offset: deployment into 'narrow': "
+
+
+def warnings(path: Path) -> list[str]:
+    told: list[Problem] = []
+    check_campaign(load_campaign(path), warn=told.append)
+    return [str(problem).splitlines()[0].replace(f"{path.parent}/", "") for problem in told]
+
+
+@pytest.mark.parametrize("path", sorted((CONFIGS / "campaigns").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_campaigns_make_sense(path: Path) -> None:
+    assert warnings(path) == []
+
+
+def test_offsets_from_which_no_stream_hits_are_told_with_those_from_which_one_does(tmp_path: Path) -> None:
+    for ends, share in (
+        ("400 mm, 500 mm", "from no x_offset in this range can a stream hit"),
+        ("1 mm, 10 mm", "from no x_offset in this range can a stream hit"),
+        ("130 mm, 230 mm", "only from 21 % of this range can a stream hit"),
+    ):
+        (told,) = warnings(write(tmp_path, "bad.yaml", QUICKSTART.replace("90 mm, 130 mm", ends)))
+        assert told.startswith(INTO_NARROW + share)
+        # simulated pours at 60 … 150 deg/s fill the narrow cup from about 90 to 125 mm
+        assert told.endswith("'narrow': a free jet comes down in it from an x_offset of 58 … 150 mm")
+
+
+def test_a_fixed_offset_is_looked_at_as_well(folder: Path) -> None:
+    assert warnings(write(folder, "good.yaml", CAMPAIGN)) == []
+    (told,) = warnings(write(folder, "bad.yaml", CAMPAIGN.replace("x_offset: 84 mm", "x_offset: 300 mm")))
+    assert told.startswith("bad.yaml:6:40: motion.x_offset: calibration: from this x_offset no stream can hit 'cup'")
+
+
+def test_pours_that_were_made_are_not_doubted(folder: Path) -> None:
+    assert warnings(write(folder, "good.yaml", RECORDED.replace("x_offset: 84 mm", "x_offset: 300 mm"))) == []
+
+
+def test_a_stream_beside_the_receiver_hits_nothing(folder: Path) -> None:
+    beside = CAMPAIGN.replace("height: 90 mm", "height: 90 mm, y_offset: 60 mm")
+    (told,) = warnings(write(folder, "bad.yaml", beside))
+    assert told.startswith("bad.yaml:6:72: motion.y_offset: calibration: the stream passes 60 mm beside the axis")
+    assert told.endswith("of 'cup', whose opening has a radius of 32 mm")
+
+
+def test_tilts_faster_than_the_laboratory_allows_are_told_with_the_limit(tmp_path: Path) -> None:
+    fast = QUICKSTART.replace("[60 deg/s, 150 deg/s]", "[60 deg/s, 200 deg/s]")
+    (told,) = warnings(write(tmp_path, "bad.yaml", fast))
+    assert told == (
+        "bad.yaml:35:23: deployment.actions.angular_velocity: deployment into 'narrow': goes up to 200 deg/s, and the "
+        "arm turns the pourer at 160 deg/s at most (arm.limits.tilt_speed): faster actions are refused one by one. "
+        "End the range there"
+    )
+    # at 200 deg/s² a turn of 120 deg comes to 155 deg/s on its way
+    slow = fast.replace("angular_acceleration: 600 deg/s^2", "angular_acceleration: 200 deg/s^2")
+    assert warnings(write(tmp_path, "good.yaml", slow)) == []

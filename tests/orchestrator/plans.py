@@ -1,0 +1,80 @@
+"""Plans from flat keywords: a strategy's settings take those that they have; other strategies' keys are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Literal
+
+from orchestrator.config.pose import PoseNoiseSection
+from orchestrator.plan import CalibrationPlan, DeploymentPlan
+from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.posterior import PosteriorFound, RemainingDiscrepancy
+from orchestrator.strategies.deployment.risk import RiskSettings
+from orchestrator.strategies.deployment.window import WindowSettings
+from orchestrator.strategies.doors import STRATEGIES
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import PoseError
+
+CALM: dict[str, dict[str, Any]] = {"D3": {"model": "residual", "trust": "always", "per_pour": 0}}
+"""What tests have otherwise than campaigns, unless they say it."""
+
+
+def calibration(strategy: str = "C4", **values: Any) -> CalibrationPlan:
+    """A calibration by one strategy."""
+    settings, rest = _settings(strategy, values)
+    return CalibrationPlan(settings, **rest)
+
+
+def deployment(strategy: str = "D3", **values: Any) -> DeploymentPlan:
+    """A deployment by one strategy."""
+    settings, rest = _settings(strategy, values)
+    return DeploymentPlan(settings, **rest)
+
+
+def risk(
+    measure: Literal["expected", "cvar"] = "expected",
+    level: float | None = None,
+    pose_error: PoseError | None = None,
+    theta: Literal["best", "posterior"] = "best",
+) -> RiskSettings:
+    """What D1 has to bear; errors are standard deviations."""
+    errors = asdict(pose_error or PoseError(speed_factor=0.0))
+    return RiskSettings(measure=measure, level=level, pose_error=PoseNoiseSection(**errors), theta=theta)
+
+
+def calibrated(theta: SimulationParameters, rows: Sequence[Mapping[str, float]] = ()) -> Calibrated:
+    """What a calibration has found, with draws of a posterior or without."""
+    posterior = PosteriorFound(
+        level=0.9,
+        mean={},
+        region={},
+        open=(),
+        correlation=(),
+        directions=(),
+        remaining_discrepancy=RemainingDiscrepancy(low=0.0, median=0.0, high=0.0),
+        effective=float(len(rows)),
+        thetas=tuple(dict(row) for row in rows),
+    )
+    found = CalibratedTheta(
+        theta=theta,
+        searched=("cohesion",),
+        predicted_discrepancy=0.0,
+        predicted_deviation=0.0,
+        hyperparameters=None,
+        map=None,
+        posterior=posterior if rows else None,
+    )
+    return Calibrated(strategy="C4", simulations=0, lost=0, undefined=0, training_pours=2, trials=(), found=found)
+
+
+def window(tolerance: float | None) -> WindowSettings | None:
+    """The window within a tolerance, if there is one."""
+    return None if tolerance is None else WindowSettings(tolerance=tolerance)
+
+
+def _settings(strategy: str, values: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    kind = STRATEGIES.get(strategy)
+    own = CALM.get(strategy, {}) | {name: value for name, value in values.items() if name in kind.model_fields}
+    others = {name for settings in STRATEGIES.all.values() for name in settings.model_fields}
+    return kind(**own), {name: value for name, value in values.items() if name not in others}

@@ -1,0 +1,119 @@
+"""A balance with a spring: settings, and a driver that takes its time to come to rest.
+
+It has no line: on a virtual bench the driver is told what stands on it. A driver of a real balance would open its port
+in `connect`, and be told nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+from actors.balance.protocol import Weight
+from actors.balance.spec import BalanceDevice
+from actors.balance.virtual_balance import Load
+from actors.protocols import LaboratoryError
+from orchestrator.config.laboratory.balance import BalanceDeviceSection
+from orchestrator.config.yaml.quantities import Quantity
+
+
+@dataclass(frozen=True)
+class SpringSpec(BalanceDevice):
+    """Settings as values.
+
+    Attributes:
+        step: of its display [kg].
+        swing: how long it swings after a change [s].
+        time_scale: bench seconds per second of the clock.
+    """
+
+    step: float = 1e-4
+    swing: float = 1.0
+    time_scale: float = 1.0
+
+    kind: ClassVar[str] = "spring"
+    told: ClassVar[bool] = True
+
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `BalanceDevice.driver`."""
+        return SpringBalance, (self, name)
+
+
+class SpringSection(BalanceDeviceSection):
+    """A balance with a spring."""
+
+    kind: Literal["spring"] = "spring"
+    """A balance with a spring."""
+
+    step: Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01, positive=True)] = 1e-4
+    """Step of its display."""
+
+    swing: Annotated[float, Quantity("s", "1 s", 0.0, 60.0)] = 1.0
+    """How long it swings after a change."""
+
+    def device(self) -> SpringSpec:
+        """See `BalanceDeviceSection.device`."""
+        return SpringSpec(self.step, self.swing)
+
+
+class SpringBalance:
+    """The driver; see `actors.balance.protocol.BalanceDriver`."""
+
+    def __init__(self, spec: SpringSpec, name: str = "spring") -> None:
+        self._spec, self._name = spec, name
+        self._mass = self._tare = 0.0
+        self._changed = -math.inf
+        self._interrupted = threading.Event()
+
+    def connect(self) -> str:
+        """See `BalanceDriver.connect`."""
+        return f"{self._name}: a spring, step {1e3 * self._spec.step:g} g"
+
+    def tare(self) -> None:
+        """See `BalanceDriver.tare`."""
+        self._rest()
+        self._tare = self._mass
+
+    def weigh(self) -> Weight:
+        """See `BalanceDriver.weigh`."""
+        self._rest()
+        return self.read()
+
+    def read(self) -> Weight:
+        """See `BalanceDriver.read`."""
+        steps = round((self._mass - self._tare) / self._spec.step)
+        now = time.monotonic()
+        return Weight(steps * self._spec.step, now >= self._still_at, now, step=self._spec.step)
+
+    def keep_reference(self) -> None:
+        """See `BalanceDriver.keep_reference`: it has no connection that could be lost."""
+
+    def interrupt(self) -> None:
+        """See `BalanceDriver.interrupt`."""
+        self._interrupted.set()
+
+    def resume(self) -> None:
+        """See `BalanceDriver.resume`."""
+        self._interrupted.clear()
+
+    def close(self) -> None:
+        """See `BalanceDriver.close`."""
+
+    def prepare(self, seed: tuple[int, ...]) -> None:
+        """A new pour: it is empty."""
+        self._mass, self._tare = 0.0, 0.0
+
+    def put(self, load: Load) -> None:
+        """What stands on it from now on."""
+        self._mass, self._changed = load.masses[-1], time.monotonic()
+
+    @property
+    def _still_at(self) -> float:
+        return self._changed + self._spec.swing / self._spec.time_scale
+
+    def _rest(self) -> None:
+        if self._interrupted.wait(max(self._still_at - time.monotonic(), 0.0)):
+            raise LaboratoryError(f"balance {self._name}: interrupted")

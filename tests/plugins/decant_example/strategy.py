@@ -1,0 +1,57 @@
+"""A deployment: pour a Latin hypercube, then recommend what a surrogate of all pours says."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from orchestrator.config.yaml.sections import Switch
+from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.settings import DeploymentSettings
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import Scene
+
+
+class HypercubeSettings(DeploymentSettings):
+    """Hypercube: pour everywhere once, then use what was best."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "hypercube"}
+    simulates: ClassVar[bool] = False
+
+    strategy: Literal["hypercube"] = "hypercube"
+    """Pour everywhere once, then use what was best."""
+
+    centred: Switch = False
+    """Pour at the middles of the slices, and not anywhere in them."""
+
+    def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
+        """The strategy itself."""
+        return Hypercube(plan, scene, parameters, seed)
+
+
+class Hypercube(Deployment[HypercubeSettings]):
+    """As many slices of every dimension as there are pours, each poured from once.
+
+    Source: McKay, Beckman and Conover, A comparison of three methods for selecting values of input variables in the
+        analysis of output from a computer code, Technometrics 21, 1979.
+    Limitations: no pour learns from another one.
+    """
+
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        super().__init__(plan, scene, parameters, seed)
+        rng, count = self._seeds.rng, plan.pours
+        slices = np.stack([rng.permutation(count) for _ in plan.actions.axes], axis=1)
+        inside = np.full(slices.shape, 0.5) if self._settings.centred else rng.random(slices.shape)
+        self._points = [tuple(map(float, row)) for row in (slices + inside) / count]
+
+    def _next(self, free_simulations: int) -> None:
+        if self._pouring is not None:
+            return
+        if self._points and self._pours_left:
+            self._pour(self._points.pop(0), None)
+        else:
+            problem = self._problem(self._real(), count=0, map_resolution=MAP_RESOLUTION)
+            self._questions.put(problem, "conclude", self._conclude)

@@ -1,0 +1,177 @@
+"""A strategy and an objective from outside: one file each, and everything that knows ours knows them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.deployment.objectives import Objectives, Spillage
+from sim_engine.losses import Loss
+from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, replay
+from tests.orchestrator.toys import narrow_cup
+from tests.plugins.decant_example.objective import Gentle
+from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings
+
+ROOT = Path(__file__).parents[2]
+
+
+def plan(pours: int = 9, **changes: Any) -> DeploymentPlan:
+    return DeploymentPlan(HypercubeSettings(pours=pours, **changes), (SCENE,), ACTIONS, Loss())
+
+
+# -- the example itself ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("centred", [False, True])
+def test_every_slice_is_poured_from_once(centred: bool) -> None:
+    strategy = Hypercube(plan(centred=centred), SCENE, THETA, 3)
+    played = Play(narrow_cup)(strategy)
+    points = np.array([ACTIONS.encode(pour.action.values()) for pour in played.pours])
+    for column in points.T:
+        assert sorted(np.floor(9 * column - 1e-9 * column)) == list(range(9))
+        assert bool(np.allclose(np.sort(column), (np.arange(9) + 0.5) / 9)) is centred
+    assert strategy.finished
+    assert strategy.best_values is not None
+    assert not played.simulations
+
+
+def test_it_is_replayed_exactly() -> None:
+    played = Play(narrow_cup)(Hypercube(plan(), SCENE, THETA, 3))
+    replay(Hypercube(plan(), SCENE, THETA, 3), played)
+
+
+def test_an_objective_of_ones_own_takes_part_in_the_weighted_sum() -> None:
+    objectives = Objectives((Spillage(), Gentle(weight=0.3)))
+    assert objectives.names == ("spillage", "gentle")
+    slow, fast = (SCENE.action(ACTIONS.decode([u, 0.5])) for u in (0.0, 1.0))
+    worst = objectives.worst(SCENE, ACTIONS)
+    costs = [objectives.parts[1].cost(None, action, SCENE) for action in (slow, fast)]  # type: ignore[arg-type]
+    assert costs == pytest.approx([15 / 90, 120 / 90])
+    assert worst == (1.0, pytest.approx(120 / 90))
+
+
+# -- what knows it -----------------------------------------------------------------------------------------------------
+
+INSPECT = """
+import json, sys
+from pathlib import Path
+sys.path.insert(0, "docs")
+import make_tables
+from orchestrator.config.load import load_campaign
+from orchestrator.config.schema import campaign_schema
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.fingerprint import fingerprint
+from orchestrator.stages import stages_of
+
+folder = Path(sys.argv[1])
+plan = load_campaign(folder / "good.yaml")
+(folder / "record.json").write_text(json.dumps(plan.resolved))
+errors = {}
+for path in sorted(folder.glob("bad-*.yaml")):
+    try:
+        load_campaign(path)
+    except ConfigError as error:
+        errors[path.stem] = str(error)
+print(json.dumps({
+    "settings": type(plan.deployment.settings).__name__,
+    "strategy": type(stages_of(plan)[-1].build({}, 1)).__name__,
+    "again": load_campaign(folder / "record.json").deployment == plan.deployment,
+    "record": plan.resolved["deployment"],
+    "fingerprint": fingerprint(plan)["deployment"]["settings"],
+    "schema": json.dumps(campaign_schema()),
+    "tables": make_tables.TABLES["deployment-strategies"]() + make_tables.TABLES["objectives"](),
+    "errors": errors,
+}))
+"""
+
+CAMPAIGN = f"""\
+name: outside
+laboratory: {ROOT}/configs/laboratories/twin.yaml
+liquid: {{mass: 200 g}}
+pourer: {ROOT}/configs/vessels/beaker.yaml
+receiver: {ROOT}/configs/vessels/narrow.yaml
+motion: {{max_angle: 120 deg, height: 110 mm}}
+deployment:
+  strategy: hypercube
+  actions: {{angular_velocity: [20 deg/s, 120 deg/s], x_offset: [70 mm, 130 mm]}}
+  pours: 5
+  centred: true
+  objectives: [{{name: spillage}}, {{name: gentle, rough: 60 deg/s, weight: 0.2}}]
+"""
+
+BAD = {
+    "misspelt": ("centred: true", "centerd: true"),
+    "not-its-own": ("centred: true", "prior_simulations: 9"),
+    "nobodys": ("strategy: hypercube", "strategy: hyprcube"),
+    "not-of-the-objective": ("rough: 60 deg/s", "volume: 150 mL"),
+    "without-a-unit": ("rough: 60 deg/s", "rough: 60"),
+    "no-pours": ("  pours: 5\n", ""),
+}
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What a program says of it in an environment where the example is registered."""
+    folder, site = tmp_path_factory.mktemp("campaign"), tmp_path_factory.mktemp("site")
+    metadata = site / "decant_example-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: decant-example\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(
+        "[decant.strategies]\nhypercube = tests.plugins.decant_example.strategy:HypercubeSettings\n"
+        "[decant.objectives]\ngentle = tests.plugins.decant_example.objective:Gentle\n"
+    )
+    (folder / "good.yaml").write_text(CAMPAIGN)
+    for name, (old, new) in BAD.items():
+        assert old in CAMPAIGN
+        (folder / f"bad-{name}.yaml").write_text(CAMPAIGN.replace(old, new))
+    path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", INSPECT, str(folder)],
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    return dict(json.loads(done.stdout))
+
+
+def test_a_campaign_may_ask_for_it_and_its_record_loads_to_the_same(known: dict[str, Any]) -> None:
+    assert (known["settings"], known["strategy"]) == ("HypercubeSettings", "Hypercube")
+    assert known["again"] is True
+    assert (known["record"]["strategy"], known["record"]["centred"]) == ("hypercube", True)
+    assert known["fingerprint"]["centred"] is True
+
+
+def test_schema_and_tables_have_its_keys_and_their_meanings(known: dict[str, Any]) -> None:
+    for meaning in ("Pour at the middles of the slices", "An angular velocity that is as bad as spilling everything"):
+        assert meaning in known["schema"]
+        assert meaning in known["tables"]
+    assert "| hypercube | `centred` | `true` or `false` | `false` |" in known["tables"]
+    assert "| gentle | `rough` | 0.572958 … 572.958 deg/s | 90 deg/s |" in known["tables"]
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("misspelt", ":11:3: deployment.centerd: unknown key; did you mean 'centred'?"),
+        ("not-its-own", ":11:3: deployment.prior_simulations: belongs to D3, not to hypercube; remove it"),
+        ("nobodys", ":8:13: deployment.strategy: 'hyprcube' is not known here; did you mean 'hypercube'?"),
+        ("not-of-the-objective", "objectives[1].volume: belongs to target_volume, not to gentle; remove it"),
+        ("without-a-unit", "objectives[1].rough: 60 has no unit; write '60 deg/s' if that is what is meant"),
+        ("no-pours", ":7:1: deployment: key 'pours' is missing; hypercube learns on real pours"),
+    ],
+)
+def test_what_is_wrong_is_said_as_of_ours(known: dict[str, Any], case: str, message: str) -> None:
+    said = known["errors"][f"bad-{case}"]
+    assert message in said
+    assert said.count(".yaml:") == 1, "one cause, one message"
