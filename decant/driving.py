@@ -115,7 +115,7 @@ def plan(
     Raises:
         ValueError, LaboratoryError, RunError: see `run`.
     """
-    planned = planning_plan(campaign, None, None, iterations, None)
+    planned = planning_plan(campaign, None, None, iterations)
     deployment = planned.deployment
     assert deployment is not None
     if receiver is not None:

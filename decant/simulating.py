@@ -84,7 +84,7 @@ def simulate(
     chosen = assigned_action(
         [f"{name}={value}" for name, value in (action or {}).items()], fixed=scene.fixed, space=space
     )
-    if problems := check_vessels(scene):
+    if problems := check_vessels(scene, campaign.source):
         raise ValueError("\n".join(map(str, problems)))
     parameters = campaign.parameters if theta is None else theta
     tasks = [PourTask(scene, chosen, parameters, seed + i, FRAME_RATE if i == 0 else 0.0) for i in range(seeds)]

@@ -40,10 +40,10 @@ def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
-    return campaign_from(Document.read(resolved(path)), laboratory)
+    return campaign_from(Document.read(resolved(path)), laboratory, seed)
 
 
-def campaign_from(document: Document, laboratory: Path | None = None) -> CampaignPlan:
+def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
     """The plan of a campaign that was read already; relative paths in it start from the folder of its path.
 
     Raises:
