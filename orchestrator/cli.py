@@ -286,6 +286,14 @@ def validate(
     call(verb.validate, files)
 
 
+@app.command(epilog=examples("decant init lab", "decant run lab/campaigns/quickstart.yaml"))
+def init(directory: Annotated[Path, typer.Argument(help="A folder that is empty, or not there yet.")]) -> None:
+    """Copy a starting set into a folder: campaigns, laboratories, studies, vessels and weighed pours."""
+    from orchestrator.commands import starting
+
+    call(starting.init, directory)
+
+
 @app.command(
     epilog=examples("decant schema > campaign.json", "decant schema result > result.json"),
 )

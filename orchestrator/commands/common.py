@@ -171,6 +171,7 @@ def run_in_front_of_people(
     from orchestrator.publish import publish
     from orchestrator.report.table import print_summary
     from orchestrator.stages import stages_of
+    from sim_engine.extras import installed
 
     chosen = tuple(stages_of(plan) if stages is None else stages)
     pouring = any(stage.pours for stage in chosen)
@@ -185,7 +186,9 @@ def run_in_front_of_people(
         display = ProgressDisplay(plan, quiet=is_quiet())
         operator = person_at_the_terminal(spec, display.paused) if pouring else None
         laboratory = open_laboratory(spec, need_bench=pouring, operator=operator)
-        if plan.outputs.rrd:
+        if plan.outputs.rrd and not installed("rerun"):
+            say("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
+        elif plan.outputs.rrd:
             monitor = RerunMonitor(directory / "campaign.rrd", plan)
         with display:
             watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]

@@ -40,10 +40,19 @@ def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
+    return campaign_from(Document.read(resolved(path)), laboratory, seed)
+
+
+def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+    """The plan of a campaign that was read already; relative paths in it start from the folder of its path.
+
+    Raises:
+        ConfigError: as `load_campaign`.
+    """
     if laboratory is not None:
         load_laboratory(laboratory)  # what is wrong with it is not the campaign's fault
     report = Report()
-    place = Place(Document.read(resolved(path)))
+    place = Place(document)
     if (other := wrong_kind(place.document, "campaign")) is not None:
         raise ConfigError([other])
     section = validate(CampaignFile, place, report)
