@@ -103,18 +103,19 @@ def calibrate(path: Path, options: RunOptions) -> None:
 
 
 def calibration_json(finished: Finished) -> dict[str, Any]:
-    """θ* and mean |r − c_s| by split: its own, the median of random θ, the mean predictor's, the regression's."""
+    """θ* and mean |r − c_s| by split: its own, that of its rivals: see `Scorecard`."""
     from orchestrator.results import learnt_by
     from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta
     from orchestrator.strategies.calibration.base import Calibrated
     from orchestrator.strategies.calibration.evaluation import Scores
-    from orchestrator.strategies.calibration.scorecard import CALIBRATED
+    from orchestrator.strategies.calibration.scorecard import CALIBRATED, UNCALIBRATED
 
     results = finished.result.results
     theta, calibration = calibrated_theta(results).theta.model_dump(), learnt_by(results, CALIBRATION, Calibrated)
     evaluation = learnt_by(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
     rivals = {
+        "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,
         "regression": evaluation.regression,
