@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import pytest
@@ -83,3 +84,15 @@ def test_publishing_closes_the_recording_and_can_be_done_again(tmp_path: Path, r
     assert json.loads(summary)["theta"] == results["calibration"].found.theta.model_dump()
     publish(watched.campaign(), result, recording)
     assert (tmp_path / "run" / "summary.json").read_text() == summary
+
+
+def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    from orchestrator import results as module
+    from orchestrator.report.summary import summary_schema
+    from tests.orchestrator.scripted import Scripted
+
+    assert Scripted not in module.kinds()
+    settings = type("Settings", (), {"__module__": Scripted.__module__})
+    monkeypatch.setattr(module, "STRATEGIES", SimpleNamespace(all={"scripted": settings}))
+    assert Scripted in module.kinds()
+    assert "Scripted" in summary_schema()["$defs"]
