@@ -24,6 +24,7 @@ from orchestrator.report.results import (
 from orchestrator.results import AnyResult, Results
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.posterior import PosteriorSummary
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed, FrontAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.pours import Foretold
@@ -283,6 +284,7 @@ def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | Non
         return {}
     table: dict[str, dict[str, float | None]] = {}
     rivals = {
+        "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,
         "regression": evaluation.regression,
