@@ -185,7 +185,7 @@ def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> No
             if request.scene == "narrow":
                 theta = canonical(request.parameters.model_dump())
                 seeds.setdefault(theta, set()).add((request.action, request.seed))
-    assert len(seeds) == 4
+    assert len(seeds) == 5  # θ*, the uncalibrated θ and three random ones
     assert len({frozenset(of_theta) for of_theta in seeds.values()}) == 1
 
 
