@@ -160,6 +160,7 @@ class DeploymentPlan:
         data: pours of before the campaign.
         objectives: what is minimised in place of the loss.
         constraints: on actions, beside the bounds of their space.
+        confirm: how often the recommended action is poured again in each scene, after the strategy has ended.
         thetas: draws of a posterior, equally likely, for settings that need them, where no calibration of the same
             campaign makes them.
     """
@@ -171,6 +172,7 @@ class DeploymentPlan:
     data: ExistingPours | None = None
     objectives: Objectives | None = None
     constraints: tuple[Linear, ...] = ()
+    confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
 
     @property
@@ -186,6 +188,11 @@ class DeploymentPlan:
     def pours(self) -> int:
         """Real pours per scene."""
         return self.settings.pours or 0
+
+    def wanted(self, scene: Scene) -> float:
+        """Volume that should arrive in a scene's receiver [m³]: the load, unless less is asked for."""
+        share = 1.0 if self.objectives is None else self.objectives.wanted(scene)
+        return share * scene.liquid.volume
 
     @property
     def loss_name(self) -> str:

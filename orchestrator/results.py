@@ -15,6 +15,7 @@ from orchestrator.errors import RunError
 from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.strategies.calibration.design import DesignPoured
 from orchestrator.strategies.calibration.evaluation import Scores
+from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.one_pour import OnePoured
@@ -27,7 +28,7 @@ Results = Mapping[str, Learnt]
 """What the stages learnt, by their names, in order."""
 
 AnyResult = Annotated[
-    DesignPoured | Calibrated | Scores | Deployed | Foreseen | OnePoured | Tabled | FinalPoured,
+    DesignPoured | Calibrated | Scores | Deployed | Confirmed | Foreseen | OnePoured | Tabled | FinalPoured,
     Field(discriminator="kind"),
 ]
 """All kinds that Decant itself comes with."""

@@ -309,7 +309,10 @@ class StageScheduler:
 
         Cancelled again, it gives the pour up as well.
         """
-        reason = "asked to pause" if isinstance(error, asyncio.CancelledError) else f"{type(error).__name__}: {error}"
+        if isinstance(error, asyncio.CancelledError):
+            reason = "asked to pause"
+        else:  # the text of an error of ours says all; another one's is a defect, whose kind matters
+            reason = str(error) if isinstance(error, RunError) else f"{type(error).__name__}: {error}"
         pours: list[asyncio.Task[None]] = []
         others: list[asyncio.Task[None]] = []
         for flight in self._flights.values():

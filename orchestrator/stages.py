@@ -16,6 +16,7 @@ from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.protocol import Strategy
@@ -24,7 +25,7 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
 POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
-DEPLOYMENT, PREDICTION = "deployment:", "prediction:"
+DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "prediction:"
 """Names of a calibration's stages, and what those of receivers begin with."""
 
 POSTERIOR_DRAWS = 64
@@ -104,13 +105,17 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
         theta = calibrated_theta(results).theta
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        return Scorecard(theta, rivals, pours, plan.actions, seed)
+        plain = SimulationParameters.from_values(plan.fixed_parameters) if rivals else None
+        return Scorecard(theta, rivals, pours, plan.actions, seed, uncalibrated=plain)
 
     return [*stages, StageDefinition(CALIBRATION, calibration), StageDefinition(EVALUATION, evaluation)]
 
 
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
-    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated)."""
+    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated).
+
+    Each is followed by one that pours what was recommended again, where the plan asks for that.
+    """
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
@@ -119,15 +124,21 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
         return build
 
-    return [
-        StageDefinition(
-            DEPLOYMENT + name,
-            build_for(scene),
-            order=deployment.settings.order,
-            pours=deployment.pours > 0,
-        )
-        for name, scene in _by_receiver(deployment).items()
-    ]
+    def confirm_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            recommended = learnt_by(results, DEPLOYMENT + name, Deployed).recommended
+            costing = Costing.of(deployment, scene, _theta(plan, results))
+            return Confirmation(costing, recommended, deployment.confirm, seed)
+
+        return build
+
+    stages = []
+    for name, scene in _by_receiver(deployment).items():
+        order, pours = deployment.settings.order, deployment.pours > 0
+        stages.append(StageDefinition(DEPLOYMENT + name, build_for(scene), order=order, pours=pours))
+        if deployment.confirm:
+            stages.append(StageDefinition(CONFIRMATION + name, confirm_for(name, scene), pours=True))
+    return stages
 
 
 def prediction_stages(

@@ -23,6 +23,7 @@ from orchestrator.report import style
 from orchestrator.report.names import receiver_name
 from orchestrator.report.units import LossUnit, is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
+from orchestrator.strategies.deployment.confirm import PURPOSE as CONFIRM
 from orchestrator.strategies.progress import Progress
 from orchestrator.work import particles_of, work_of
 
@@ -65,6 +66,7 @@ class PourTally:
     predicted: str
     started_at: float
     calibrating: bool
+    confirming: bool = False
     progress: PourProgress | None = None
     result: str = ""
 
@@ -169,6 +171,7 @@ class Tally:
                     predicted,
                     event.time,
                     is_calibration(self.plan, pour),
+                    pour.purpose == CONFIRM,
                 )
 
     def _finished(self, event: RequestFinished) -> None:
@@ -187,7 +190,7 @@ class Tally:
                 loss = loss_of_pour(self.plan, pour, outcome.measurement)
                 if self.pour is not None:
                     self.pour.result = "too little was poured" if loss is None else unit.text(loss)
-                if loss is not None and not is_calibration(self.plan, pour):
+                if loss is not None and pour.purpose != CONFIRM and not is_calibration(self.plan, pour):
                     best = self.best.get(pour.scene)
                     if best is None or loss < best.loss:
                         self.best[pour.scene] = Best(loss, pour.number, unit)
@@ -237,9 +240,10 @@ class Tally:
         if pour.calibrating:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
-            total = self.plan.deployment.pours
+            total = self.plan.deployment.confirm if pour.confirming else self.plan.deployment.pours
         of = f"/{total}" if total else ""
-        line = f"pour {pour.number}{of} into {receiver_name(self.plan, pour.scene)}  {pour.action}"
+        kind = "confirming pour" if pour.confirming else "pour"
+        line = f"{kind} {pour.number}{of} into {receiver_name(self.plan, pour.scene)}  {pour.action}"
         if pour.predicted:
             line += f"  predicted {pour.predicted}"
         if pour.result:

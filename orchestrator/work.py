@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from actors.spec import LaboratorySpec
 from orchestrator.forecast import PRICE, Work
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
-from orchestrator.stages import CALIBRATION, DEPLOYMENT, EVALUATION, POURS
+from orchestrator.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, EVALUATION, POURS
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.space import Space
 from sim_engine.task import Scene
@@ -35,9 +35,10 @@ def _work(plan: CampaignPlan, name: str) -> Work:
             return Work(calibration.simulations, particles=particles_of(plan))
         if name == EVALUATION:
             return Work(_scored(calibration))
-    if deployment is not None and name.startswith(DEPLOYMENT):
+    if deployment is not None and name.startswith((DEPLOYMENT, CONFIRMATION)):
         pour = pour_time(plan.laboratory, deployment.scenes[0], deployment.actions)
-        return _deployed(deployment, pour)
+        confirming = name.startswith(CONFIRMATION)
+        return Work(pours=deployment.confirm, pour_time=pour) if confirming else _deployed(deployment, pour)
     return Work()
 
 

@@ -15,7 +15,7 @@ from actors.arm.protocol import PathReport
 from actors.arm.spec import ArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, say
 from orchestrator.config.yaml.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
 from orchestrator.strategies.calibration.prior import actions_all_over
@@ -108,16 +108,21 @@ def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) 
 
 def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
     """How many pours the stages may ask for."""
+    from orchestrator.stages import CONFIRMATION
+
     calibrating, deploying = _pouring(stages)
     count = plan.calibration.pour_count if plan.calibration is not None and calibrating else 0
-    return count + (plan.deployment.pours * deploying if plan.deployment is not None else 0)
+    if plan.deployment is None:
+        return count
+    confirming = sum(stage.name.startswith(CONFIRMATION) for stage in stages)
+    return count + plan.deployment.pours * deploying + plan.deployment.confirm * confirming
 
 
 def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
     """Whether the calibration's pours are among the stages, and how many deployments that pour."""
-    from orchestrator.stages import DEPLOYMENT
+    from orchestrator.stages import CONFIRMATION, DEPLOYMENT
 
-    names = [stage.name for stage in stages if stage.pours]
+    names = [stage.name for stage in stages if stage.pours and not stage.name.startswith(CONFIRMATION)]
     deploying = sum(name.startswith(DEPLOYMENT) for name in names)
     return deploying < len(names), deploying
 
@@ -142,12 +147,14 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
         return None
     if laboratory.mode != "hardware":
         if armed:
-            say(f"note: --arm has nothing to arm: laboratory {laboratory.name} is {laboratory.mode}, and moves nothing")
+            mention(
+                f"note: --arm has nothing to arm: laboratory {laboratory.name} is {laboratory.mode}, and moves nothing"
+            )
         return None
     require_flag(laboratory, armed=armed, again=f"decant {verb} {plan.source.name} --arm")
     assert laboratory.arm is not None
     checksum = accepted(plan)
-    say(f"planning paths from all over the actions of {plan.name} …")
+    mention(f"planning paths from all over the actions of {plan.name} …")
     found = envelope(laboratory.arm, campaign_pours(plan, stages))
     if not found.reports:
         raise RefusalError(

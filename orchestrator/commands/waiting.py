@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import TextIO
 
@@ -52,3 +54,27 @@ class Waiting:
         if self._shown:
             self._out.write("\r\x1b[K")
             self._out.flush()
+
+
+@contextlib.contextmanager
+def waiting_for(text: Callable[[], str], *, beat: float = 0.5) -> Iterator[None]:
+    """The same around something that never comes back to say what it is doing: a thread asks every now and then.
+
+    Args:
+        text: what is being done; called in that thread.
+        beat: how often it is asked [s].
+    """
+    done = threading.Event()
+    with Waiting() as doing:
+
+        def keep_current() -> None:
+            while not done.wait(beat):
+                doing(text())
+
+        thread = threading.Thread(target=keep_current, name="waiting", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()

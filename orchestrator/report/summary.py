@@ -15,6 +15,7 @@ from orchestrator.report.names import receiver_names
 from orchestrator.report.results import (
     SPLITS,
     calibrated_label,
+    confirmations_of,
     deployments_of,
     evaluation_of,
     predictions_of,
@@ -23,6 +24,8 @@ from orchestrator.report.results import (
 from orchestrator.results import AnyResult, Results
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.posterior import PosteriorSummary
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed, FrontAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.deployment.trust import Compared
@@ -155,6 +158,9 @@ class ReceiverSummary(Part):
     predicted_delivered_ml: float | None
     """The same by the liquid's density."""
 
+    confirmed: Confirmed | None
+    """What came of pouring the recommended action again; null where nobody asked for that."""
+
     not_covered: tuple[NotCovered, ...]
     """What is not simulated of the recommended action."""
 
@@ -237,7 +243,7 @@ def summarise(
         totals: how much the run took.
     """
     found = theta_of(results)
-    names, predictions = receiver_names(plan), predictions_of(results)
+    names, predictions, confirmations = receiver_names(plan), predictions_of(results), confirmations_of(results)
     spreads = {scene: foreseen.over_seeds for scene, foreseen in predictions.items()}
     liquids = {} if plan.deployment is None else {scene.name: scene.liquid for scene in plan.deployment.scenes}
     return RunSummary(
@@ -257,6 +263,7 @@ def summarise(
                 spreads.get(scene),
                 (best_not_covered or {}).get(scene, ()),
                 liquids.get(scene),
+                confirmations.get(scene),
             )
             for scene, result in deployments_of(results).items()
         },
@@ -277,6 +284,7 @@ def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | Non
         return {}
     table: dict[str, dict[str, float | None]] = {}
     rivals = {
+        "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,
         "regression": evaluation.regression,
@@ -297,6 +305,7 @@ def _receiver(
     prediction: dict[str, Spread] | None,
     not_covered: Sequence[NotCovered],
     liquid: Liquid | None,
+    confirmed: Confirmed | None,
 ) -> ReceiverSummary:
     pours, best = result.weighed, result.best
     received = None if prediction is None else prediction.get("received")
@@ -334,6 +343,7 @@ def _receiver(
         prediction=prediction,
         predicted_delivered_g=None if delivered is None else 1e3 * delivered,
         predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),
+        confirmed=confirmed,
         not_covered=tuple(not_covered),
     )
 

@@ -14,6 +14,7 @@ from orchestrator.report.risk import risk_line, window_line
 from orchestrator.report.summary import ReceiverSummary, RunSummary
 from orchestrator.report.trust import trust_line
 from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
+from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import FrontAction
 from sim_engine.spread import Spread
 
@@ -79,6 +80,7 @@ def _discrepancy_table(rows: Mapping[str, Mapping[str, float | None]]) -> Render
 
     columns = {
         "calibrated": "θ*",
+        "uncalibrated": "uncalibrated",
         "random_theta": "random θ (median)",
         "mean_predictor": "mean of training pours",
         "regression": "GP regression",
@@ -105,6 +107,7 @@ def _receiver_table(rows: Sequence[ReceiverSummary], unit: LossUnit) -> Renderab
         "best measured": ("right", [_best_measured(row, unit) for row in rows]),
         "delivered": ("right", [_amount(row.best_delivered_g, row.best_delivered_ml) for row in rows]),
         "best expected": ("right", [_best_expected(row, unit) for row in rows]),
+        "confirmed": ("right", [_confirmed(row.confirmed, unit) for row in rows]),
         "best action": ("left", [style.display_values(dict(row.best_action_si or {})) for row in rows]),
     }
     table = Table(title=unit.label, title_justify="left", title_style="", box=_box())
@@ -118,6 +121,14 @@ def _receiver_table(rows: Sequence[ReceiverSummary], unit: LossUnit) -> Renderab
 
 def _best_measured(row: ReceiverSummary, unit: LossUnit) -> str:
     return "" if row.best_loss is None else f"{unit.text(row.best_loss)} (pour {row.best_pour})"
+
+
+def _confirmed(found: Confirmed | None, unit: LossUnit) -> str:
+    """'1.40 ± 0.30 % (3 pours)': the mean, and how much a pour differs from it."""
+    if found is None or found.loss is None:
+        return ""
+    count = "1 pour" if found.loss.count == 1 else f"{found.loss.count} pours"
+    return f"{unit.text(found.loss.mean, found.loss.deviation)} ({count})"
 
 
 def _amount(grams: float | None, millilitres: float | None) -> str:
@@ -143,6 +154,10 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
             what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
             why = f": {'; '.join(row.failures)}" if row.failures else ""
             remarks.append(Text(f"  {receiver}: {what}{why}", style="yellow"))
+        if row.confirmed is not None:
+            lost = [f"pour {pour.number}: {pour.failed}" for pour in row.confirmed.pours if pour.failed]
+            if lost:
+                remarks.append(Text(f"  {receiver}, confirming pours that failed: {'; '.join(lost)}", style="yellow"))
         if row.gave_up:
             remarks.append(Text(f"  {receiver}: {row.gave_up}", style="yellow"))
         elif not _has_losses(row):

@@ -80,6 +80,7 @@ def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]
     common = {key: value for key, value in _common(section, LearningSection).items() if key != "receiver"}
     if plan.data is None:
         common.pop("data", None)
+    common["confirm"] = plan.confirm
     return {**common, "receivers": [one for one in receivers if one["name"] in wanted], **written(plan.settings)}
 
 

@@ -303,7 +303,7 @@ class Stepper:
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
         f.waited[s] += dt
-        if f.viscosity[s] > 0.0 and f.waited[s] >= f.wait[s]:
+        if f.waited[s] >= f.wait[s]:
             relax(f, s, f.waited[s])
             f.waited[s] = 0.0
         # Too late is unstable: before it could be, not after.

@@ -157,6 +157,17 @@ def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> Non
     assert {scene: best.pour for scene, best in tally.best.items()} == {"narrow cup": 3}
 
 
+def test_confirming_pours_are_counted_apart_and_are_no_best_so_far() -> None:
+    plan = watched.campaign()
+    assert plan.deployment is not None
+    tally = Tally(replace(plan, deployment=replace(plan.deployment, confirm=5)))
+    for event in watched.events(plan):
+        if isinstance(event, (RequestStarted, RequestFinished)) and isinstance(event.request, Pour):
+            tally(replace(event, request=replace(event.request, purpose="confirm")))
+    assert (tally.pour_line() or "").startswith("confirming pour 3/5 into narrow  ")
+    assert tally.best == {}
+
+
 def test_failed_pours_and_simulations_are_shown_as_such() -> None:
     plan = watched.campaign()
     tally = Tally(plan)

@@ -12,18 +12,23 @@ import pytest
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
 from orchestrator.codec import canonical
+from orchestrator.commands.arming import pour_count
 from orchestrator.errors import RunError
 from orchestrator.events import Event, RequestFinished
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour, RecordSet
+from orchestrator.report.summary import summarise
+from orchestrator.report.table import summary_table
 from orchestrator.requests import Pour, Simulate
 from orchestrator.stages import scenes_of, stages_of
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.settings import DeploymentSettings
+from orchestrator.work import work_of
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
 from sim_engine.vessel.spec import cylinder
 from tests.orchestrator import plans
+from tests.orchestrator.reported import shown
 from tests.orchestrator.toy import SCENE, SPACE, ToyLaboratory, logical_record, run_toy, toy_plan
 
 NARROW = replace(SCENE, name="narrow", receiver=cylinder("narrow", inner_radius=0.02, inner_height=0.1))
@@ -93,6 +98,33 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
     assert evaluation.random_median.keys() == {"test"}  # random θ are not simulated on training pours
     assert evaluation.mean_predictor["test"] is not None
     assert evaluation.regression["test"] is not None
+
+
+def test_what_is_recommended_is_poured_again_after_each_deployment(tmp_path: Path) -> None:
+    plan = campaign(tmp_path, calibration=None)
+    assert plan.deployment is not None
+    plan = replace(plan, deployment=replace(plan.deployment, confirm=2))
+    events: list[Event] = []
+    result = run(tmp_path / "run", plan, watchers=[events.append])
+    assert list(result.results) == ["deployment:cup", "confirmation:cup", "deployment:narrow", "confirmation:narrow"]
+    assert pour_count(plan, stages_of(plan)) == 2 * (2 + 2)
+    for scene in (SCENE, NARROW):
+        recommended = result.results[f"deployment:{scene.name}"].recommended
+        pours = [
+            event.request
+            for event in events
+            if isinstance(event, RequestFinished) and event.stage == f"confirmation:{scene.name}"
+        ]
+        assert [pour.action for pour in pours if isinstance(pour, Pour)] == 2 * [scene.action(recommended.action_si)]
+        confirmed = result.results[f"confirmation:{scene.name}"]
+        assert (confirmed.scene, confirmed.loss.count) == (scene.name, 2)
+    summary = summarise(plan, result.results)
+    found = summary.receivers[SCENE.name].confirmed
+    assert found is not None
+    text = " ".join(shown(summary_table(plan, summary)).split())
+    assert "confirmed" in text
+    assert "(2 pours)" in text
+    assert work_of(plan, ["confirmation:cup"])["confirmation:cup"].pours == 2
 
 
 def test_the_real_strategies_resume_as_if_nothing_had_happened(tmp_path: Path) -> None:

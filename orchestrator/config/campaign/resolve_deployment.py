@@ -36,6 +36,9 @@ def resolve_deployment(
         at = place.at("pours") if "pours" in settings.model_fields_set else place
         hint = "name one with a bench" if settings.learns_on_pours else "'pours: 0' only plans"
         report.add(at, f"laboratory '{laboratory.name}' has no bench to pour on; {hint}")
+    elif section.confirm and laboratory is not None and not laboratory.pours:
+        text = f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench, or remove it"
+        report.add(place.at("confirm"), text)
     loss = section.loss or LossSection()
     if loss.retained_weight is not None and loss.name != "spilled_and_retained":
         report.add(
@@ -54,7 +57,7 @@ def resolve_deployment(
             motions,
             () if actions is None else actions.names,
             place,
-            recorded=settings.pours == 0,
+            recorded=settings.pours == 0 and not section.confirm,
         )
         scenes.append(scene)
         if scene is None:
@@ -73,6 +76,7 @@ def resolve_deployment(
         data=data,
         objectives=resolve_objectives(section, place, complete[0], actions, report),
         constraints=constraints,
+        confirm=section.confirm,
     )
 
 

@@ -169,6 +169,9 @@ class DeploymentSection(Section):
     floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
     """Share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless given."""
 
+    confirm: Count = 0
+    """Pours of the recommended action at the end, which take no part in choosing it: what to expect of it."""
+
     @property
     def settings(self) -> DeploymentSettings:
         """What belongs to the strategy."""

@@ -170,7 +170,7 @@ def deployment_arms(
         rounds = changes.pop("iterations", None)
         settings = kind.like(base.settings, without=BUDGETS, **changes)
         settings.check(Premises(base.actions, base.objectives is not None), PlacedComplaints(at, report, frozenset()))
-        common = replace(base, settings=settings, data=None)
+        common = replace(base, settings=settings, data=None, confirm=0)  # a study has a 'confirm' of its own
         if rounds is None:
             arms.append(DeploymentArm(_label(key), common, repetitions))
         for n in sorted(set(rounds or ())):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import io
+import threading
+import time
+from functools import partial
 
 import pytest
 
-from orchestrator.commands import speaking
+from orchestrator.commands import single, speaking, waiting
 from orchestrator.commands.waiting import Waiting
 
 
@@ -37,3 +40,26 @@ def test_a_file_gets_a_line_now_and_then() -> None:
 def test_nobody_is_told_who_wants_it_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(speaking, "_quiet", True)
     assert waited(Terminal(), [5.0]) == ""
+
+
+class Slow:
+    """A simulator that takes its time, and never comes back in between."""
+
+    def simulate(self, task: object) -> object:
+        time.sleep(0.4)
+        return task
+
+    def close(self) -> None:
+        pass
+
+
+def test_simulate_says_which_seed_it_is_at_while_it_simulates(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(waiting, "EVERY", 0.1)
+    monkeypatch.setattr(single, "waiting_for", partial(waiting.waiting_for, beat=0.05))
+    assert single._simulated(Slow(), [1, 2]) == [1, 2]  # type: ignore[arg-type, list-item, comparison-overlap]
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[0].startswith("simulating seed 1 of 2, 0 s so far; the first pour ever also compiles kernels")
+    assert lines[-1].startswith("simulating seed 2 of 2, ")
+    assert all(t.name != "waiting" for t in threading.enumerate())

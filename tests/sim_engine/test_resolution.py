@@ -1,0 +1,33 @@
+"""What was learnt with one number of particles holds with another."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.liquid import SimulationParameters
+from sim_engine.pour import PourSimulator
+from sim_engine.validation.convergence import CHOSEN, FOUND, Pour, spillage
+
+HIDDEN = 0.3
+"""Friction of the liquid that is calibrated on."""
+TRIED = (0.0, 0.15, 0.3, 0.45, 0.6)
+TRAINING = (FOUND[1], FOUND[3], FOUND[5])
+ELSEWHERE = (FOUND[2], FOUND[6], CHOSEN[4])
+
+
+def spilled(simulator: PourSimulator, pours: tuple[Pour, ...], particles: int, friction: float) -> NDArray[np.float64]:
+    theta = SimulationParameters(particles=particles, cohesion=0.0, viscosity=1.0, friction=friction)
+    return np.array([spillage(simulator, pour, theta, seed=1)[0] for pour in pours])
+
+
+def test_what_is_calibrated_with_few_particles_predicts_with_more(simulator: PourSimulator) -> None:
+    """Friction that is found by 600 particles on pours of 2,000 is theirs, and holds for other vessels at 1,200."""
+    weighed = spilled(simulator, TRAINING, 2_000, HIDDEN)
+    errors = [float(np.abs(spilled(simulator, TRAINING, 600, f) - weighed).mean()) for f in TRIED]
+    found = TRIED[int(np.argmin(errors))]
+    assert abs(found - HIDDEN) <= 0.15
+    assert max(errors) > 2.0 * min(errors)  # the pours tell frictions apart
+    truth = spilled(simulator, ELSEWHERE, 2_000, HIDDEN)
+    predicted = spilled(simulator, ELSEWHERE, 1_200, found)
+    assert float(np.abs(predicted - truth).mean()) < 0.03
