@@ -23,6 +23,7 @@ from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.pool import RaySimulatorPool
 from actors.simulation.worker import Simulator, pour_simulator
 from actors.spec import LaboratorySpec
+from sim_engine.extras import installed
 
 if TYPE_CHECKING:
     from actors.cluster.site import Site
@@ -42,6 +43,11 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
             "(--laboratory configs/laboratories/twin.yaml)"
+        )
+    if not spec.in_process and not installed("ray"):
+        raise LaboratoryError(
+            f"laboratory {spec.name}: simulators side by side need Ray, which is not installed: pip install "
+            "'decant[lab]', or run with --in-process, one simulation after the other"
         )
     if spec.ray is not None and not spec.in_process:
         from actors.cluster.probe import check_cluster

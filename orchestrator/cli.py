@@ -18,10 +18,12 @@ from orchestrator.commands.options import (
     Json,
     OtherLaboratory,
     Parameters,
+    Quiet,
     Receiver,
     Resume,
     RunId,
     SceneName,
+    Seed,
     call,
     examples,
 )
@@ -29,7 +31,6 @@ from orchestrator.commands.options import (
 app = typer.Typer(
     name="decant",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="""Teach a robot arm to pour without spilling.
@@ -42,6 +43,23 @@ A campaign (YAML) says what is poured from where into what, which actions may be
 Exit codes: 0 done, 1 failed, 2 bad input (nothing was started), 3 a person has to answer, 130 interrupted.
 """,
 )
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"decant {version('decant')}")
+        raise typer.Exit
+
+
+@app.callback()
+def decant(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """What stands before the verbs."""
 
 
 class BackendChoice(StrEnum):
@@ -65,7 +83,9 @@ def run(
     in_process: InProcess = False,
     arm: Arm = False,
     laboratory: OtherLaboratory = None,
+    seed: Seed = None,
     as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/.
 
@@ -82,6 +102,7 @@ def run(
             answer=answer,
             in_process=in_process,
             laboratory=laboratory,
+            seed=seed,
             as_json=as_json,
             armed=arm,
         ),
@@ -102,7 +123,9 @@ def calibrate(
     in_process: InProcess = False,
     arm: Arm = False,
     laboratory: OtherLaboratory = None,
+    seed: Seed = None,
     as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Only calibrate: find the θ whose simulated spills match the weighed ones (C1 to C4), scored on unseen pours.
 
@@ -119,6 +142,7 @@ def calibrate(
             answer=answer,
             in_process=in_process,
             laboratory=laboratory,
+            seed=seed,
             as_json=as_json,
             armed=arm,
         ),
@@ -136,7 +160,7 @@ def plan(
     parameters: Parameters = None,
     receiver: Receiver = None,
     iterations: Annotated[int | None, typer.Option(min=2, help="Iterations of the optimiser.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="In place of the campaign's.")] = None,
+    seed: Seed = None,
     seeds: Annotated[
         int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction and its spread.")
     ] = 5,
@@ -144,8 +168,10 @@ def plan(
         int,
         typer.Option(min=0, max=50, help="Predict with so many θ of the posterior in --parameters; 0: with θ* alone."),
     ] = 0,
+    laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
     as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Plan a pour in simulation (D1), for the campaign's receivers or one that it never saw.
 
@@ -162,6 +188,7 @@ def plan(
         seed=seed,
         seeds=seeds,
         thetas=thetas,
+        laboratory=laboratory,
         in_process=in_process,
         as_json=as_json,
     )
@@ -186,6 +213,7 @@ def study(
         bool, typer.Option("--report", help="Only write figures, tables and page of what is there.")
     ] = False,
     as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare C1 to C4 and D1 to D3, repeated, on virtual benches that are more or less like the simulator.
 
@@ -217,6 +245,7 @@ def simulate(
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
     png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
     backend: Annotated[BackendChoice, typer.Option(help="Where the solver runs.")] = BackendChoice.CPU,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate one pour of a campaign's scene, with several seeds, and say where the liquid went.
 
@@ -249,11 +278,20 @@ def validate(
     files: Annotated[
         list[Path], typer.Argument(help="Campaign, study, vessel or laboratory files.", show_default=False)
     ],
+    quiet: Quiet = False,
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and that some action can be poured."""
     from orchestrator.commands import validate as verb
 
     call(verb.validate, files)
+
+
+@app.command(epilog=examples("decant init lab", "decant run lab/campaigns/quickstart.yaml"))
+def init(directory: Annotated[Path, typer.Argument(help="A folder that is empty, or not there yet.")]) -> None:
+    """Copy a starting set into a folder: campaigns, laboratories, studies, vessels and weighed pours."""
+    from orchestrator.commands import starting
+
+    call(starting.init, directory)
 
 
 @app.command(

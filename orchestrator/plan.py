@@ -189,6 +189,11 @@ class DeploymentPlan:
         """Real pours per scene."""
         return self.settings.pours or 0
 
+    def wanted(self, scene: Scene) -> float:
+        """Volume that should arrive in a scene's receiver [m³]: the load, unless less is asked for."""
+        share = 1.0 if self.objectives is None else self.objectives.wanted(scene)
+        return share * scene.liquid.volume
+
     @property
     def loss_name(self) -> str:
         """What results call that which is minimised."""

@@ -45,10 +45,16 @@ class ProgressDisplay:
         plan: of the campaign.
         console: where to write; by default stderr.
         clock: seconds, monotonic, for the plain lines.
+        quiet: only warnings and errors are wanted.
     """
 
     def __init__(
-        self, plan: CampaignPlan, *, console: Console | None = None, clock: Callable[[], float] = time.monotonic
+        self,
+        plan: CampaignPlan,
+        *,
+        console: Console | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        quiet: bool = False,
     ) -> None:
         if console is None:
             from rich.console import Console
@@ -56,6 +62,7 @@ class ProgressDisplay:
             console = Console(stderr=True, highlight=False)
         self._console = console
         self._clock = clock
+        self._quiet = quiet
         self._tally = Tally(plan)
         self._live: Live | None = None
         self._lock = threading.Lock()
@@ -63,7 +70,7 @@ class ProgressDisplay:
         self._held: list[str] | None = None
 
     def __enter__(self) -> ProgressDisplay:
-        if self._console.is_terminal:
+        if self._console.is_terminal and not self._quiet:
             from rich.live import Live
 
             # Rich draws in a thread of its own, four times a second, whatever the rate of events.
@@ -149,6 +156,8 @@ class ProgressDisplay:
     def _print(self, text: str, look: str = "") -> None:
         from rich.text import Text
 
+        if self._quiet and not look:
+            return
         if self._held is not None and not look:
             self._held.append(text)
             return

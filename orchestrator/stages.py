@@ -105,7 +105,8 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
         theta = calibrated_theta(results).theta
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        return Scorecard(theta, rivals, pours, plan.actions, seed)
+        plain = SimulationParameters.from_values(plan.fixed_parameters) if rivals else None
+        return Scorecard(theta, rivals, pours, plan.actions, seed, uncalibrated=plain)
 
     return [*stages, StageDefinition(CALIBRATION, calibration), StageDefinition(EVALUATION, evaluation)]
 

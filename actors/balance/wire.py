@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from actors.balance.dialects.dialect import LineSettings
 from actors.balance.errors import LineSettingsError, NoConnectionError
+from sim_engine.extras import require
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -160,6 +161,7 @@ class Wire:
 
 
 def _open(port: str, line: LineSettings, handshake: str) -> Serial:
+    require("serial", f"balance at {port}")
     import serial
 
     try:

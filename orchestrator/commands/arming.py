@@ -15,7 +15,7 @@ from actors.arm.protocol import PathReport
 from actors.arm.spec import ArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, say
 from orchestrator.config.yaml.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
 from orchestrator.strategies.calibration.prior import actions_all_over
@@ -147,12 +147,14 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
         return None
     if laboratory.mode != "hardware":
         if armed:
-            say(f"note: --arm has nothing to arm: laboratory {laboratory.name} is {laboratory.mode}, and moves nothing")
+            mention(
+                f"note: --arm has nothing to arm: laboratory {laboratory.name} is {laboratory.mode}, and moves nothing"
+            )
         return None
     require_flag(laboratory, armed=armed, again=f"decant {verb} {plan.source.name} --arm")
     assert laboratory.arm is not None
     checksum = accepted(plan)
-    say(f"planning paths from all over the actions of {plan.name} …")
+    mention(f"planning paths from all over the actions of {plan.name} …")
     found = envelope(laboratory.arm, campaign_pours(plan, stages))
     if not found.reports:
         raise RefusalError(

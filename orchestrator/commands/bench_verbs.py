@@ -14,6 +14,8 @@ from orchestrator.commands.options import (
     InProcess,
     Json,
     Laboratory,
+    OtherLaboratory,
+    Quiet,
     SceneName,
     call,
 )
@@ -73,9 +75,11 @@ def pour(
         bool, typer.Option("--empty", help="The whole cycle with an empty pourer, and nothing weighed.")
     ] = False,
     slow: Annotated[float, typer.Option(min=0.05, max=1.0, help="With --empty: fraction of the planned speed.")] = 1.0,
+    laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
     arm: Arm = False,
     as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Pour once, with an action of your own, on the campaign's bench; or only plan it, or try it with an empty pourer.
 
@@ -94,6 +98,7 @@ def pour(
         empty=empty,
         slow=slow,
         armed=arm,
+        laboratory=laboratory,
         in_process=in_process,
         as_json=as_json,
     )

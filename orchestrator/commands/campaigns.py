@@ -14,7 +14,7 @@ from orchestrator.commands.common import (
     read_campaign,
     run_in_front_of_people,
 )
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -38,6 +38,8 @@ class RunOptions:
     in_process: bool
     laboratory: Path | None
     """In place of the campaign's."""
+    seed: int | None
+    """In place of the campaign's."""
     as_json: bool
     armed: bool
     """Hardware may move in this run."""
@@ -47,7 +49,7 @@ def run(path: Path, options: RunOptions) -> None:
     """The whole campaign."""
     from orchestrator.report.summary import summary_json
 
-    plan = read_campaign(path, options.laboratory)
+    plan = read_campaign(path, options.laboratory, options.seed)
     check_campaign_can_run(plan)
     _check_posterior(plan)
     finished = _run(plan, "run", path, options)
@@ -88,7 +90,7 @@ def calibrate(path: Path, options: RunOptions) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
     from orchestrator.stages import calibration_stages
 
-    plan = read_campaign(path, options.laboratory)
+    plan = read_campaign(path, options.laboratory, options.seed)
     if plan.calibration is None:
         raise RefusalError(f"{path}: has no 'calibration' section; there is nothing to calibrate", BAD_INPUT)
     # The deployment stays out: its vessels need not be there yet.
@@ -101,18 +103,19 @@ def calibrate(path: Path, options: RunOptions) -> None:
 
 
 def calibration_json(finished: Finished) -> dict[str, Any]:
-    """θ* and mean |r − c_s| by split: its own, the median of random θ, the mean predictor's, the regression's."""
+    """θ* and mean |r − c_s| by split: its own, that of its rivals: see `Scorecard`."""
     from orchestrator.results import learnt_by
     from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta
     from orchestrator.strategies.calibration.base import Calibrated
     from orchestrator.strategies.calibration.evaluation import Scores
-    from orchestrator.strategies.calibration.scorecard import CALIBRATED
+    from orchestrator.strategies.calibration.scorecard import CALIBRATED, UNCALIBRATED
 
     results = finished.result.results
     theta, calibration = calibrated_theta(results).theta.model_dump(), learnt_by(results, CALIBRATION, Calibrated)
     evaluation = learnt_by(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
     rivals = {
+        "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,
         "regression": evaluation.regression,
@@ -142,6 +145,7 @@ def plan_pour(
     seed: int | None,
     seeds: int,
     thetas: int,
+    laboratory: Path | None,
     in_process: bool,
     as_json: bool,
 ) -> None:
@@ -151,7 +155,7 @@ def plan_pour(
     from orchestrator.strategies.deployment.learnt import Deployed
     from orchestrator.strategies.repeats import Foreseen
 
-    plan = planning_plan(read_campaign(path), parameters, receiver, iterations, seed)
+    plan = planning_plan(read_campaign(path, laboratory, seed), parameters, receiver, iterations)
     check_campaign_can_run(plan, as_written=receiver is None)
     assert plan.deployment is not None
     planning = deployment_stages(plan, plan.deployment)
@@ -160,7 +164,9 @@ def plan_pour(
     check_laboratory_answers(plan, stages, in_process=in_process)
     directory = run_directory(plan, resume=False, run_id=None)
     if parameters is None:
-        say(f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})")
+        mention(
+            f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})"
+        )
     finished = run_in_front_of_people(
         plan,
         directory,
@@ -216,7 +222,7 @@ def _drawn(plan: CampaignPlan, parameters: Path | None, thetas: int) -> tuple[Si
 
 
 def planning_plan(
-    plan: CampaignPlan, parameters: Path | None, receiver: Path | None, iterations: int | None, seed: int | None
+    plan: CampaignPlan, parameters: Path | None, receiver: Path | None, iterations: int | None
 ) -> CampaignPlan:
     """A campaign turned into D1 without pours.
 
@@ -262,7 +268,6 @@ def planning_plan(
         parameters=theta,
         calibration=None,
         deployment=deployment,
-        seed=plan.seed if seed is None else seed,
     )
 
 
@@ -284,6 +289,7 @@ def _run(
     check_laboratory_answers(plan, chosen, in_process=options.in_process)
     directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
     flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
+    flag += "" if options.seed is None else f" --seed {options.seed}"
     flag += " --arm" if plan.laboratory.mode == "hardware" else ""
     again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
     finished = run_in_front_of_people(
@@ -297,7 +303,7 @@ def _run(
         checksum=checksum,
     )
     if finished.published.theta is not None:
-        say(f"θ* is in {finished.published.theta}; use it with --parameters")
+        mention(f"θ* is in {finished.published.theta}; use it with --parameters")
     return finished
 
 

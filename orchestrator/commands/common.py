@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from orchestrator.commands.speaking import (
     FAILED,
     INTERRUPTED,
     RefusalError,
+    is_quiet,
     mention,
     say,
     stdout_for_results,
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from orchestrator.stages import StageDefinition
 
 
-def read_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
-    """A campaign's plan, on another laboratory if one is given.
+def read_campaign(path: Path, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+    """A campaign's plan, on another laboratory or with another seed if one is given.
 
     Raises:
         RefusalError: with all problems of its files, exit code 2.
@@ -39,7 +39,7 @@ def read_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
     from orchestrator.config.yaml.errors import ConfigError
 
     try:
-        return load_campaign(path, laboratory)
+        return load_campaign(path, laboratory, seed)
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
 
@@ -79,7 +79,7 @@ def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinitio
 
     laboratory = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
     if laboratory.ray is not None and not laboratory.in_process:
-        say(f"looking at the Ray cluster at {laboratory.ray.address} …")
+        mention(f"looking at the Ray cluster at {laboratory.ray.address} …")
     try:
         check_laboratory(laboratory, need_bench=any(stage.pours for stage in stages))
     except LaboratoryError as error:
@@ -92,20 +92,37 @@ def check_output(path: Path | None, option: str, suffix: str) -> None:
     Raises:
         RefusalError: it can't be written there, or has the wrong suffix (exit code 2).
     """
+    from orchestrator.config.yaml.files import why_unreadable
+
     if path is None:
         return
     folder = path.absolute().parent
-    if path.is_dir():
+    if why_unreadable(path) == "is a directory; name a file in it":
         problem = "is a folder; name a file in it"
     elif path.suffix.lower() != suffix:
         problem = f"should end in {suffix}"
     elif not folder.is_dir():
         problem = "its folder does not exist"
-    elif not os.access(path if path.exists() else folder, os.W_OK):
-        problem = "can't be written; the permission is missing"
+    elif (why := _why_not_opened(path)) is not None:
+        problem = f"can't be written: {why}"
     else:
         return
     raise RefusalError(f"{option} {path}: {problem}", BAD_INPUT)
+
+
+def _why_not_opened(path: Path) -> str | None:
+    """Found out by opening it: permissions don't tell of full disks, names too long, and folders of the system."""
+    from orchestrator.config.yaml.files import why_unreadable
+
+    there = why_unreadable(path) != "no such file"
+    try:
+        with path.open("ab"):
+            pass
+        if not there:
+            path.unlink()
+    except (OSError, ValueError) as error:
+        return getattr(error, "strerror", None) or str(error)
+    return None
 
 
 @dataclass(frozen=True)
@@ -154,21 +171,24 @@ def run_in_front_of_people(
     from orchestrator.publish import publish
     from orchestrator.report.table import print_summary
     from orchestrator.stages import stages_of
+    from sim_engine.extras import installed
 
     chosen = tuple(stages_of(plan) if stages is None else stages)
     pouring = any(stage.pours for stage in chosen)
     spec = replace(
         plan.laboratory, in_process=in_process or plan.laboratory.in_process, accepted_checksum=checksum or ""
     )
-    say(f"run {directory}  ({spec.mode} bench)" if pouring else f"run {directory}")
+    mention(f"run {directory}  ({spec.mode} bench)" if pouring else f"run {directory}")
     if not resume:
         _warn_of_what_is_not_simulated(plan)
     monitor: RerunMonitor | None = None
     try:
-        display = ProgressDisplay(plan)
+        display = ProgressDisplay(plan, quiet=is_quiet())
         operator = person_at_the_terminal(spec, display.paused) if pouring else None
         laboratory = open_laboratory(spec, need_bench=pouring, operator=operator)
-        if plan.outputs.rrd:
+        if plan.outputs.rrd and not installed("rerun"):
+            say("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
+        elif plan.outputs.rrd:
             monitor = RerunMonitor(directory / "campaign.rrd", plan)
         with display:
             watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]
@@ -226,7 +246,7 @@ def _warn_of_what_is_not_simulated(plan: CampaignPlan) -> None:
     from orchestrator.report.names import receiver_names
 
     for line in regimes.lines(worked_out(lambda: regimes.campaign_warnings(plan), say), receiver_names(plan)):
-        say(line)
+        mention(line)
 
 
 async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, resumable: bool) -> CampaignResult:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.commands.speaking import INTERRUPTED, RefusalError, fail
+from orchestrator.commands.speaking import INTERRUPTED, RefusalError, fail, hush
 
 Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
@@ -28,6 +28,16 @@ OtherLaboratory = Annotated[
     Path | None,
     typer.Option("--laboratory", help="Laboratory file (YAML) in place of the campaign's.", show_default=False),
 ]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet",
+        "-q",
+        callback=hush,
+        help="Only results, questions, warnings of a run, and errors: no progress, no notes.",
+    ),
+]
+Seed = Annotated[int | None, typer.Option(min=0, help="In place of the campaign's.", show_default=False)]
 Assignments = Annotated[
     list[str] | None,
     typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from actors.arm.protocol import PathReport, PlannedPour
 from orchestrator.commands.arming import accepted, confirm, report_lines, require_flag
 from orchestrator.commands.common import check_output, read_campaign
-from orchestrator.commands.single import scene_to_simulate
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
+from orchestrator.commands.single import scene_to_simulate, wanted_in
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, mention, print_json, say
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -50,6 +50,7 @@ def pour(
     empty: bool,
     slow: float,
     armed: bool,
+    laboratory: Path | None,
     in_process: bool,
     as_json: bool,
 ) -> None:
@@ -65,6 +66,7 @@ def pour(
         empty: the whole cycle with an empty pourer, nothing weighed.
         slow: with `empty`, fraction of the planned speed.
         armed: whether `--arm` was given.
+        laboratory: file in place of the campaign's.
         in_process: without Ray.
         as_json: print the result as JSON.
 
@@ -73,11 +75,11 @@ def pour(
     """
     _check_options(dry_run=dry_run, connect=connect, empty=empty, slow=slow)
     check_output(png, "--png", ".png")
-    chosen = _chosen(path, assignments, scene_name)
-    laboratory = chosen.plan.laboratory
+    chosen = _chosen(path, laboratory, assignments, scene_name)
+    bench = chosen.plan.laboratory
     if chosen.path is None and (dry_run or empty or png is not None):
         raise RefusalError(
-            f"laboratory {laboratory.name} has no arm whose path could be planned; its bench is made of numbers",
+            f"laboratory {bench.name} has no arm whose path could be planned; its bench is made of numbers",
             BAD_INPUT,
         )
     if png is not None:
@@ -85,15 +87,15 @@ def pour(
     if dry_run:
         _dry_run(chosen, connect=connect, as_json=as_json)
         return
-    again = f"decant pour {path} … --arm"
-    require_flag(laboratory, armed=armed, again=again)
+    verb = f"decant pour {path}" + ("" if laboratory is None else f" --laboratory {laboratory}")
+    require_flag(bench, armed=armed, again=f"{verb} … --arm")
     if empty:
         from orchestrator.commands.pour_empty import pour_empty
 
         assert chosen.path is not None
         pour_empty(chosen.plan, chosen.action, chosen.path.slowed(slow), slow=slow, as_json=as_json)
         return
-    _pour(chosen, in_process=in_process, again=f"Another pour: decant pour {path} …", as_json=as_json)
+    _pour(chosen, in_process=in_process, again=f"Another pour: {verb} …", as_json=as_json)
 
 
 def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) -> None:
@@ -108,7 +110,7 @@ def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) ->
         )
 
 
-def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chosen:
+def _chosen(path: Path, laboratory: Path | None, assignments: list[str], scene_name: str | None) -> Chosen:
     """The pour that is asked for, its path planned and checked.
 
     Raises:
@@ -118,13 +120,13 @@ def _chosen(path: Path, assignments: list[str], scene_name: str | None) -> Chose
     from orchestrator.config.campaign.assignments import assigned_action
     from orchestrator.config.campaign.check import check_vessels
 
-    plan = read_campaign(path)
+    plan = read_campaign(path, laboratory)
     scene, space = scene_to_simulate(plan, scene_name)
     try:
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
     except ValueError as error:
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
-    problems = check_vessels(scene, plan.source)
+    problems = check_vessels(scene, plan.source, wanted_in(plan, scene, scene_name))
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     if not plan.laboratory.pours:
@@ -162,14 +164,14 @@ def _draw(chosen: Chosen, png: Path) -> None:
         title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
         note=chosen.action.display(),
     )
-    say(f"picture: {drawn}")
+    mention(f"picture: {drawn}")
 
 
 def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
     planned, laboratory = chosen.path, chosen.plan.laboratory
     assert planned is not None
     assert laboratory.arm is not None
-    say(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
+    mention(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
     home = _stands_at_home(chosen) if connect else None
     if as_json:
         print_json(

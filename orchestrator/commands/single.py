@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.commands.common import check_output, read_campaign
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, mention, print_json, stdout_for_results
 from orchestrator.commands.waiting import waiting_for
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def simulate(
         raise RefusalError(f"--set: {error}", BAD_INPUT) from None
     check_output(rrd, "--rrd", ".rrd")
     check_output(png, "--png", ".png")
-    problems = check_vessels(scene, plan.source)
+    problems = check_vessels(scene, plan.source, wanted_in(plan, scene, scene_name))
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     record_rate = 20.0 if rrd or png else 0.0
@@ -102,12 +102,25 @@ def simulate(
             }
         )
     else:
-        say(f"{scene.name}: {action.display()}")
+        mention(f"{scene.name}: {action.display()}")
         amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
         print(told(outcomes, over_seeds, amount))
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)
+
+
+def wanted_in(plan: CampaignPlan, scene: Scene, name: str | None) -> float | None:
+    """Volume that a scene's receiver has to hold where less than the load is asked for [m³]; None for all of it.
+
+    Args:
+        plan: the campaign.
+        scene: one that `scene_to_simulate` gave, perhaps with another receiver.
+        name: as given to that.
+    """
+    if plan.deployment is None or name in ("calibration", "transfer"):
+        return None
+    return plan.deployment.wanted(scene)
 
 
 def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:
@@ -158,11 +171,11 @@ def _regimes(task: PourTask) -> Regimes | None:
     try:
         found = regimes_of(task.scene, task.action, task.parameters.particles)
     except (ValueError, OSError) as error:
-        say(f"note: whether something is not simulated could not be worked out: {error}")
+        mention(f"note: whether something is not simulated could not be worked out: {error}")
         return None
-    say(f"{numbers_line(found)} (Reynolds, Weber and Bond numbers)")
+    mention(f"{numbers_line(found)} (Reynolds, Weber and Bond numbers)")
     for one in found.not_covered:
-        say(f"not simulated, {one.kind}: {one.text}")
+        mention(f"not simulated, {one.kind}: {one.text}")
     return found
 
 
@@ -193,11 +206,11 @@ def _show(task: PourTask, pour: SimulatedPour, rrd: Path | None, png: Path | Non
     if rrd is not None:
         from orchestrator.monitor.simulation import simulation_rrd
 
-        say(f"recording: {simulation_rrd(rrd, task, pour)} (open it with: rerun {rrd})")
+        mention(f"recording: {simulation_rrd(rrd, task, pour)} (open it with: rerun {rrd})")
     if png is not None:
         from orchestrator.report.scene import simulation_png
 
-        say(f"picture: {simulation_png(png, task, pour)}")
+        mention(f"picture: {simulation_png(png, task, pour)}")
 
 
 def schema(which: str) -> None:

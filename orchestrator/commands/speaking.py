@@ -32,10 +32,11 @@ def say(text: str) -> None:
 _quiet = False
 
 
-def hush(quiet: bool) -> None:
-    """From now on `mention` says nothing; questions, warnings of what moves, and errors are still told."""
+def hush(quiet: bool) -> bool:
+    """Whether from now on `mention` says nothing; questions, warnings of what moves, and errors are still told."""
     global _quiet
-    _quiet = _quiet or quiet
+    _quiet = quiet
+    return quiet
 
 
 def is_quiet() -> bool:

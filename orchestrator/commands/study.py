@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.speaking import BAD_INPUT, INTERRUPTED, RefusalError, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, INTERRUPTED, RefusalError, mention, print_json
 
 if TYPE_CHECKING:
     from orchestrator.study.cells import Cell
@@ -118,8 +118,8 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> Status:
     cells = cells_of(plan)
     finished = finished_results(folder, cells)
     if len(finished) < len(cells) and (text := warning(finished)) is not None:
-        say(text)
-    say(f"study {folder}, {jobs} at a time")
+        mention(text)
+    mention(f"study {folder}, {jobs} at a time")
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}")]
     try:
         with Progress(*columns, console=Console(stderr=True)) as bar, _ending_like_ctrl_c():
@@ -159,5 +159,5 @@ def _report(plan: StudyPlan, folder: Path) -> Path:
     from orchestrator.study.report.page import write_report
 
     page = write_report(plan, folder)
-    say(f"figures, tables and a page: {page}")
+    mention(f"figures, tables and a page: {page}")
     return page

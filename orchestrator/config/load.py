@@ -29,23 +29,37 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.spec import VesselSpec
 
 
-def load_campaign(path: Path, laboratory: Path | None = None) -> CampaignPlan:
+def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
     """The plan of a campaign file, with everything that it refers to.
 
     Args:
         path: of the file.
         laboratory: of a file in place of the campaign's own.
+        seed: in place of the campaign's own.
 
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
+    return campaign_from(Document.read(resolved(path)), laboratory, seed)
+
+
+def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+    """The plan of a campaign that was read already; relative paths in it start from the folder of its path.
+
+    Raises:
+        ConfigError: as `load_campaign`.
+    """
+    if laboratory is not None:
+        load_laboratory(laboratory)  # what is wrong with it is not the campaign's fault
     report = Report()
-    place = Place(Document.read(resolved(path)))
+    place = Place(document)
     if (other := wrong_kind(place.document, "campaign")) is not None:
         raise ConfigError([other])
     section = validate(CampaignFile, place, report)
     if section is not None and laboratory is not None:
         section = section.model_copy(update={"laboratory": str(resolved(laboratory))})
+    if section is not None and seed is not None:
+        section = section.model_copy(update={"seed": seed})
     plan = None if section is None else resolve_campaign(section, place, report)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"

@@ -89,13 +89,14 @@ VesselFile: Any = _vessel_file()
 class LiquidFile(Section):
     """What is poured."""
 
-    required: ClassVar[dict[str, str]] = {"mass": "200 g"}
-
     name: Text = "water"
     """For people."""
 
     mass: Annotated[float, Quantity("kg", "200 g", lower=1e-4, upper=20.0)] | None = None
-    """Mass that is loaded into the pourer."""
+    """Mass that is loaded into the pourer; or give `volume`."""
+
+    volume: Annotated[float, Quantity("m^3", "200 mL", lower=1e-7, upper=0.02)] | None = None
+    """Volume that is loaded, from which the mass follows; or give `mass`, which a balance tells better."""
 
     density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] = 998.0
     """Density; water's at 20 °C unless given."""
@@ -182,13 +183,23 @@ def _mesh(section: VesselBase, place: Place, report: Report) -> MeshShape | None
     return MeshShape(path=path, unit=section.unit, up=section.up or "z")
 
 
-def resolve_liquid(section: LiquidFile) -> Liquid | None:
-    """The liquid of a file, None if its mass is missing (which is reported already)."""
-    if section.mass is None:
+def resolve_liquid(section: LiquidFile, place: Place, report: Report) -> Liquid | None:
+    """The liquid of a file; problems go to the report, and then the answer is None."""
+    if section.mass is not None and section.volume is not None:
+        report.add(place.at("volume"), "the load has a mass already; keep one of 'mass' and 'volume'", key=True)
         return None
+    if section.mass is None and section.volume is None:
+        if not any(report.is_broken(place.at(key)) for key in ("mass", "volume")):
+            text = "key 'mass' is missing; add for example 'mass: 200 g', or 'volume: 200 mL'"
+            report.add(place, text, key=True)
+        return None
+    mass = section.mass
+    if mass is None:
+        assert section.volume is not None
+        mass = section.volume * section.density
     return Liquid(
         name=section.name,
-        mass=section.mass,
+        mass=mass,
         density=section.density,
         surface_tension=section.surface_tension,
         dynamic_viscosity=section.dynamic_viscosity,

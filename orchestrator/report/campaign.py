@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
 from orchestrator.report.figures import draw_discrepancy, draw_spillage
 from orchestrator.report.maps import draw_surrogate, draw_trials
 from orchestrator.report.names import receiver_name
@@ -28,14 +30,13 @@ from orchestrator.report.window import draw_window
 from orchestrator.results import Results
 from orchestrator.strategies.deployment.trust import Compared
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _log = logging.getLogger(__name__)
 
 
-def draw_figures(
-    directory: Path,
-    plan: CampaignPlan,
-    results: Results,
-) -> dict[str, Path]:
+def draw_figures(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Path]:
     """Draw what the results allow: discrepancy map and trials, test discrepancy, spillage against pours, loss maps,
     and the first pours against what was simulated.
 
@@ -52,6 +53,27 @@ def draw_figures(
     Returns:
         Name of each figure → its file.
     """
+    drawn: dict[str, Path] = {}
+    for name, job in _jobs(directory, plan, results).items():
+        try:
+            drawn[name] = job()
+        except Exception as error:
+            _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
+    return drawn
+
+
+def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
+    """The same figures, not written: for notebooks. One that can't be drawn raises what went wrong with it."""
+    found = {}
+    for name, job in _jobs(Path(), plan, results).items():
+        with style.unsaved() as figures:
+            job()
+        found[name] = figures[0]
+    return found
+
+
+def _jobs(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Path]]:
+    """What draws each figure."""
     jobs: dict[str, Callable[[], Path]] = {}
     calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
     if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
@@ -87,10 +109,4 @@ def draw_figures(
                 jobs[f"trust {name}"] = lambda t=trust, n=name: draw_trust(  # type: ignore[misc]
                     directory / f"trust-{safe_name(n)}.png", t, unit=unit, receiver=n
                 )
-    drawn: dict[str, Path] = {}
-    for name, job in jobs.items():
-        try:
-            drawn[name] = job()
-        except Exception as error:
-            _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
-    return drawn
+    return jobs

@@ -155,6 +155,7 @@ class DiscrepancyGroup:
         name: 'training pours', 'test pours', 'another receiver'.
         pours: how many.
         calibrated: of the calibrated simulator θ*.
+        uncalibrated: of the simulator as it is without calibration; None if not scored.
         random: of the simulator with θ drawn at random, one number each; empty if not scored.
         mean_predictor: of 'what the training pours spilled on average'; None if not scored.
         regression: of a GP regression without simulator; None where it can't answer (another vessel).
@@ -163,13 +164,14 @@ class DiscrepancyGroup:
     name: str
     pours: int
     calibrated: float
+    uncalibrated: float | None = None
     random: Sequence[float] = ()
     mean_predictor: float | None = None
     regression: float | None = None
 
 
 def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: str) -> Path:
-    """Mean |Δ| of θ* beside its rivals: random θ (median, quartiles), mean of training pours, GP regression.
+    """Mean |Δ| of θ* beside its rivals: uncalibrated, random θ (median, quartiles), mean of training pours, regression.
 
     Args:
         path: PNG to write.
@@ -185,12 +187,13 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
     if not groups:
         raise ValueError("discrepancy figure: no set of pours was scored")
     figure, axes = style.new_figure(size=(2.2 + 2.5 * len(groups), 4.4))
-    width = 0.19
+    width = 0.17
     named: set[str] = set()
     top, left, middles = 0.0, 0.0, []
     for group in groups:
         every: list[tuple[str, float | None, str, tuple[float, float] | None]] = [
             ("calibrated simulator θ*", group.calibrated, style.BEST, None),
+            ("uncalibrated simulator", group.uncalibrated, style.PREDICTED, None),
             (*_random(group.random),),
             ("mean of training pours", group.mean_predictor, style.PALE, None),
             ("GP regression, no simulator", group.regression, style.FALLING, None),

@@ -17,6 +17,7 @@ from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, d
 from orchestrator.results import Results
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.display import DisplayedMap
@@ -66,8 +67,9 @@ def predictions_of(results: Results) -> dict[str, Foreseen]:
 
 
 def calibrated_label(evaluation: Scores) -> str | None:
-    """Under which label an evaluation scored θ*: the one that isn't random."""
-    return next((label for label in evaluation.discrepancy if not label.startswith("random ")), None)
+    """Under which label an evaluation scored θ*: the one that is no rival's."""
+    rivals = ("random ", UNCALIBRATED)
+    return next((label for label in evaluation.discrepancy if not label.startswith(rivals)), None)
 
 
 def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
@@ -86,6 +88,7 @@ def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
                 name,
                 sum(pair.split == split and pair.theta == label for pair in evaluation.pairs),
                 own,
+                evaluation.discrepancy.get(UNCALIBRATED, {}).get(split),
                 [value for value in rivals if value is not None],
                 evaluation.mean_predictor.get(split),
                 evaluation.regression.get(split),

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -199,12 +202,29 @@ def at_ends(values: dict[str, float | None], axes: tuple[Axis, ...]) -> list[str
     return said
 
 
+_UNSAVED: ContextVar[list[Figure] | None] = ContextVar("unsaved figures", default=None)
+
+
+@contextlib.contextmanager
+def unsaved() -> Iterator[list[Figure]]:
+    """What would be written as PNG meanwhile is collected instead: for notebooks, which show figures themselves."""
+    figures: list[Figure] = []
+    token = _UNSAVED.set(figures)
+    try:
+        yield figures
+    finally:
+        _UNSAVED.reset(token)
+
+
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG; the folder is made if needed.
+    """Write a PNG, unless `unsaved` collects it; the folder is made if needed.
 
     Raises:
         OSError: the file can't be written.
     """
+    if (figures := _UNSAVED.get()) is not None:
+        figures.append(figure)
+        return path
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=DPI, facecolor="white")
     return path

@@ -80,6 +80,7 @@ def _discrepancy_table(rows: Mapping[str, Mapping[str, float | None]]) -> Render
 
     columns = {
         "calibrated": "θ*",
+        "uncalibrated": "uncalibrated",
         "random_theta": "random θ (median)",
         "mean_predictor": "mean of training pours",
         "regression": "GP regression",

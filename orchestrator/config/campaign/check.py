@@ -96,26 +96,41 @@ class _Checker:
                 self.vessels[spec] = None
         return self.vessels[spec]
 
-    def scene(self, scene: Scene, role: _Role) -> tuple[Vessel, Vessel] | None:
-        """The scene's vessels, if both exist and hold the liquid."""
+    def scene(self, scene: Scene, role: _Role, wanted: float | None = None) -> tuple[Vessel, Vessel] | None:
+        """The scene's vessels, if both exist and hold the liquid.
+
+        Args:
+            wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+        """
         places = {"pourer": role.places(("pourer",)), "receiver": (*role.receiver, *role.places(("receiver",)))}
         pourer = self.vessel(scene.pourer, places["pourer"])
         receiver = self.vessel(scene.receiver, places["receiver"])
         if pourer is None or receiver is None:
             return None
         ok = True
+        load = f"the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g)"
+        less = wanted is not None and wanted < scene.liquid.volume
         for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
+            what, volume = (
+                (load, scene.liquid.volume) if wanted is None or vessel is pourer else ("what is asked for", wanted)
+            )
             try:
-                check_holds(vessel, scene.liquid.volume)
+                check_holds(vessel, volume)
             except VesselError as error:
                 ok = False
-                load = f"{scene.liquid.name} ({scene.liquid.mass * 1e3:g} g)"
-                self.add(places[name], f"{role.text}: {name} can't hold the {load}: {error}")
+                self.add(places[name], f"{role.text}: {name} can't hold {what if less else load}: {error}")
+        if ok and less and scene.liquid.volume > receiver.capacity:
+            text = (
+                f"{role.text}: the receiver holds {1e6 * receiver.capacity:.4g} mL, enough for what is asked for, not "
+                f"for {load}: a pour that misses its target may run over"
+            )
+            self.warn(self.problem(places["receiver"], text))
         return (pourer, receiver) if ok else None
 
     def reachable(self, plan: CalibrationPlan | DeploymentPlan, scene: Scene, role: _Role) -> None:
         """Some action of the space must pour, not touch, and be one that the arm can make."""
-        vessels = self.scene(scene, role)
+        wanted = plan.wanted(scene) if isinstance(plan, DeploymentPlan) else None
+        vessels = self.scene(scene, role, wanted)
         self._payload(scene)
         actions = plan.actions
         trials = actions_all_over(actions, plan.constraints, corners=CORNERS, drawn=DRAWN)
@@ -273,18 +288,19 @@ def check_campaign(
     return list(dict.fromkeys(checker.problems))
 
 
-def check_vessels(scene: Scene, source: Path) -> list[Problem]:
+def check_vessels(scene: Scene, source: Path, wanted: float | None = None) -> list[Problem]:
     """Build the vessels of one scene.
 
     Args:
         scene: any.
         source: the campaign's file.
+        wanted: volume that the receiver has to hold [m³]; the whole load unless given.
 
     Returns:
         What is wrong: a vessel that is none, or can't hold the load.
     """
     checker = _Checker(source)
-    checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"))
+    checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"), wanted)
     return checker.problems
 
 

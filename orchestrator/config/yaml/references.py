@@ -103,7 +103,7 @@ class References:
     def liquid(self, value: Any, place: Place) -> Liquid | None:
         """A liquid; None where something is wrong with it."""
         found = self.section(value, place, LiquidFile)
-        return None if found is None else resolve_liquid(found[0])
+        return None if found is None else resolve_liquid(*found, self.report)
 
     def laboratory(self, value: Any, place: Place) -> Any:
         """A `LaboratorySpec`; None where something is wrong with it."""

@@ -17,13 +17,17 @@ BySplit = dict[str, float | None]
 CALIBRATED = "theta"
 """Label of θ* in the results."""
 
+UNCALIBRATED = "uncalibrated"
+"""Label of the θ that one would take without calibrating."""
+
 
 class Scorecard:
     """Score θ* on all weighed pours, and its rivals on those that calibration did not see.
 
-    The rivals are random θ from the same box (their median), the mean of the training pours, and a GP regression of
-    the training pours. The regression is judged in the calibration's scene only: of another vessel it knows nothing.
-    Random θ are not simulated on training pours, where nothing is to be won by it.
+    The rivals are the uncalibrated θ, random θ from the same box (their median), the mean of the training pours, and a
+    GP regression of the training pours. The regression is judged in the calibration's scene only: of another vessel it
+    knows nothing. Random θ are not simulated on training pours, where nothing is to be won by it; the uncalibrated one
+    is, for it has seen no pour at all.
     """
 
     def __init__(
@@ -33,6 +37,8 @@ class Scorecard:
         pours: Sequence[ScoredPour],
         actions: Space,
         seed: int,
+        *,
+        uncalibrated: SimulationParameters | None = None,
     ) -> None:
         """Plan.
 
@@ -40,6 +46,7 @@ class Scorecard:
             random_thetas: by label, 'random 1' … .
             pours: of the splits 'train', 'test' and 'transfer'.
             actions: space of the regression.
+            uncalibrated: θ that one would take without calibrating; None, or θ* itself, is not scored.
         """
         unseen = [scored for scored in pours if scored.pour.split != "train"]
         train = [scored for scored in pours if scored.pour.split == "train"]
@@ -48,6 +55,8 @@ class Scorecard:
             Evaluation({CALIBRATED: theta}, [*unseen, *train], seed),
             Evaluation(random_thetas, unseen, seed),
         ]
+        if uncalibrated is not None and uncalibrated != theta:
+            self._parts.append(Evaluation({UNCALIBRATED: uncalibrated}, [*unseen, *train], seed))
         self._owner: dict[Simulate, Evaluation] = {}
         self._actions = actions
         self._pours: dict[str, list[MeasuredPour]] = {}
@@ -87,15 +96,15 @@ class Scorecard:
 
     def result(self) -> Scores:
         """Mean |r − c_s| by label and split, the random θ's median by split, and the rivals without a simulator."""
-        ours, rivals = (part.result() for part in self._parts)
+        parts = [part.result() for part in self._parts]
         mean_predictor, regression = self._without_simulator() if self.finished else ({}, {})
         return Scores(
-            simulations=ours.simulations + rivals.simulations,
-            undefined=ours.undefined | rivals.undefined,
-            discrepancy=ours.discrepancy | rivals.discrepancy,
-            random_median=rivals.random_median,
-            thetas=ours.thetas | rivals.thetas,
-            pairs=(*ours.pairs, *rivals.pairs),
+            simulations=sum(part.simulations for part in parts),
+            undefined={label: count for part in parts for label, count in part.undefined.items()},
+            discrepancy={label: scores for part in parts for label, scores in part.discrepancy.items()},
+            random_median=parts[1].random_median,
+            thetas={label: theta for part in parts for label, theta in part.thetas.items()},
+            pairs=tuple(pair for part in parts for pair in part.pairs),
             mean_predictor=mean_predictor,
             regression=regression,
         )

@@ -189,7 +189,7 @@ class Objectives:
         Args:
             worst: as `worst` gives it.
         """
-        least = self.floor * self._wanted(scene)
+        least = self.floor * self.wanted(scene)
         delivered = max(fractions.poured - fractions.spilled, 0.0)
         if delivered < least:
             missing = 1.0 - delivered / least
@@ -206,7 +206,7 @@ class Objectives:
         """Σ w_j f_j."""
         return sum(part.weight * value for part, value in zip(self.parts, vector, strict=True))
 
-    def _wanted(self, scene: Scene) -> float:
+    def wanted(self, scene: Scene) -> float:
         """Share of the load that should arrive."""
         return min(part.wanted(scene) for part in self.parts)
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from orchestrator.report import style
 from orchestrator.strategies.calibration.base import Calibrated
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.drawing import Drawn, colour, legend, log_axis, look, strategy_of
-from orchestrator.study.report.gather import UNCALIBRATED, Found, Gathered, mean, running_least
+from orchestrator.study.report.gather import Found, Gathered, mean, running_least
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate
 
 

@@ -10,14 +10,12 @@ from orchestrator.results import learnt_by
 from orchestrator.stages import CALIBRATION, EVALUATION
 from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.strategies.calibration.evaluation import Scores
-from orchestrator.strategies.calibration.scorecard import CALIBRATED
+from orchestrator.strategies.calibration.scorecard import CALIBRATED, UNCALIBRATED
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.study.cells import FINAL, Cell, cells_of
 from orchestrator.study.folder import CellResult
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.strategies import FinalPoured
-
-UNCALIBRATED = "uncalibrated"
 
 
 @dataclass

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from orchestrator.report.units import deployment_unit
 from orchestrator.strategies.calibration.base import Calibrated
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.deployments import checkpoints, loss_range, mean_loss, most_pours, places
 from orchestrator.study.report.effects import ALL, Effect, at_pour_of, effect, tests_of
 from orchestrator.study.report.finals import CAPTION, final_effects, final_rows
-from orchestrator.study.report.gather import UNCALIBRATED, Gathered, Key, at_pour, mean
+from orchestrator.study.report.gather import Gathered, Key, at_pour, mean
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate, statistic
 
 TABLE_POURS = (1, 3, 15)

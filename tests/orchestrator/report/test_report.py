@@ -328,7 +328,10 @@ def test_the_title_of_the_first_pours_says_which_were_worse_and_which_agree(monk
 
 def test_predictors_that_have_nothing_to_say_get_no_bar_and_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = kept(monkeypatch)
-    groups = [DiscrepancyGroup("training pours", 7, 0.06), DiscrepancyGroup("test pours", 3, 0.01, [0.02, 0.03], 0.04)]
+    groups = [
+        DiscrepancyGroup("training pours", 7, 0.06),
+        DiscrepancyGroup("test pours", 3, 0.01, None, [0.02, 0.03], 0.04),
+    ]
     draw_discrepancy(Path("bars.png"), groups, title="bars")
     said = [text.get_text() for text in drawn[0].findobj(Text)]
     assert not [text for text in said if "n/a" in text]

@@ -148,11 +148,11 @@ WRONG: dict[str, tuple[Any, str]] = {
     "nothing to confirm": (lambda d: without({**d, "confirm": 1}, "deployment"), "confirm: there is no deployment"),
     "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),
     "level twice": (lambda d: {**d, "mismatch": [d["mismatch"][0]] * 2}, "mismatch[1]: a level 'small'"),
-    "not searched": (lambda d: {**d, "search": ["friction"]}, "search[0]: 'friction' is not searched"),
+    "not searched": (lambda d: {**d, "search": ["viscosity"]}, "search[0]: 'viscosity' is not searched"),
     "nothing left to search": (
         lambda d: {
             **without(d, "search"),
-            "parameters": {"particles": 500, "cohesion": "0 N/m", "viscosity": "1 1/s"},
+            "parameters": {"particles": 500, "cohesion": "0 N/m", "friction": 0.1, "wall_distance": 0.5},
         },
         "parameters: fixes all that the campaign searches",
     ),

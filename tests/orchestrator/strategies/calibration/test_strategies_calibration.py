@@ -11,6 +11,7 @@ from orchestrator.strategies.calibration.baselines import mean_predictor_discrep
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour, choose_holdout, stratified
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
+from orchestrator.strategies.calibration.scorecard import Scorecard
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from tests.orchestrator.play import (
@@ -304,3 +305,24 @@ def test_a_regression_beats_the_mean_inside_the_scene_it_was_fitted_in():
     assert mean == pytest.approx(np.mean([abs(p.spillage - np.mean([q.spillage for q in train])) for p in test]))
     assert regression_discrepancy(CALIBRATION_ACTIONS, train, test) < 0.5 * mean
     assert mean_predictor_discrepancy(train, []) is None
+
+
+def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the_calibrated_one():
+    pours = [ScoredPour("cup", pour) for pour in measured(count=8, holdout=2)]
+    plain = SimulationParameters(particles=4000, cohesion=0.0)
+    rivals = random_parameters(PARAMETERS, {}, 2, 1)
+    card = Scorecard(TRUE_THETA, rivals, pours, CALIBRATION_ACTIONS, 3, uncalibrated=plain)
+    without = Scorecard(TRUE_THETA, rivals, pours, CALIBRATION_ACTIONS, 3)
+    played, before = Play(calibration_spill)(card), Play(calibration_spill)(without)
+    asked = {theta: [r for r in played.simulations if r.parameters == theta] for theta in (TRUE_THETA, plain)}
+    assert [(r.action, r.seed) for r in asked[TRUE_THETA]] == [(r.action, r.seed) for r in asked[plain]]
+    assert played.simulations[: len(before.simulations)] == before.simulations, (
+        "what was asked before is asked as before"
+    )
+    result = card.result()
+    assert result.discrepancy["uncalibrated"]["train"] > 2 * result.discrepancy["theta"]["train"]
+    assert sum(pair.theta == "uncalibrated" for pair in result.pairs) == 8
+    assert "uncalibrated" not in without.result().discrepancy
+    same = Scorecard(TRUE_THETA, rivals, pours, CALIBRATION_ACTIONS, 3, uncalibrated=TRUE_THETA)
+    Play(calibration_spill)(same)
+    assert "uncalibrated" not in same.result().discrepancy

@@ -1,0 +1,55 @@
+"""The files that Decant comes with: campaigns, laboratories, studies, vessels, weighed pours."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+STARTING_SET = ("README.md", "campaigns", "data", "laboratories", "schema", "studies", "vessels")
+"""What is copied of the shipped files."""
+
+
+def shipped(name: str = "") -> Path:
+    """One of the files that Decant comes with: 'campaigns/quickstart.yaml'; the folder of all without a name.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    root = _root()
+    path = root / name
+    if not path.exists():
+        known = sorted(str(p.relative_to(root)) for p in root.glob("*/*.yaml"))
+        raise FileNotFoundError(f"Decant comes with no '{name}'; there are {', '.join(known)}")
+    return path
+
+
+def starting_set(directory: Path | str) -> list[Path]:
+    """Copy the shipped campaigns, laboratories, studies, vessels and data into a folder: `decant init DIR`.
+
+    Args:
+        directory: is made if needed; must be empty.
+
+    Returns:
+        The campaigns.
+
+    Raises:
+        FileExistsError: there is something in it already.
+        OSError: it can't be written.
+    """
+    directory = Path(directory)
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise FileExistsError(f"{directory}: is not an empty folder; name another one")
+    directory.mkdir(parents=True, exist_ok=True)
+    for name in STARTING_SET:
+        source = shipped(name)
+        if source.is_dir():
+            shutil.copytree(source, directory / name)
+        else:
+            shutil.copy(source, directory / name)
+    return sorted((directory / "campaigns").glob("*.yaml"))
+
+
+def _root() -> Path:
+    """In an installed package they stand beside its modules, in a checkout at its top."""
+    here = Path(__file__).parent
+    return here / "configs" if (here / "configs").is_dir() else here.parent / "configs"

@@ -1,0 +1,41 @@
+"""Packages that only some installations have, by the extra that brings them."""
+
+from __future__ import annotations
+
+import importlib.util
+
+EXTRAS = {
+    "ray": "lab",
+    "serial": "lab",
+    "psutil": "lab",
+    "rtde_receive": "lab",
+    "rerun": "live",
+    "pandas": "tables",
+    "pyarrow": "tables",
+}
+"""Importable name → extra."""
+
+
+class MissingExtraError(ImportError):
+    """A package that belongs to an extra is not installed; the text says what to install."""
+
+
+def installed(module: str) -> bool:
+    """Whether a package is there; it is not imported."""
+    return importlib.util.find_spec(module) is not None
+
+
+def require(module: str, what_for: str) -> None:
+    """Say which extra is missing before anything begins.
+
+    Args:
+        module: one of `EXTRAS`.
+        what_for: begins the sentence: 'a recording'.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    if not installed(module):
+        raise MissingExtraError(
+            f"{what_for} needs the package '{module}', which is not installed: pip install 'decant[{EXTRAS[module]}]'"
+        )

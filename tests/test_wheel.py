@@ -1,0 +1,131 @@
+"""What is installed: the wheel's content, and an installation without the extras."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from orchestrator.shipped import STARTING_SET
+from sim_engine.extras import EXTRAS
+
+ROOT = Path(__file__).parents[1]
+
+BLOCKED = f"""
+import sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {sorted(EXTRAS)}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Missing())
+import importlib.util
+real = importlib.util.find_spec
+importlib.util.find_spec = lambda name, package=None: None if name in {sorted(EXTRAS)} else real(name, package)
+"""
+"""As if no extra were installed."""
+
+
+def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True, timeout=280
+    )
+
+
+def command(*arguments: str) -> str:
+    return f"{BLOCKED}\nfrom orchestrator.cli import main\nsys.argv = {['decant', *arguments]!r}\nmain()"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy of what git knows, so that the checkout stays clean."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True
+    )
+    for name in listed.stdout.splitlines():
+        if (ROOT / name).is_file() and not name.startswith(("tests/", "benchmarks/", "docs/")):
+            target = source / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes((ROOT / name).read_bytes())
+    built = subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-q", "-w", str(out), str(source)],
+        capture_output=True,
+        text=True,
+    )
+    assert built.returncode == 0, built.stderr[-2000:]
+    (path,) = out.glob("*.whl")
+    return path
+
+
+def test_the_wheel_carries_every_shipped_file_and_no_tests(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for name in STARTING_SET:
+        files = [ROOT / "configs" / name]
+        if files[0].is_dir():
+            files = [path for path in files[0].rglob("*") if path.is_file()]
+        assert {f"orchestrator/configs/{path.relative_to(ROOT / 'configs')}" for path in files} <= names
+    assert {"decant/__init__.py", "decant/py.typed"} <= names
+    assert not [name for name in names if name.split("/")[0] in ("tests", "benchmarks", "docs")]
+
+
+def test_every_package_of_an_extra_is_declared_in_it() -> None:
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    package = {"serial": "pyserial", "rtde_receive": "ur-rtde", "rerun": "rerun-sdk"}
+    for module, extra in EXTRAS.items():
+        name = package.get(module, module)
+        assert any(text.startswith(name) for text in declared["optional-dependencies"][extra]), name
+        assert not any(text.startswith(name) for text in declared["dependencies"]), name
+
+
+def test_without_extras_one_simulates_and_plans(tmp_path: Path) -> None:
+    done = run(command("init", "lab"), tmp_path)
+    assert done.returncode == 0, done.stderr
+    small = ["--set", "angular_velocity=100", "--set", "x_offset=110", "--seeds", "1"]
+    theta = tmp_path / "theta.json"
+    theta.write_text('{"particles": 250}', encoding="utf-8")
+    campaign = "lab/campaigns/quickstart.yaml"
+    done = run(command("simulate", campaign, *small, "--parameters", str(theta)), tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "received" in done.stdout
+    planning = ["plan", campaign, "--parameters", str(theta), "--iterations", "2", "--seeds", "2"]
+    done = run(command(*planning, "--in-process"), tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "pip install 'decant[live]'" in done.stderr, "a recording was wanted"
+    done = run(command(*planning), tmp_path)
+    assert done.returncode == 2
+    assert "pip install 'decant[lab]'" in done.stderr
+
+
+def test_without_extras_a_table_says_what_to_install(tmp_path: Path) -> None:
+    code = f"{BLOCKED}\nfrom decant.runs import _frame\n_frame(iter([]))"
+    done = run(code, tmp_path)
+    assert "pip install 'decant[tables]'" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
+    venv.create(tmp_path / "bare", with_pip=True)
+    python = tmp_path / "bare" / "bin" / "python"
+    subprocess.run([python, "-m", "pip", "install", "-q", str(wheel)], check=True, cwd=tmp_path, timeout=1500)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+    def decant(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [tmp_path / "bare" / "bin" / "decant", *arguments]
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+
+    assert decant("init", "lab").returncode == 0
+    (tmp_path / "theta.json").write_text('{"particles": 250}', encoding="utf-8")
+    campaign = ["lab/campaigns/quickstart.yaml", "--parameters", "theta.json"]
+    done = decant("simulate", *campaign, "--set", "angular_velocity=100", "--set", "x_offset=110", "--seeds", "1")
+    assert done.returncode == 0, done.stderr
+    done = decant("plan", *campaign, "--iterations", "2", "--seeds", "2", "--in-process")
+    assert done.returncode == 0, done.stderr
+    assert "decant[lab]" in decant("run", "lab/campaigns/quickstart.yaml").stderr
