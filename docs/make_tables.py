@@ -22,7 +22,7 @@ from orchestrator.config import pose, vessel
 from orchestrator.config.campaign import sections as campaign
 from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
-from orchestrator.config.laboratory import arm_sections, cluster, operator
+from orchestrator.config.laboratory import arm_sections, cell, cluster, operator
 from orchestrator.config.laboratory import sections as laboratory
 from orchestrator.config.laboratory.arms import ARMS
 from orchestrator.config.study import sections as study
@@ -66,7 +66,7 @@ SECTIONS: dict[str, type[Section]] = {
     "ray": cluster.RaySection,
     "arm": arm_sections.UrArmSection,
     "limits": arm_sections.LimitsSection,
-    "cell": arm_sections.CellSection,
+    "cell": cell.CellSection,
     "operator": operator.OperatorSection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
@@ -303,7 +303,7 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     if origin is dict:
         return "mapping"
     if isinstance(annotation, type) and issubclass(annotation, Section):
-        return OF_SECTIONS[annotation.__name__]
+        return OF_SECTIONS.get(annotation.__name__, f"mapping: {_one_line(annotation.__doc__ or '')}")
     metadata = [deep for m in metadata for deep in (m.metadata if isinstance(m, FieldInfo) else [m])]
     if annotation is int:
         lowest = next((m.ge for m in metadata if getattr(m, "ge", None) is not None), None)

@@ -26,10 +26,11 @@ class Plugin:
 def doors() -> tuple[Door[Any], ...]:
     """Every door; nothing behind them has been loaded before somebody looks."""
     from actors.balance.doors import BALANCES
-    from orchestrator.strategies.doors import STRATEGIES
+    from orchestrator.config.laboratory.arms import ARMS
+    from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES
     from sim_engine.vessel.spec import VESSELS
 
-    return STRATEGIES, BALANCES, VESSELS
+    return STRATEGIES, OBJECTIVES, BALANCES, ARMS, VESSELS
 
 
 def installed() -> list[Plugin]:

@@ -10,8 +10,8 @@ ROOT = Path(__file__).parents[1]
 FLOORS = ("sim_engine", "actors", "orchestrator")
 
 SETTINGS = ("spec.py", "settings.py")
-MAKERS = ("build", "driver", "stand_in", "look", "plan")
-"""Methods of settings that make what they are settings of."""
+MAKERS = ("build", "driver", "stand_in", "look", "plan", "resolve", "unknown_tag")
+"""Methods of settings that make what they are settings of, or ask the door that they are found at."""
 
 
 def modules() -> dict[str, Path]:

@@ -78,7 +78,7 @@ LABORATORY = (
 name: example
 in_process: true
 simulators: 1
-arm: {kind: stand}
+arm: {kind: stand, fastest: 130 deg/s}
 balance: {kind: spring, swing: 0.5 s, step: 0.1 g}
 """
     + BENCH
@@ -152,3 +152,93 @@ def test_what_nobody_has_is_refused_with_what_is_meant(decant: Decant, folder: P
     said = decant("validate", "example.yaml", cwd=folder)
     assert said.returncode == 2
     assert "'sprong' is not known here; did you mean 'spring'?" in said.stderr
+
+
+CAMPAIGN = """\
+name: outside
+seed: 3
+laboratory: example.yaml
+liquid: {mass: 100 g}
+pourer: beaker.yaml
+motion: {hold_time: 0.3 s, return_velocity: 120 deg/s}
+simulator: {parameters: {particles: 300}}
+deployment:
+  strategy: hypercube
+  centred: true
+  receiver: cone.yaml
+  motion: {max_angle: 115 deg, height: 60 mm}
+  actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [60 mm, 90 mm]}
+  objectives: [{name: spillage}, {name: gentle, weight: 0.2, rough: 100 deg/s}]
+  pours: 2
+outputs: {directory: runs}
+"""
+
+
+def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: Decant, folder: Path) -> None:
+    (folder / "campaign.yaml").write_text(CAMPAIGN)
+    checked = decant("validate", "campaign.yaml", cwd=folder)
+    assert checked.returncode == 0, checked.stderr
+    ran = decant("run", "campaign.yaml", "--json", cwd=folder)
+    assert ran.returncode == 0, ran.stderr
+    (run,) = (folder / "runs").iterdir()
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["pours"] == 2
+    resolved = json.loads((run / "resolved.json").read_text())
+    assert resolved["deployment"]["strategy"] == "hypercube"
+    assert resolved["laboratory"]["balance"]["kind"] == "spring"
+    assert resolved["laboratory"]["arm"]["kind"] == "stand"
+    assert resolved["deployment"]["receiver"]["cone"]["top"] == "0.045 m"
+    assert any(part["name"] == "gentle" for part in resolved["deployment"]["objectives"])
+    again = decant("validate", str(run / "resolved.json"), cwd=folder)
+    assert again.returncode == 0, again.stderr
+
+
+def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: Path, folder: Path) -> None:
+    said = command(site)("doctor", "example.yaml", "--json", cwd=folder)
+    checks = {check["name"]: check for check in json.loads(said.stdout.splitlines()[-1])["checks"]}
+    assert checks["balance"]["found"] == "balance: a spring, step 0.1 g"
+    assert checks["balance reading"]["state"] == "ok"
+    said = command(site, broken)("doctor", "example.yaml", "--json", cwd=folder)
+    found = [check["found"] for check in json.loads(said.stdout.splitlines()[-1])["checks"]]
+    assert any("decant-broken 0.3" in text for text in found)
+
+
+DIALECT = """
+from actors.balance.serial_balance import SerialBalance
+from actors.balance.spec import SerialBalanceSpec
+from actors.balance.virtual_serial.handle import VirtualSerialBalance
+
+far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
+balance = SerialBalance(SerialBalanceSpec(far.port, time_scale=20.0))
+print(balance.connect())
+balance.tare()
+far.put(0.2)
+print(balance.weigh().mass)
+balance.close()
+far.close()
+"""
+
+
+def python(folder: Path, program: str) -> list[str]:
+    """Lines that a program prints with a folder of packages installed."""
+    path = os.pathsep.join([str(folder), str(ROOT)])
+    ran = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout.splitlines()
+
+
+def test_a_dialect_from_outside_is_found_out_and_has_a_virtual_balance(site: Path) -> None:
+    said, mass = python(site, DIALECT)
+    assert said.startswith("Example's plain balance on ")
+    assert float(mass) == pytest.approx(0.2, abs=1e-3)
+
+
+def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
+    program = "import runpy; print(runpy.run_path('docs/make_tables.py')['TABLES']['vessel']())"
+    assert any("`cone`" in line and "A cone that opens upwards" in line for line in python(site, program))

@@ -9,17 +9,9 @@ import re
 from actors.arm.geometry import ArmLimits, Cell, Mount, Plane, Pose, Vector
 from actors.arm.path.kinematics import MODELS
 from actors.arm.spec import UrArmSpec
-from orchestrator.config.laboratory.arm_sections import (
-    JOINTS,
-    CellSection,
-    LimitsSection,
-    PlaneSection,
-    PointSection,
-    UrArmSection,
-)
+from orchestrator.config.laboratory.arm_sections import JOINTS, LimitsSection, PlaneSection, UrArmSection
+from orchestrator.config.laboratory.cell import CellSection, PointSection
 from orchestrator.config.yaml.source import Place, Report
-
-__all__ = ["CellSection", "UrArmSection", "resolve_arm"]
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\.?")

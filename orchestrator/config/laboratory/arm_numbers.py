@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from actors.arm.numbers import NumbersSpec
-from orchestrator.config.laboratory.arm_sections import CellSection
 from orchestrator.config.laboratory.arms import ArmSettings
+from orchestrator.config.laboratory.cell import CellSection
 from orchestrator.config.yaml.source import Place, Report
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar, Literal
 from actors.arm.geometry import ArmLimits, Cell
 from actors.arm.spec import UrArmSpec
 from orchestrator.config.laboratory.arms import ArmSettings
+from orchestrator.config.laboratory.cell import Angle, CellSection, Length, PointSection
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Number, Section, Text
 from orchestrator.config.yaml.source import Place, Report
@@ -21,26 +22,9 @@ _ARM = UrArmSpec("ur10e", _LIMITS, Cell((0.0,) * 3), (0.0,) * 6)
 JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
 """As the teach pendant names them."""
 
-Length = Annotated[float, Quantity("m", "100 mm", -3.0, 3.0)]
 Turn = Annotated[float, Quantity("rad", "1.571 rad", -2.0 * math.pi, 2.0 * math.pi)]
-Angle = Annotated[float, Quantity("rad", "90 deg", -math.radians(363.0), math.radians(363.0))]
 Speed = Annotated[float, Quantity("rad/s", "40 deg/s", 0.0, math.radians(360.0), positive=True)]
 Acceleration = Annotated[float, Quantity("rad/s^2", "80 deg/s^2", 0.0, math.radians(2000.0), positive=True)]
-
-
-class PointSection(Section):
-    """A point in the room's frame: the base's, as the teach pendant shows it, for an arm that stands on a table."""
-
-    required: ClassVar[dict[str, str]] = {"x": "650 mm", "y": "0 mm", "z": "80 mm"}
-
-    x: Length | None = None
-    """Of the room's frame."""
-
-    y: Length | None = None
-    """Of the room's frame."""
-
-    z: Length | None = None
-    """Upwards from where the robot is screwed down."""
 
 
 class CentreSection(Section):
@@ -231,21 +215,3 @@ class UrArmSection(ArmSettings):
         from orchestrator.config.laboratory.arm import resolve_arm
 
         return resolve_arm(self, cell, place, report, mode=mode)
-
-
-class CellSection(Section):
-    """What stands where around the arm."""
-
-    required: ClassVar[dict[str, str]] = {
-        "receiver": "{x: 650 mm, y: 0 mm, z: 80 mm}",
-        "direction": "90 deg",
-    }
-
-    receiver: PointSection | None = None
-    """Where the middle of the receiver's underside stands, in the room's frame."""
-
-    direction: Angle | None = None
-    """That the liquid is poured in, seen from above: 0 along the room's x, 90 deg along its y."""
-
-    table: Length = 0.0
-    """Height of the surface that nothing may go below, in the room's frame."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from orchestrator.config.laboratory.cell import CellSection
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.doors import Door
 
 if TYPE_CHECKING:
     from actors.arm.spec import ArmSpec
-    from orchestrator.config.laboratory.arm_sections import CellSection
 
 
 class ArmSettings(Section):

@@ -11,9 +11,9 @@ from actors.balance.spec import BalanceSpec
 from actors.bench.spec import VirtualBenchSpec
 from actors.operator import OperatorSpec
 from actors.spec import LaboratorySpec
-from orchestrator.config.laboratory.arm_sections import CellSection
 from orchestrator.config.laboratory.arms import ARMS, ArmSettings
 from orchestrator.config.laboratory.balance import any_balance, resolve_balance
+from orchestrator.config.laboratory.cell import CellSection
 from orchestrator.config.laboratory.cluster import RaySection, resolve_ray
 from orchestrator.config.laboratory.operator import OperatorSection, resolve_operator
 from orchestrator.config.motion import parameter_quantity

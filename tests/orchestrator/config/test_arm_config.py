@@ -10,7 +10,9 @@ import pytest
 
 from actors.arm.geometry import Plane, Pose
 from actors.arm.spec import UrArmSpec
-from orchestrator.config.laboratory.arm import CellSection, UrArmSection, resolve_arm
+from orchestrator.config.laboratory.arm import resolve_arm
+from orchestrator.config.laboratory.arm_sections import UrArmSection
+from orchestrator.config.laboratory.cell import CellSection
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Document, Place, Report

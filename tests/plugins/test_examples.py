@@ -1,0 +1,57 @@
+"""The example's balances and vessels do what ours have to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from decimal import Decimal
+
+import pytest
+
+from actors.balance.reading import FrameError, Reading, Status
+from actors.balance.virtual_balance import Load
+from actors.contracts.balance import BalanceBench, BalanceContract
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.spec import VesselSpec
+from tests.plugins.decant_example.balance import SpringBalance, SpringSpec
+from tests.plugins.decant_example.dialect import PLAIN
+from tests.plugins.decant_example.vessel import Cone
+
+
+class TestSpring(BalanceContract):
+    @pytest.fixture
+    def bench(self) -> Iterator[BalanceBench]:
+        spec = SpringSpec(swing=0.1)
+        driver = SpringBalance(spec)
+        yield BalanceBench(
+            driver, lambda mass: driver.put(Load((0.0,), (mass,))), tolerance=0.1e-3, make=(SpringBalance, spec)
+        )
+        driver.close()
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "mass"),
+    [(b"12.3 g", Status.STABLE, 0.0123), (b"-0.5 g!", Status.UNSTABLE, -0.0005), (b"1.2 kg", Status.STABLE, 1.2)],
+)
+def test_lines_of_the_dialect_are_read_and_written(line: bytes, status: Status, mass: float) -> None:
+    reading = PLAIN.decode(line)
+    assert isinstance(reading, Reading)
+    assert (reading.status, reading.mass()) == (status, pytest.approx(mass))
+    assert PLAIN.encode(reading) == line + b"\r\n"
+
+
+@pytest.mark.parametrize("line", [b"", b"12.3", b"12,3 g", b"12.3 g?", b"x12.3 g"])
+def test_half_a_line_is_no_weight(line: bytes) -> None:
+    with pytest.raises(FrameError):
+        PLAIN.decode(line)
+    with pytest.raises(ValueError, match="no words"):
+        PLAIN.encode(Reading(Status.OVER, None))
+    assert PLAIN.encode(Reading(Status.STABLE, Decimal("1.0"), "g")) == b"1.0 g\r\n"
+
+
+def test_a_cone_holds_what_a_cone_holds() -> None:
+    cone = Cone(kind="cone", top="45 mm", bottom="30 mm", height="100 mm")  # type: ignore[arg-type]
+    vessel = build_vessel(VesselSpec(name="cone-1", shape=cone))
+    r, s, h = 0.045, 0.03, 0.1
+    assert vessel.capacity == pytest.approx(math.pi * h * (r * r + r * s + s * s) / 3.0, rel=1e-6)
+    assert vessel.rim_height == pytest.approx(h + 0.004)
