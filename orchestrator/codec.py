@@ -124,7 +124,7 @@ def to_json(value: Any, hint: Any = Any) -> Any:
 
 
 def from_json(data: Any, hint: Any = Any) -> Any:
-    """Inverse of `to_json` for the same annotation. Missing fields take their defaults.
+    """Inverse of `to_json` for the same annotation.
 
     Raises:
         CodecError: the data don't fit the type; the text says where.
@@ -171,8 +171,10 @@ def _dataclass_from_json(data: Any, hint: type[Any]) -> Any:
         raise CodecError(
             f"{hint.__name__} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"
         )
+    if missing := hints.keys() - data.keys():
+        raise CodecError(f"{hint.__name__} lacks {', '.join(sorted(missing))}; was it written by an older version?")
     values = {}
-    for name in hints.keys() & data.keys():
+    for name in hints:
         try:
             values[name] = from_json(data[name], hints[name])
         except (CodecError, ValueError, TypeError) as error:

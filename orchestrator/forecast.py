@@ -34,6 +34,10 @@ ENOUGH = 4
 """Simulations of a stage after which its pace counts; what is expected of it still counts as so many."""
 
 
+RECENT = 5
+"""Pours that count for the next ones: a person finds a pace, and other programs come and go."""
+
+
 @dataclass(frozen=True)
 class Work:
     """What a stage is expected to do, before it says so itself.
@@ -184,9 +188,9 @@ class Forecast:
     def _cycle(self, stage: _Stage) -> float:
         """Seconds from the end of a pour to the end of the next."""
         if len(stage.cycles) >= 2:
-            return _usual(stage.cycles)
+            return _usual(stage.cycles[-RECENT:])
         # the plan's own time counts as a pour that was seen: the first one may have started the simulator of a bench
-        pour = median_low([stage.work.pour_time, *self._pours])
+        pour = median_low([stage.work.pour_time, *self._pours[-RECENT:]])
         return max(pour, stage.work.beside * self._price(stage)) + THOUGHT
 
 

@@ -6,9 +6,9 @@ A result is a value with a `kind`, declared beside the strategy that learns it; 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from orchestrator.codec import from_json, to_json
 from orchestrator.errors import RunError
@@ -17,6 +17,7 @@ from orchestrator.strategies.calibration.design import DesignPoured
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.doors import STRATEGIES
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.one_pour import OnePoured
 from orchestrator.strategies.repeats import Foreseen
@@ -27,11 +28,15 @@ L = TypeVar("L", bound=Learnt)
 Results = Mapping[str, Learnt]
 """What the stages learnt, by their names, in order."""
 
-AnyResult = Annotated[
-    DesignPoured | Calibrated | Scores | Deployed | Confirmed | Foreseen | OnePoured | Tabled | FinalPoured,
-    Field(discriminator="kind"),
-]
-"""All kinds that Decant itself comes with."""
+OURS = (DesignPoured, Calibrated, Scores, Deployed, Confirmed, Foreseen, OnePoured, Tabled, FinalPoured)
+"""The kinds that Decant itself comes with; strategies from other packages may bring their own."""
+
+
+def kinds() -> tuple[type[Learnt], ...]:
+    """All kinds: ours, and those of the packages whose strategies are installed."""
+    packages = {settings.__module__.partition(".")[0] for settings in STRATEGIES.all.values()}  # this loads them
+    theirs = {found for found in Learnt.KINDS.values() if found.__module__.partition(".")[0] in packages}
+    return (*OURS, *sorted(theirs - set(OURS), key=lambda found: found.__name__))
 
 
 def encode_result(result: Learnt) -> dict[str, Any]:
@@ -46,6 +51,8 @@ def decode_result(data: Mapping[str, Any]) -> Learnt:
         RunError: the kind is not known, or the data don't fit it.
     """
     kind = data.get("kind")
+    if kind not in Learnt.KINDS:
+        kinds()  # perhaps of a package that nobody has asked for yet
     known = Learnt.KINDS.get(str(kind))
     if known is None:
         raise RunError(

@@ -43,11 +43,11 @@ def _work(plan: CampaignPlan, name: str) -> Work:
 
 
 def _scored(plan: CalibrationPlan) -> int:
-    """θ* on all pours, its random rivals on those that calibration has not seen."""
+    """θ* and the uncalibrated θ on all pours, random rivals on those that calibration has not seen."""
     records = [] if plan.records is None else list(plan.records.pours)
     transfer = 0 if plan.transfer is None else len(plan.transfer.pours)
     unseen = plan.holdout + sum(pour.split != "train" for pour in records) + transfer
-    return plan.pour_count + len(records) + transfer + plan.random_baseline * unseen
+    return 2 * (plan.pour_count + len(records) + transfer) + plan.random_baseline * unseen
 
 
 def particles_of(plan: CampaignPlan) -> float:

@@ -98,7 +98,7 @@ class FlowCourse:
         stream_velocity, diameter: of the stream at the receiver's rim [m/s], [m].
         covered: whether liquid covers the whole opening.
         lip: x of the lip in the world [m].
-        fall: from the lip to the level of the receiver's rim, at least 0 [m].
+        fall: from the lip to the level of the receiver's rim, 0 where it is not above it [m].
     """
 
     volume: Floats

@@ -227,12 +227,8 @@ class PourSimulator:
         return SceneSetup(
             positions=self._laid(task, motion, start),
             spacing=d,
-            tension=parameters.cohesion,
             density=scene.liquid.density,
-            viscosity=parameters.viscosity,
-            friction=parameters.friction,
-            wall_distance=parameters.wall_distance,
-            lip_drop=parameters.lip_drop,
+            parameters=parameters,
             pourer=self._walls(scene.pourer, SUPPORT * d),
             receiver=self._walls(scene.receiver, SUPPORT * d),
             receiver_at=np.array([error.x, error.y, 0.0]),

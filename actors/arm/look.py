@@ -35,12 +35,14 @@ class ArmLook:
     Attributes:
         checksum: of the settings that keep people safe; '' if the arm tells none, and then none can be accepted.
         serial, model, software: as in `SafetyRecord`.
+        problem: why the arm can't move now, or can't be reached; '' if it could.
     """
 
     checksum: str = ""
     serial: str = ""
     model: str = ""
     software: str = ""
+    problem: str = ""
 
     def checks(self, record: SafetyRecord | None, *, accept: str, virtual: bool) -> list[Check]:
         """One line for everything that was found.
@@ -50,7 +52,14 @@ class ArmLook:
             accept: the command that accepts it.
             virtual: nobody has to.
         """
-        return [Check("arm", "ok", "a driver with nothing more to tell")]
+        who = " ".join(filter(None, (self.model, self.serial, self.software))) or "not reached"
+        checks = [Check("arm", "fail" if self.problem else "ok", self.problem or who)]
+        if self.checksum and not virtual:
+            accepted = record is not None and (record.checksum, record.serial) == (self.checksum, self.serial)
+            found = f"{self.checksum}, accepted by {record.accepted_by if record and accepted else 'nobody'}"
+            advice = "" if accepted else f"read the arm's safety settings, then: {accept}"
+            checks.append(Check("safety checksum", "ok" if accepted else "fail", found, advice))
+        return checks
 
     def at_home(self) -> Check:
         """Whether the arm stands where it waits."""

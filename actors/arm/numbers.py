@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from actors.arm.errors import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.geometry import Pose
-from actors.arm.protocol import ArmFacts, ArmState, PathReport, Whereabouts
+from actors.arm.motion_path import ExecutedMotion, MotionPath
+from actors.arm.protocol import ArmFacts, ArmState, Whereabouts
 from actors.arm.spec import ArmSpec
 from actors.pacing import Pace
 from sim_engine.action import Action
 from sim_engine.motion import PourMotion
-from sim_engine.sampled_motion import SampledMotion
 from sim_engine.task import Scene
 
 FloatArray = NDArray[np.float64]
@@ -54,99 +54,6 @@ class Grip:
     seed: tuple[int, ...] = (0,)
 
 
-@dataclass(frozen=True, eq=False)
-class NumbersPath:
-    """A pour for an arm of numbers, which is nowhere in particular: the motion itself.
-
-    Attributes:
-        motion: of the pourer.
-        factor: of its speed.
-    """
-
-    motion: PourMotion
-    approach_time: float = APPROACH_TIME
-    retreat_time: float = 0.0
-    factor: float = 1.0
-
-    @property
-    def pour_time(self) -> float:
-        """[s]."""
-        return self.motion.duration / self.factor
-
-    @property
-    def phases(self) -> tuple[tuple[str, float, float], ...]:
-        """See `PlannedPour.phases`."""
-        return tuple((phase.name, phase.start / self.factor, phase.end / self.factor) for phase in self.motion.phases)
-
-    def tilt(self, times: FloatArray) -> FloatArray:
-        """Of the pourer at times of the pour, shape (T,) [rad]."""
-        return self.motion.tilt(times * self.factor)
-
-    def poses(self, times: FloatArray) -> FloatArray:
-        """Of the pourer in the world at times of the pour, shape (T, 7)."""
-        return self.motion.sample(times * self.factor)
-
-    def slowed(self, factor: float) -> NumbersPath:
-        """See `PlannedPour.slowed`."""
-        return replace(self, factor=self.factor * factor)
-
-    @property
-    def report(self) -> PathReport:
-        """See `PlannedPour.report`."""
-        return motion_report(self.motion, self.approach_time + self.retreat_time, self.factor)
-
-
-def motion_report(motion: PourMotion, travel_time: float = 0.0, factor: float = 1.0) -> PathReport:
-    """What a motion says of a pour, for arms that don't look at their joints: the pourer's origin stands for the tool.
-
-    Args:
-        motion: of the pourer.
-        travel_time: way there and back together [s].
-        factor: of the motion's speed.
-    """
-    times = np.linspace(0.0, motion.duration, 500)
-    poses, tilts = motion.sample(times), motion.tilt(times)
-    step = times[1] / factor
-    low, high = poses[:, :3].min(axis=0), poses[:, :3].max(axis=0)
-    return PathReport(
-        joint_speed=0.0,
-        fastest_joint=0,
-        tool_speed=float(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=-1).max() / step),
-        tilt=float(np.abs(tilts).max()),
-        tilt_speed=float(np.abs(np.diff(tilts)).max() / step),
-        singularity=1.0,
-        clearance=0.0,
-        low=(float(low[0]), float(low[1]), float(low[2])),
-        high=(float(high[0]), float(high[1]), float(high[2])),
-        duration=motion.duration / factor + travel_time,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class ExecutedMotion:
-    """See `actors.arm.protocol.Executed`; poses as the arm read them back.
-
-    Attributes:
-        times: shape (T,) [s].
-        poses: shape (T, 7).
-        completed: False if it was stopped on the way.
-    """
-
-    times: FloatArray
-    poses: FloatArray
-    completed: bool
-    tracking: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def motion(self) -> SampledMotion:
-        """As a motion that can be simulated again."""
-        return SampledMotion(self.times, self.poses)
-
-    def record(self) -> dict[str, Any]:
-        """See `Executed.record`: the action says all of it."""
-        return {}
-
-
 @dataclass(frozen=True)
 class NumbersSpec(ArmSpec):
     """An arm of numbers.
@@ -165,11 +72,11 @@ class NumbersSpec(ArmSpec):
         """See `ArmSpec.driver`."""
         return NumbersArm, (self,)
 
-    def plan(self, scene: Scene, action: Action) -> NumbersPath:
+    def plan(self, scene: Scene, action: Action) -> MotionPath:
         """See `ArmSpec.plan`."""
         from actors.bench.planning import plan_pour
 
-        return NumbersPath(plan_pour(scene, action))
+        return MotionPath(plan_pour(scene, action), approach_time=APPROACH_TIME)
 
 
 class NumbersArm:
@@ -234,12 +141,12 @@ class NumbersArm:
 
     # ---- motions
 
-    def move_to_start(self, path: NumbersPath) -> None:
+    def move_to_start(self, path: MotionPath) -> None:
         """See `Arm.move_to_start`."""
         tilt = float(path.motion.tilt(np.zeros(1))[0])
-        self._way("approach", APPROACH_TIME, lambda t: tilt)
+        self._way("approach", path.approach_time, lambda t: tilt)
 
-    def execute(self, path: NumbersPath) -> ExecutedMotion:
+    def execute(self, path: MotionPath) -> ExecutedMotion:
         """See `Arm.execute`.
 
         The grip's speed factor stretches or shrinks the tilting phase; hold and return keep their times.
@@ -255,12 +162,12 @@ class NumbersArm:
             )
         return done
 
-    def retreat(self, path: NumbersPath) -> None:
+    def retreat(self, path: MotionPath) -> None:
         """See `Arm.retreat`; nobody waits for it."""
         self._way("retreat", path.retreat_time, lambda t: 0.0)
         self._released = False
 
-    def untilt(self, path: NumbersPath | None = None) -> None:
+    def untilt(self, path: MotionPath | None = None) -> None:
         """See `Arm.untilt`."""
         begin = self.state().tilt
         self._way("untilt", _UPRIGHT_TIME, lambda t: begin * max(1.0 - t / _UPRIGHT_TIME, 0.0))

@@ -100,7 +100,17 @@ class ArmSpec(ABC):
 
     def look(self) -> ArmLook:
         """Ask the arm everything that `decant doctor` tells of; nothing moves, nothing is set."""
-        return ArmLook()
+        from actors.protocols import LaboratoryError
+
+        cls, arguments = self.driver(None)
+        arm = cls(*arguments)
+        try:
+            facts = arm.connect()
+        except LaboratoryError as error:
+            return ArmLook(problem=str(error))
+        finally:
+            arm.close()
+        return ArmLook(facts.checksum, facts.serial, facts.model, facts.version, facts.problem)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,8 @@ def campaign_from(document: Document, laboratory: Path | None = None, seed: int 
     Raises:
         ConfigError: as `load_campaign`.
     """
+    if laboratory is not None:
+        load_laboratory(laboratory)  # what is wrong with it is not the campaign's fault
     report = Report()
     place = Place(document)
     if (other := wrong_kind(place.document, "campaign")) is not None:

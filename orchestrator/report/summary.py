@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
-from pydantic import Field, SerializeAsAny
+from pydantic import Field, SerializeAsAny, create_model
 from pydantic.json_schema import GenerateJsonSchema
 
 from orchestrator.plan import CampaignPlan
@@ -21,7 +23,7 @@ from orchestrator.report.results import (
     predictions_of,
     theta_of,
 )
-from orchestrator.results import AnyResult, Results
+from orchestrator.results import Results, kinds
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.posterior import PosteriorSummary
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
@@ -199,12 +201,6 @@ class RunSummary(Totals):
     """What each stage learnt, in order."""
 
 
-class _Documented(RunSummary):
-    """The same, with the kinds of results that are known: for the schema."""
-
-    results: dict[str, AnyResult]  # type: ignore[assignment]
-
-
 class _NoTitles(GenerateJsonSchema):
     """JSON schema without titles: they only repeat the keys."""
 
@@ -214,8 +210,10 @@ class _NoTitles(GenerateJsonSchema):
 
 
 def summary_schema() -> dict[str, Any]:
-    """JSON schema of `summary.json`, with all kinds of results."""
-    schema = _Documented.model_json_schema(mode="serialization", schema_generator=_NoTitles)
+    """JSON schema of `summary.json`, with all kinds of results that installed packages have."""
+    tagged: Any = Annotated[reduce(or_, cast("Any", kinds())), Field(discriminator="kind")]
+    documented = create_model("RunSummary", __base__=RunSummary, __doc__=RunSummary.__doc__, results=dict[str, tagged])
+    schema = documented.model_json_schema(mode="serialization", schema_generator=_NoTitles)
     return {**schema, "title": "Result"}
 
 

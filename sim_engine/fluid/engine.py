@@ -12,17 +12,12 @@ from numpy.typing import NDArray
 from sim_engine.backend import BackendError, require_backend
 from sim_engine.cache import cache_directory
 from sim_engine.fluid.setup import POSE_STEP, SceneSetup
-from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, SUPPORT, FluidState
+from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState
 from sim_engine.fluid.step import LONGEST_STEP, Stepper
-from sim_engine.fluid.tension import cohesion_acceleration, pull_interval
-from sim_engine.fluid.viscosity import relax_interval
 from sim_engine.outcome import ParticleState
 
 POOLS = {"cpu": (50_000, 64), "cuda": (2_500_000, 1_024)}
 """Particles and scenes that a process has room for, by backend; the largest scene has 50,000 particles."""
-
-NATURAL_WALL_DISTANCE = 0.44
-"""Spacings at which the unshifted wall integral holds liquid off a wall, measured on a cup at rest."""
 
 FAULTS = {
     0: None,
@@ -79,13 +74,9 @@ class FluidEngine:
             f.list_begin[s] = begin * NEIGHBOURS + s * LIST_RESERVE
             f.cells_begin[s] = begin * CELLS + s * (LEAST_CELLS + 2)
             f.cells[s] = count * CELLS + LEAST_CELLS
-            f.cohesion[s] = cohesion_acceleration(setup.tension, setup.density, d)
-            f.viscosity[s], f.friction[s], f.lip_drop[s] = setup.viscosity, setup.friction, setup.lip_drop
-            f.waited[s], f.wait[s] = 0.0, relax_interval(setup.viscosity)
-            f.pull_waited[s], f.pull_wait[s] = 0.0, pull_interval(setup.tension, setup.density, d)
+            f.set_parameters(s, setup)
             f.gravity[s] = setup.gravity
             f.longest_step[s] = LONGEST_STEP if setup.longest_step is None else setup.longest_step
-            f.wall_shift[s] = (setup.wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
             for b, walls in enumerate((setup.pourer, setup.receiver)):
                 f.grid_offset[s, b] = values.add(walls.grid.values)
                 f.plane_offset[s, b] = planes.add(walls.plane)

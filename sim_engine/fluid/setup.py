@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.sdf import SignedDistanceGrid
 
 GRAVITY = 9.81
@@ -41,12 +42,8 @@ class SceneSetup:
     Attributes:
         positions: (N, 3) in the world [m].
         spacing: d [m].
-        tension: surface tension that cohesion is scaled to [N/m].
         density: of the liquid [kg/m³].
-        viscosity: XSPH rate [1/s].
-        friction: Coulomb coefficient.
-        wall_distance: where liquid comes to rest before a wall, in spacings.
-        lip_drop: rims are lower for particles at rest by so many spacings, at most `LARGEST_LIP_DROP`.
+        parameters: θ_s.
         pourer, receiver: the vessels.
         receiver_at: (3,) [m].
         spill_level: below it and in no vessel a particle is spilled [m].
@@ -60,12 +57,8 @@ class SceneSetup:
 
     positions: NDArray[np.float32]
     spacing: float
-    tension: float
     density: float
-    viscosity: float
-    friction: float
-    wall_distance: float
-    lip_drop: float
+    parameters: SimulationParameters
     pourer: SolidWalls
     receiver: SolidWalls
     receiver_at: NDArray[np.float64]

@@ -2,8 +2,13 @@
 
 import taichi as ti
 
+from sim_engine.fluid.setup import SceneSetup
+
 SUPPORT = 2.2
 """Kernel support h over spacing d. At 2.0 liquid at rest was a crystal, too stiff for waves (sloshing 6 % fast)."""
+
+NATURAL_WALL_DISTANCE = 0.44
+"""Spacings at which the unshifted wall integral holds liquid off a wall, measured on a cup at rest."""
 
 VESSELS = 2
 """Pourer (0) and receiver (1)."""
@@ -109,3 +114,17 @@ class FluidState:
         self.swing = ti.field(ti.f32, shape=scenes)  # farthest that the pourer carries a point in this step [m]
         self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]
+
+    def set_parameters(self, s: int, setup: SceneSetup) -> None:
+        """What θ_s of a scene is to the methods."""
+        from sim_engine.fluid.tension import cohesion_acceleration, pull_interval
+        from sim_engine.fluid.viscosity import relax_interval
+
+        theta, density, d = setup.parameters, setup.density, setup.spacing
+        self.cohesion[s] = cohesion_acceleration(theta.cohesion, density, d)
+        self.pull_waited[s], self.pull_wait[s] = 0.0, pull_interval(theta.cohesion, density, d)
+        self.viscosity[s] = theta.viscosity
+        self.waited[s], self.wait[s] = 0.0, relax_interval(theta.viscosity)
+        self.friction[s] = theta.friction
+        self.lip_drop[s] = theta.lip_drop
+        self.wall_shift[s] = (theta.wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT

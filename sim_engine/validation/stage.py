@@ -118,12 +118,8 @@ def run(
     setup = SceneSetup(
         positions=np.ascontiguousarray(positions, dtype=np.float32),
         spacing=spacing,
-        tension=parameters.cohesion,
         density=DENSITY,
-        viscosity=parameters.viscosity,
-        friction=parameters.friction,
-        wall_distance=parameters.wall_distance,
-        lip_drop=parameters.lip_drop,
+        parameters=parameters,
         pourer=walls,
         receiver=SolidWalls(NOTHING, NOTHING.values, NOTHING.cavity, 1e-3, NO_RIM),
         receiver_at=FAR_AWAY,

@@ -9,7 +9,7 @@ from sim_engine import cache
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.flood import Flood, brim_height, flood, floor_height
 from sim_engine.vessel.mesh_distance import GridLayout, cast_rays, crossings, layout_around, signed_distance
-from sim_engine.vessel.mesh_file import read_mesh
+from sim_engine.vessel.mesh_file import check_size, read_mesh
 from sim_engine.vessel.rim import measure_opening, trace_meridians
 from sim_engine.vessel.sdf import SignedDistanceGrid, choose_spacing
 from sim_engine.vessel.spec import MeshShape, VesselSpec
@@ -31,6 +31,7 @@ SCALARS = ("spacing", "inner_floor", "rim_height", "opening_radius", "outer_radi
 def build_mesh_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
     """See `sim_engine.vessel.build.build_vessel`."""
     assert isinstance(spec.shape, MeshShape)
+    check_size(spec.shape)
     key = f"vessel-{FORMAT_VERSION}-{spec.content_hash()}"
     if use_cache:
         stored = cache.load_arrays(key)

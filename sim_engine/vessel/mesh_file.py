@@ -23,6 +23,20 @@ LARGEST_FILE = 300_000_000
 """As much as so many triangles take where they are written as text [bytes]."""
 
 
+def check_size(shape: MeshShape) -> None:
+    """Refuse a file that is too large to be read, before it is.
+
+    Raises:
+        VesselError: it is.
+        OSError: there is none.
+    """
+    size = shape.path.stat().st_size
+    if size > LARGEST_FILE:
+        raise VesselError(
+            f"{shape.path.name}: {size / 1e6:.0f} MB; simplify it to at most {MOST_FACES:,} triangles, some 50 MB"
+        )
+
+
 def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
     """Closed, outward-facing triangles of a mesh file in metres, z up.
 
@@ -38,11 +52,6 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
     kind = shape.path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise VesselError(f"{shape.path.name}: '{kind}' is no mesh format known here; use {', '.join(FORMATS)}")
-    size = shape.path.stat().st_size
-    if size > LARGEST_FILE:
-        raise VesselError(
-            f"{shape.path.name}: {size / 1e6:.0f} MB; simplify it to at most {MOST_FACES:,} triangles, some 50 MB"
-        )
     content = shape.path.read_bytes()
     try:
         loaded = trimesh.load(io.BytesIO(content), file_type=kind, process=True)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from actors.arm.actor import DeviceArm
-from actors.arm.errors import ArmNotReleasedError, ArmStoppedError
-from actors.arm.numbers import POSITION_NOISE, Grip, NumbersArm, NumbersPath, NumbersSpec
+from actors.arm.errors import ArmLostError, ArmNotReleasedError, ArmStoppedError
+from actors.arm.look import ArmLook, SafetyRecord
+from actors.arm.motion_path import MotionPath
+from actors.arm.numbers import POSITION_NOISE, Grip, NumbersArm, NumbersSpec
 from actors.bench.planning import plan_pour
 from actors.contracts.arm import ArmBench, ArmContract
 from actors.device import LocalDevice, RayDevice
@@ -18,7 +21,7 @@ from actors.device import LocalDevice, RayDevice
 
 @pytest.fixture
 def path(scene, action):
-    return NumbersPath(plan_pour(scene, action))
+    return MotionPath(plan_pour(scene, action))
 
 
 @pytest.fixture
@@ -127,6 +130,33 @@ def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
     assert list(dict.fromkeys(s.phase for s in moving)) == ["tilt", "hold", "return"]
     for state in moving:
         assert state.tilt == pytest.approx(float(motion.tilt(np.array([state.time]))[0]), abs=1e-6)
+
+
+class Unreachable(NumbersArm):
+    def connect(self):
+        raise ArmLostError("nobody answers at 192.168.0.10")
+
+
+class UnreachableSpec(NumbersSpec):
+    def driver(self, accepted):
+        return Unreachable, (self,)
+
+
+def test_any_arm_can_be_looked_at_and_one_that_does_not_answer_says_so():
+    (there,) = NumbersSpec().look().checks(None, accept="", virtual=True)
+    assert (there.state, there.found) == ("ok", "numbers")
+    (lost,) = UnreachableSpec().look().checks(None, accept="", virtual=True)
+    assert (lost.state, lost.found) == ("fail", "nobody answers at 192.168.0.10")
+
+
+def test_safety_settings_that_nobody_has_accepted_fail_on_hardware():
+    look = ArmLook(checksum="AB", serial="7", model="arm")
+    record = SafetyRecord("AB", "7", "arm", "1", "2026-01-01", "Ada")
+    states = [look.checks(r, accept="accept it", virtual=False)[-1].state for r in (None, record)]
+    assert states == ["fail", "ok"]
+    other = look.checks(replace(record, serial="8"), accept="accept it", virtual=False)[-1]
+    assert other.state == "fail"
+    assert "accept it" in other.advice
 
 
 class TestArmOfNumbers(ArmContract):

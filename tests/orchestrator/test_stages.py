@@ -93,7 +93,9 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
         "narrow"
     }
     evaluation = result.results["evaluation"]
-    assert set(evaluation.discrepancy) == {"theta", "random 1", "random 2", "random 3"}
+    assert set(evaluation.discrepancy) == {"theta", "uncalibrated", "random 1", "random 2", "random 3"}
+    scored = [e for e in done if e.stage == "evaluation"]
+    assert len(scored) == work_of(campaign(tmp_path), ["evaluation"])["evaluation"].simulations
     assert evaluation.discrepancy["theta"].keys() == {"test", "train"}
     assert evaluation.random_median.keys() == {"test"}  # random θ are not simulated on training pours
     assert evaluation.mean_predictor["test"] is not None
@@ -183,7 +185,7 @@ def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> No
             if request.scene == "narrow":
                 theta = canonical(request.parameters.model_dump())
                 seeds.setdefault(theta, set()).add((request.action, request.seed))
-    assert len(seeds) == 4
+    assert len(seeds) == 5  # θ*, the uncalibrated θ and three random ones
     assert len({frozenset(of_theta) for of_theta in seeds.values()}) == 1
 
 

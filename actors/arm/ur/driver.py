@@ -33,7 +33,7 @@ from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.facts import UrFacts
 from actors.arm.ur.jogging import jog_path
 from actors.arm.ur.legs import Leg
-from actors.arm.ur.messages import Motion, Outcome, Reading, Settings
+from actors.arm.ur.messages import MotionOrder, Outcome, Reading, Settings
 from actors.arm.ur.script import path_program
 from actors.arm.ur.session import ANSWER_TIME, Session
 from actors.arm.ur.stopping import Stops, StopTimes
@@ -332,7 +332,7 @@ class UrArm:
         number = next(_numbers)
         program = path_program(path, settings, number, cb3=not facts.e_series)
         start, end = (tuple(map(float, path.joints[k])) for k in (0, -1))
-        motion = Motion(program, number, start, end, path.duration, settings, stops)
+        motion = MotionOrder(program, number, start, end, path.duration, settings, stops)
         self._announced, self._leg = True, leg
         self._session.forget_progress()
         self._stops.begin()
@@ -357,7 +357,7 @@ class UrArm:
         if self._stops.wait_for_one(stops, until - time.monotonic()):
             raise ArmStoppedError("stopped before it moved", "operator", "announced", 0.0, leg.tilt(0.0))
 
-    def _run(self, motion: Motion, leg: Leg) -> Outcome:
+    def _run(self, motion: MotionOrder, leg: Leg) -> Outcome:
         deadline = MOTION_MARGIN + 2.0 * motion.duration / self._spec.time_scale
         try:
             outcome = self._session.ask("run", motion, deadline=deadline)

@@ -54,7 +54,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionOrder:
     """A program that moves the arm, and what has to hold around it.
 
     Attributes:

@@ -14,7 +14,7 @@ from actors.arm.ur.messages import (
     READY,
     SLOWEST_HEARTBEAT,
     STOPPED,
-    Motion,
+    MotionOrder,
     Outcome,
     Progress,
     Reading,
@@ -86,7 +86,7 @@ class Watch:
         self,
         link: Link,
         address: str,
-        motion: Motion,
+        motion: MotionOrder,
         tell: Callable[[Progress], None],
         owner_seen: Callable[[], float],
     ) -> None:

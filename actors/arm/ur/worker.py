@@ -18,7 +18,7 @@ from typing import Any
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
 from actors.arm.ur.link import Link
-from actors.arm.ur.messages import Facts, Motion, Outcome, Progress, Reading, TroubleError
+from actors.arm.ur.messages import Facts, MotionOrder, Outcome, Progress, Reading, TroubleError
 from actors.arm.ur.primary import Primary, PrimaryError
 from actors.arm.ur.recovery import recover
 from actors.arm.ur.watch import STOPPED_PROGRAM, Watch
@@ -125,7 +125,7 @@ class Worker:
         """A fresh package."""
         return self.link.fresh()
 
-    def run(self, motion: Motion) -> Outcome:
+    def run(self, motion: MotionOrder) -> Outcome:
         """Make a motion."""
         watch = Watch(self.link, self._address, motion, self._tell, lambda: self._owner_seen)
         self._watch = watch

@@ -234,7 +234,8 @@ def _read_row(
         table.problems.append(Problem(path, number, column, name, message, line))
 
     if len(cells) != len(header):
-        add("", f"has {len(cells)} cells, the header {len(header)}")
+        open_quote = "; is a quote still open?" if any("\n" in cell for cell in cells) else ""
+        add("", f"has {len(cells)} cell{'s' * (len(cells) > 1)}, the header {len(header)}{open_quote}")
         return None
     values: dict[str, float] = {}
     for name, cell in zip(header, cells, strict=True):

@@ -62,7 +62,7 @@ def _misses(
     actions: Space, scene: Scene, pourer: Vessel, receiver: Vessel, known: dict[tuple[object, ...], float | None]
 ) -> Senseless | None:
     """An x_offset from which the stream passes beside the receiver."""
-    half, hits, beside = receiver.opening_radius + BESIDE, [], 0.0
+    half, hits, beside, below = receiver.opening_radius + BESIDE, [], 0.0, False
     for values in _spread(tuple(axis for axis in actions.axes if axis.name != "x_offset")):
         try:
             action = scene.action({"x_offset": 0.0, **values})
@@ -72,11 +72,18 @@ def _misses(
         if key not in known:
             known[key] = _landing(scene, action, pourer, receiver)
         landing = known[key]
-        if landing is not None and abs(action.y_offset) < half:
+        if landing is not None and math.isnan(landing):
+            below = True
+        elif landing is not None and abs(action.y_offset) < half:
             chord = math.sqrt(half**2 - action.y_offset**2)
             hits.append((landing - chord, landing + chord))
         elif landing is not None:
             beside = min(beside or math.inf, abs(action.y_offset))
+    if not hits and below:
+        text = (
+            f"the liquid leaves the lip below the rim of '{scene.receiver.name}'; a larger height would bring it above"
+        )
+        return _where(actions, "height"), text
     if not hits:
         if not beside:
             return None  # nothing leaves, which is told elsewhere
@@ -109,12 +116,17 @@ def _misses(
 
 
 def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> float | None:
-    """Where the stream comes down if the pourer stands over the receiver's axis [m]; None if nothing leaves."""
+    """Where the stream comes down if the pourer stands over the receiver's axis [m]; None if nothing leaves.
+
+    Not a number if most of it leaves below the receiver's rim.
+    """
     try:
         course = flow_course(plan_motion(scene, action, pourer, receiver), scene.liquid.volume, pourer, receiver)
     except ValueError:
         return None  # a motion that can't be made, which is told elsewhere
-    return None if course is None else course.landing()
+    if course is None:
+        return None
+    return course.landing() if course.quantile(course.fall, 0.5) > 0.0 else math.nan
 
 
 def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless | None:

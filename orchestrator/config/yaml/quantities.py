@@ -124,6 +124,8 @@ def parse_quantity(value: Any, unit: str, example: str) -> float:
         raise QuantityError(f"{value} has no unit; write '{value} {preferred}' if that is what is meant")
     if text == unit:
         return number
+    if re.match(r",\d", text):
+        raise QuantityError(f"{value!r} has a decimal comma; write '{str(value).replace(',', '.', 1)}'")
     source = _unit(text, kind, example)
     if source.dimensionality != registry().parse_units(unit if unit != "1" else "").dimensionality:
         raise QuantityError(f"{value!r} is {_kind_of(source)}; should be {kind}, for example '{example}'")

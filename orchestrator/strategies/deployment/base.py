@@ -205,7 +205,7 @@ class Deployment(ABC, Generic[S]):
         simulation from seed to seed, as fitted; None without a surrogate.
 
         Args:
-            noise: what the answer says of the place; None, as in journals of before: what it says of all.
+            noise: what the answer says of the place; None: what it says of all places.
         """
         return (suggestion.hyperparameters or {}).get("noise") if noise is None else noise
 

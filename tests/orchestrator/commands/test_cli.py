@@ -134,6 +134,10 @@ BAD: dict[str, str] = {
     "calibrate mass-csv.yaml": "poured 90 g + retained 90 g = 180 g, but 100 g were loaded",
     "calibrate nothing-csv.yaml": "nothing.csv: is empty; it needs a header and a line for each pour",
     # values on the command line
+    "run small.yaml --laboratory gone.yaml": "gone.yaml: no such file",
+    "plan small.yaml --laboratory small.yaml": "small.yaml: describes a campaign, but a laboratory is needed here",
+    f"{SIMULATE} --rrd {'x' * 300}.rrd": "can't be written: File name too long",
+    f"{SIMULATE} --png /proc/pour.png": "--png /proc/pour.png: can't be written: ",
     "run small.yaml --resume": "no unfinished run of campaign 'small'; begin one without --resume",
     "run small.yaml --resume --run nope": "runs/nope: no such run; known: none",
     "run small.yaml --run nope": "--run nope: goes with --resume",

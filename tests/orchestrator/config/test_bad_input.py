@@ -36,6 +36,7 @@ BAD_CAMPAIGNS = {
         "2:1: name: duplicate key; it stands in line 1",
     ),
     "bare number": (CAMPAIGN, "110 deg", "110", "6:21: motion.max_angle: 110 has no unit; write '110 deg'"),
+    "decimal comma": (CAMPAIGN, "mass: 200 g", 'mass: "1,5 kg"', "'1,5 kg' has a decimal comma; write '1.5 kg'"),
     "another dimension": (CAMPAIGN, "84 mm", "84 deg", "'84 deg' is an angle; should be a length, for example '90 mm'"),
     "frequency for an angular velocity": (
         CAMPAIGN,

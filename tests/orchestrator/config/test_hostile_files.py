@@ -114,6 +114,10 @@ BAD_TABLES = {
         "pours.csv:2002:1: has more than 2000 pours, which no calibration can use",
     ),
     "an open quote": (CSV.replace("80,120", '"80,120') + "5,5,5,5,5,train\n" * 20_000, "is not CSV: field larger than"),
+    "a quote that is never closed": (
+        CSV.replace("80,120", '"80,120'),
+        "pours.csv:4:1: has 1 cell, the header 6; is a quote still open?",
+    ),
     "zero bytes": (
         CSV.replace("80,120", "80\0,120"),
         "pours.csv:4:1: angular_velocity_deg_s: '80\\x00' is not a number",

@@ -14,7 +14,8 @@ from tests.orchestrator.good_files import CAMPAIGN, RECORDED, write
 CONFIGS = Path(__file__).parents[3] / "configs"
 QUICKSTART = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
 
-INTO_NARROW = "bad.yaml:36:15: deployment.actions.x_offset: deployment into 'narrow': "
+LINE = 1 + QUICKSTART[: QUICKSTART.index("x_offset: [")].count("\n")
+INTO_NARROW = f"bad.yaml:{LINE}:15: deployment.actions.x_offset: deployment into 'narrow': "
 
 
 def warnings(path: Path) -> list[str]:
@@ -57,13 +58,21 @@ def test_a_stream_beside_the_receiver_hits_nothing(folder: Path) -> None:
     assert told.endswith("of 'cup', whose opening has a radius of 32 mm")
 
 
+def test_a_lip_below_the_rim_pours_nothing_in(folder: Path) -> None:
+    low = CAMPAIGN.replace("height: 90 mm", "height: -20 mm").replace("x_offset: 84 mm", "x_offset: 120 mm")
+    (told,) = warnings(write(folder, "bad.yaml", low))
+    assert told.startswith(
+        "bad.yaml:6:56: motion.height: calibration: the liquid leaves the lip below the rim of 'cup'"
+    )
+
+
 def test_tilts_faster_than_the_laboratory_allows_are_told_with_the_limit(tmp_path: Path) -> None:
     fast = QUICKSTART.replace("[60 deg/s, 150 deg/s]", "[60 deg/s, 200 deg/s]")
     (told,) = warnings(write(tmp_path, "bad.yaml", fast))
     assert told == (
-        "bad.yaml:35:23: deployment.actions.angular_velocity: deployment into 'narrow': goes up to 200 deg/s, and the "
-        "arm turns the pourer at 160 deg/s at most (arm.limits.tilt_speed): faster actions are refused one by one. "
-        "End the range there"
+        f"bad.yaml:{LINE - 1}:23: deployment.actions.angular_velocity: deployment into 'narrow': goes up to 200 deg/s, "
+        "and the arm turns the pourer at 160 deg/s at most (arm.limits.tilt_speed): faster actions are refused one "
+        "by one. End the range there"
     )
     # at 200 deg/s² a turn of 120 deg comes to 155 deg/s on its way
     slow = fast.replace("angular_acceleration: 600 deg/s^2", "angular_acceleration: 200 deg/s^2")

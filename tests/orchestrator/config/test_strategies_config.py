@@ -203,7 +203,7 @@ def test_objectives_that_make_no_sense_are_refused(text: str, expected: str, tmp
     assert expected in refusal(tmp_path, text)
 
 
-DEPLOYED = f"""\
+CONFIRMED = f"""\
 name: test
 laboratory: {CONFIGS}/laboratories/virtual.yaml
 liquid: {{name: water, mass: 200 g}}
@@ -219,15 +219,15 @@ deployment:
 
 
 def test_confirming_pours_are_part_of_the_plan_whatever_the_strategy(tmp_path: Path) -> None:
-    for strategy, text in (("D1", DEPLOYED), ("D2", DEPLOYED.replace("D1", "D2").replace("pours: 0", "pours: 4"))):
+    for strategy, text in (("D1", CONFIRMED), ("D2", CONFIRMED.replace("D1", "D2").replace("pours: 0", "pours: 4"))):
         plan = load(tmp_path, text)
         assert plan.deployment is not None
         assert (plan.deployment.strategy, plan.deployment.confirm) == (strategy, 3)
-    without = load(tmp_path, DEPLOYED.replace("  confirm: 3\n", ""))
+    without = load(tmp_path, CONFIRMED.replace("  confirm: 3\n", ""))
     assert without.deployment is not None
     assert without.deployment.confirm == 0
 
 
 def test_confirming_pours_need_a_bench(tmp_path: Path) -> None:
-    problem = refusal(tmp_path, DEPLOYED.replace("laboratories/virtual.yaml", "laboratories/planning.yaml"))
+    problem = refusal(tmp_path, CONFIRMED.replace("laboratories/virtual.yaml", "laboratories/planning.yaml"))
     assert "campaign.yaml:11:12: deployment.confirm: laboratory 'planning' has no bench to pour on" in problem

@@ -18,7 +18,7 @@ import numpy as np
 
 from actors.arm.errors import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.geometry import Pose
-from actors.arm.numbers import ExecutedMotion, NumbersPath
+from actors.arm.motion_path import ExecutedMotion, MotionPath
 from actors.arm.protocol import ArmFacts, ArmState, Whereabouts
 from actors.arm.spec import ArmSpec
 from actors.bench.planning import plan_pour
@@ -50,9 +50,9 @@ class StandSpec(ArmSpec):
         """See `ArmSpec.driver`; a stand has no safety settings that could be accepted."""
         return Stand, (self,)
 
-    def plan(self, scene: Scene, action: Action) -> NumbersPath:
+    def plan(self, scene: Scene, action: Action) -> MotionPath:
         """See `ArmSpec.plan`: the motor makes any motion that isn't too fast for it."""
-        path = NumbersPath(plan_pour(scene, action), approach_time=1.0)
+        path = MotionPath(plan_pour(scene, action), approach_time=1.0)
         if path.report.tilt_speed > self.fastest * 1.001:
             asked, most = math.degrees(path.report.tilt_speed), math.degrees(self.fastest)
             raise InvalidActionError(
@@ -112,10 +112,10 @@ class Stand:
     def where(self) -> Whereabouts:
         return Whereabouts(Pose(z=self._height))
 
-    def move_to_start(self, path: NumbersPath) -> None:
+    def move_to_start(self, path: MotionPath) -> None:
         self._way("approach", path.approach_time, lambda t: 0.0)
 
-    def execute(self, path: NumbersPath) -> ExecutedMotion:
+    def execute(self, path: MotionPath) -> ExecutedMotion:
         def phase(t: float) -> str:
             return next((name for name, _, end in path.phases if t < end), "return")
 
@@ -133,11 +133,11 @@ class Stand:
             )
         return executed
 
-    def retreat(self, path: NumbersPath) -> None:
+    def retreat(self, path: MotionPath) -> None:
         self._way("retreat", path.retreat_time, lambda t: 0.0)
         self._free = False
 
-    def untilt(self, path: NumbersPath | None = None) -> None:
+    def untilt(self, path: MotionPath | None = None) -> None:
         tilt, speed = self._state.tilt, self._spec.untilt_speed
         self._way("untilt", tilt / speed, lambda t: max(tilt - speed * t, 0.0))
         self._free = False

@@ -1,0 +1,98 @@
+"""What stages learnt, written and read back by its kind; and what is written after a run, whoever drove it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import pytest
+
+from orchestrator.errors import RunError
+from orchestrator.publish import publish
+from orchestrator.results import decode_result, encode_result, learnt_by
+from orchestrator.strategies.calibration.base import Calibrated
+from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.learnt import Learnt
+from tests.orchestrator import watched
+from tests.orchestrator.reported import changed
+from tests.orchestrator.toy import run_toy
+
+
+def test_results_read_back_as_they_were_bit_for_bit(results: dict[str, Any]) -> None:
+    for result in results.values():
+        assert decode_result(json.loads(json.dumps(encode_result(result), allow_nan=False))) == result
+
+
+def test_a_number_that_is_none_survives_the_journal(results: dict[str, Any]) -> None:
+    spoilt = changed(results["calibration"].trials[0], discrepancy=math.nan)
+    result = changed(results["calibration"], trials=[spoilt])
+    again = decode_result(json.loads(json.dumps(encode_result(result), allow_nan=False)))
+    assert isinstance(again, Calibrated)
+    assert again.trials[0].discrepancy is not None
+    assert math.isnan(again.trials[0].discrepancy)
+
+
+def test_a_kind_that_nobody_knows_is_said_with_those_that_are_known() -> None:
+    with pytest.raises(RunError, match=r"kind 'guess' is not known; is the package installed .* calibration"):
+        decode_result({"kind": "guess"})
+    with pytest.raises(RunError, match="'calibration' can't be read: strategy: Field required"):
+        decode_result({"kind": "calibration"})
+
+
+def test_two_kinds_of_one_name_and_a_result_without_one_are_refused() -> None:
+    with pytest.raises(TypeError, match="Calibrated has the kind 'calibration' already"):
+
+        class Impostor(Learnt):
+            kind: Literal["calibration"] = "calibration"
+
+    with pytest.raises(TypeError, match="has to declare its kind"):
+
+        class Nameless(Learnt):
+            pass
+
+
+def test_a_stage_that_learnt_something_else_is_named(results: dict[str, Any]) -> None:
+    assert learnt_by(results, "narrow cup", Deployed) is results["narrow cup"]
+    with pytest.raises(RunError, match=r"stage narrow cup should have learnt a Calibrated, but .* 'deployment'"):
+        learnt_by(results, "narrow cup", Calibrated)
+    with pytest.raises(RunError, match="stage pours should have learnt a Calibrated, but there is nothing"):
+        learnt_by(results, "pours", Calibrated)
+
+
+def test_publishing_closes_the_recording_and_can_be_done_again(tmp_path: Path, results: dict[str, Any]) -> None:
+    class Recording:
+        path, dropped, closed = tmp_path / "campaign.rrd", 3, False
+
+        def close(self) -> None:
+            self.closed = True
+
+    from dataclasses import replace
+
+    recording = Recording()
+    result = replace(asyncio.run(run_toy(tmp_path / "run")), results=results)
+    published = publish(watched.campaign(), result, recording)
+    assert recording.closed
+    assert published.summary.dropped_events == 3
+    assert published.theta is not None
+    assert json.loads(published.theta.read_text())["theta"] == results["calibration"].found.theta.model_dump()
+    assert all(path.is_file() for path in published.figures.values())
+    summary = (tmp_path / "run" / "summary.json").read_text()
+    assert json.loads(summary)["theta"] == results["calibration"].found.theta.model_dump()
+    publish(watched.campaign(), result, recording)
+    assert (tmp_path / "run" / "summary.json").read_text() == summary
+
+
+def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    from orchestrator import results as module
+    from orchestrator.report.summary import summary_schema
+    from tests.orchestrator.scripted import Scripted
+
+    assert Scripted not in module.kinds()
+    settings = type("Settings", (), {"__module__": Scripted.__module__})
+    monkeypatch.setattr(module, "STRATEGIES", SimpleNamespace(all={"scripted": settings}))
+    assert Scripted in module.kinds()
+    assert "Scripted" in summary_schema()["$defs"]
