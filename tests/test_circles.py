@@ -10,8 +10,8 @@ ROOT = Path(__file__).parents[1]
 FLOORS = ("sim_engine", "actors", "orchestrator")
 
 SETTINGS = ("spec.py", "settings.py")
-MAKERS = ("build", "driver", "stand_in", "look", "plan", "resolve", "unknown_tag")
-"""Methods of settings that make what they are settings of, or ask the door that they are found at."""
+MAKERS = ("build", "driver", "stand_in", "look", "plan", "resolve", "unknown_tag", "set_parameters")
+"""Methods of settings that make what they are settings of, hand it their values, or ask the door they are found at."""
 
 
 def modules() -> dict[str, Path]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny
 
-from sim_engine.doors import Door
+from sim_engine.doors import Door, DoorError
 from sim_engine.marks import BY_CONTENT
 
 LengthUnit = Literal["m", "cm", "mm", "in"]
@@ -102,7 +102,12 @@ VESSELS: Door[type[Shape]] = Door("decant.vessels", "source of vessels", _shape)
 
 def _of_its_kind(value: Any) -> Any:
     """A shape as it was written down, by its kind."""
-    return VESSELS.get(str(value.get("kind"))).model_validate(value) if isinstance(value, dict) else value
+    if not isinstance(value, dict):
+        return value
+    try:
+        return VESSELS.get(str(value.get("kind"))).model_validate(value)
+    except DoorError as error:
+        raise ValueError(str(error)) from None
 
 
 class VesselSpec(BaseModel):

@@ -180,3 +180,10 @@ def test_bottle_has_shoulder_and_neck() -> None:
     assert bottle.outer_radius == pytest.approx(0.032, abs=1e-5)
     neck = np.array([[0.013, 0.0, 0.145], [0.02, 0.0, 0.145], [0.0, 0.0, 0.145]])
     assert np.sign(bottle.grid.sample(neck)).tolist() == [-1.0, 1.0, 1.0]
+
+
+def test_a_shape_is_read_back_by_its_kind():
+    spec = cylinder("cup", inner_radius=0.04, inner_height=0.1)
+    assert VesselSpec.model_validate_json(spec.model_dump_json()) == spec
+    with pytest.raises(ValueError, match="unknown source of vessels 'profil'; did you mean 'profile'"):
+        VesselSpec.model_validate({"name": "cup", "shape": {"kind": "profil"}})

@@ -8,7 +8,6 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from orchestrator.config.load import load_laboratory
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid
 from sim_engine.outcome import PourOutcome
+from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.spec import cylinder
 from tests.patience import PATIENCE
@@ -45,7 +45,7 @@ class Trickle:
     """A liquid of one rule: a pourer tilted to `FULL_TILT` is empty, one less tilted keeps what it can; a twentieth of
     what leaves it misses the receiver."""
 
-    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimpleNamespace:
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         assert task.motion is not None, "the wired bench simulates what was executed"
         tilt = float(np.max(task.motion.tilt(task.motion.times)))
         poured = min(max((tilt - 30 * DEG) / (FULL_TILT - 30 * DEG), 0.0), 1.0)
@@ -66,7 +66,7 @@ class Trickle:
             curve_poured=(0.0, poured),
             curve_spilled=(0.0, 0.05 * poured),
         )
-        return SimpleNamespace(outcome=outcome, frames=None)
+        return SimulatedPour(outcome)
 
     def close(self) -> None:
         pass

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from actors.balance.placement import Placement
+from actors.balance.spec import NumbersBalanceSpec
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.laboratory.sections import LaboratoryFile
@@ -205,3 +206,13 @@ def test_a_receiver_turned_away_from_home_is_refused_soon_and_in_words_of_the_be
         assert "s into the approach" not in problem.message
     assert doing[0] == "calibration: 21 actions are tried, none of 1 can be made"
     assert any(text.startswith("deployment into 'narrow': ") for text in doing)
+
+
+def test_a_balance_of_numbers_may_stand_beside_an_arm(tmp_path):
+    start = VIRTUAL.index("balance:")
+    text = VIRTUAL[:start] + "balance: {kind: numbers, resolution: 0.2 g}\n" + VIRTUAL[VIRTUAL.index("operator:") :]
+    spec = load(tmp_path, text).balance
+    assert spec is not None
+    assert isinstance(spec.device, NumbersBalanceSpec)
+    assert spec.device.told
+    assert (spec.device.sheet.resolution, spec.device.time_scale) == (pytest.approx(2e-4), 30.0)

@@ -1,0 +1,64 @@
+"""What others build on, as text: names of `import decant` with their signatures, entry-point groups, contracts.
+
+`python -m tests.public_api` writes it to tests/public-api.txt.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import tomllib
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import decant
+
+ROOT = Path(__file__).parent.parent
+KEPT = Path(__file__).with_name("public-api.txt")
+
+
+def public_api() -> str:
+    """One line for each name, sorted."""
+    lines = [line for name in decant.__all__ for line in _lines(f"decant.{name}", getattr(decant, name))]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines += [
+        f"entry point {group}: {name}" for group, names in project["entry-points"].items() for name in sorted(names)
+    ]
+    return "\n".join(sorted(lines)) + "\n"
+
+
+def _lines(name: str, value: Any) -> list[str]:
+    if inspect.ismodule(value):
+        own = [n for n, v in vars(value).items() if inspect.isclass(v) and v.__module__ == value.__name__]
+        return [line for n in own if not n.startswith("_") for line in _lines(f"{name}.{n}", getattr(value, n))]
+    if inspect.isclass(value):
+        return [_class_line(name, value), *_members(name, value)]
+    if callable(value):
+        return [f"{name}{inspect.signature(value)}"]
+    return [f"{name} = {value}"]
+
+
+def _class_line(name: str, cls: type) -> str:
+    if issubclass(cls, Enum):
+        return f"{name}: {', '.join(member.name for member in cls)}"
+    if dataclasses.is_dataclass(cls):
+        return f"{name}({', '.join(f'{field.name}: {field.type}' for field in dataclasses.fields(cls))})"
+    fields = getattr(cls, "model_fields", None)
+    return f"{name}({', '.join(fields)})" if fields else name
+
+
+def _members(name: str, cls: type) -> list[str]:
+    lines = []
+    for key, value in vars(cls).items():
+        if key.startswith("_"):
+            continue
+        if isinstance(value, property):
+            lines.append(f"{name}.{key}")
+        elif inspect.isfunction(value):
+            lines.append(f"{name}.{key}{inspect.signature(value)}")
+    return lines
+
+
+if __name__ == "__main__":
+    KEPT.write_text(public_api(), encoding="utf-8")
