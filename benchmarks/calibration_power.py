@@ -56,7 +56,7 @@ STEPS = (("viscosity",), ("cohesion",), ("friction",), ("particles",), ("wall_di
 """Which parameters join the search, one step after the other."""
 
 RANGES = {"friction": Axis("friction", 0.0, 0.3)}
-"""Of parameters that the campaign does not search."""
+"""Ranges of parameters that the campaign does not search."""
 
 SPLITS = ("train", "test", "transfer")
 

@@ -39,7 +39,7 @@ class Store:
 
     @staticmethod
     def key(pour: str, particles: int, seed: int) -> str:
-        """Of one simulation."""
+        """Key of one simulation."""
         return f"{pour} | {particles} | {seed}"
 
     def put(self, key: str, values: tuple[float, float]) -> None:

@@ -87,7 +87,7 @@ class Fluid(Bench):
         return result
 
     async def simulate_apart(self, task: PourTask) -> SimulatedPour:
-        """Of the bench's own liquid: it takes none of the campaign's time."""
+        """A simulation of the bench's own liquid: it takes none of the campaign's time."""
         result, used = self._run(task)
         self.apart += result.outcome.cpu_s
         await self._clock.spend(0.0, used)

@@ -26,7 +26,7 @@ from sim_engine.space import Axis, Space
 
 SPACE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 SCATTER = 0.02
-"""Of a simulation."""
+"""Scatter of a simulation."""
 
 WORLDS: dict[str, Callable[[World, Floats, Floats], float]] = {
     "right": lambda world, u, _: world.true(u),

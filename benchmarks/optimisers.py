@@ -8,7 +8,7 @@ optimiser would hand to its user, judged without noise: by posterior mean for ou
 observation. Visited: the best of what it tried, whatever it reports. Means with 95 % bootstrap intervals over seeds.
 
 The others live in an environment of their own in the cache directory, made when it is first needed (about 1 GB); they
-are no dependency of Decant. Every run of (problem, optimiser, seed) is kept there too: what was interrupted goes on.
+are not a dependency of Decant. Every run of (problem, optimiser, seed) is kept there too: what was interrupted goes on.
 `--budget` ends each optimiser after so many CPU seconds; `--fresh` forgets what was kept of some. `--speed` measures
 what a fit and a suggestion cost instead.
 """

@@ -1,6 +1,6 @@
 """The peer to measure beside: SPlisHSPlasH 2.19 in an environment of its own, on the same scene.
 
-It is no dependency of Decant: `environment()` makes a virtual environment in the user's cache directory when it is
+It is not a dependency of Decant: `environment()` makes a virtual environment in the user's cache directory when it is
 first asked for (about 250 MB), and `pour()` starts the solver there as a child of this process, on the same core.
 """
 
@@ -53,7 +53,7 @@ WALL_DISTANCE = 1.0
 
 FRAME_EVERY = 0.02
 FREEZE_BELOW = -0.06
-"""Of what has fallen below this height nothing comes back [m]."""
+"""Nothing that has fallen below this height comes back [m]."""
 
 PATIENCE = 3600.0
 """A run that takes longer has gone wrong [s]."""

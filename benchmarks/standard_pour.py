@@ -83,7 +83,7 @@ def vessels() -> tuple[Vessel, Vessel]:
 
 @cache
 def motion() -> PourMotion:
-    """Of the pourer."""
+    """Motion of the pourer."""
     return plan_motion(SCENE, standard_action(), *vessels())
 
 

@@ -25,10 +25,10 @@ from orchestrator.requests import Failed, Pour, Simulate
 from orchestrator.strategies.progress import Progress
 
 PRICE = 1.2e-3
-"""Of a simulated pour on one core, per particle, before one has been seen [s]."""
+"""Price of a simulated pour on one core, per particle, before one has been seen [s]."""
 
 THOUGHT = 0.2
-"""Of what lies between two pours beside them: a question to the optimiser, the journal [s]."""
+"""Time between two pours beside them: a question to the optimiser, the journal [s]."""
 
 ENOUGH = 4
 """Simulations of a stage after which its pace counts; what is expected of it still counts as so many."""

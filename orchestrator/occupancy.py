@@ -90,7 +90,7 @@ class Occupancy:
 
 
 def occupancies(entries: Iterable[Entry], slots: int) -> dict[str, Occupancy]:
-    """Of every stage of a journal that both simulated and poured, by the stage's name."""
+    """The occupancy in every stage of a journal that both simulated and poured, by the stage's name."""
     simulations: set[int] = set()
     stages: dict[str, Occupancy] = {}
     done: dict[str, set[str]] = {}

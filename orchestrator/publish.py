@@ -131,7 +131,7 @@ def _totals(plan: CampaignPlan, result: CampaignResult) -> Totals:
 def worked_out(
     work: Callable[[], dict[str, list[W]]], tell: Callable[[str], None] = _log.warning
 ) -> dict[str, list[W]]:
-    """Warnings, or none if they can't be worked out: that is no reason to lose a summary."""
+    """Warnings, or none if they can't be worked out: that is not a reason to lose a summary."""
     try:
         return work()
     except (ValueError, OSError) as error:

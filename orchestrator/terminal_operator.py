@@ -144,7 +144,7 @@ class TerminalOperator:
             return line.strip()
         answer = _WORDS[question.wants].get(said)
         if answer is None:
-            unknown = f"'{line.strip()}' is no answer; " if said else ""
+            unknown = f"'{line.strip()}' is not an answer; " if said else ""
             self._write(f"{unknown}{_EXPECTED[question.wants]}\n> ")
         return answer
 

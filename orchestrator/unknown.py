@@ -101,7 +101,7 @@ async def settle_open_questions(
             meant = next((o for o in request.options if o.lower() == " ".join(answer.lower().split())), None)
             if meant is not None:
                 break
-            text = f"{request.question}\n'{answer}' is no answer; answer with one of: {'; '.join(request.options)}"
+            text = f"{request.question}\n'{answer}' is not an answer; answer with one of: {'; '.join(request.options)}"
         else:
             raise needs_answer(request)
         asked = {"id": key, "question": request.question, "options": list(request.options)}
@@ -139,7 +139,7 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
     if text == LOST:
         return Failed("pour_unknown", "declared lost by the operator")
     if not words or words[0] != "weighed":
-        raise ValueError(f"'{answer}' is no answer; answer with one of: {'; '.join(options)} (masses in grams)")
+        raise ValueError(f"'{answer}' is not an answer; answer with one of: {'; '.join(options)} (masses in grams)")
     try:
         masses = [float(word) * 1e-3 for word in words[1:] if word != "g"]
     except ValueError:
@@ -157,7 +157,7 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
 
 
 def weighed_by_hand(pour: Pour, measured: PourMeasurement) -> str:
-    """Of a pour that was weighed and can't be written down: what a person types when the run is resumed."""
+    """What a person types on resume about a pour that was weighed and can't be written down."""
     loaded, spilled, retained = (f"{1e3 * mass:.1f}" for mass in (measured.loaded, measured.spilled, measured.retained))
     return (
         f"Pour {pour.number} was made and weighed, and is not written down: {loaded} g loaded, {spilled} g spilled, "

@@ -68,7 +68,7 @@ def _deployed(plan: DeploymentPlan, pour: float) -> Work:
 
 
 def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float:
-    """Of one whole pour with the operator's part, as planned [s of the clock].
+    """Time of one whole pour with the operator's part, as planned [s of the clock].
 
     Args:
         laboratory: whose operator and bench make it.

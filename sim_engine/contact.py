@@ -3,7 +3,7 @@
 Both solids are sampled on their surfaces, and each sample is looked up in the other's signed distance grid. Samples are
 kept in patches with bounding spheres: a patch whose centre is farther from the other solid than its radius can't touch
 it, so that only the few patches near a wall are looked at closely. A lip that dips into the other's opening without
-touching its wall is no contact.
+touching its wall is not contact.
 
 A motion is looked at along the way that the pourer's points make (`poses_along`), never along the clock: a pour that is
 held for a minute is not looked at more coarsely than one that is not held.
@@ -171,7 +171,7 @@ def _check_poses(poses: Floats) -> Floats:
     if poses.ndim != 2 or poses.shape[1] != 7 or not np.all(np.isfinite(poses)):
         raise ValueError(f"poses: finite numbers of shape (T, 7), x y z qw qx qy qz, got shape {poses.shape}")
     if len(poses) and np.linalg.norm(poses[:, 3:], axis=1).min() < 1e-6:
-        raise ValueError("poses: a quaternion of length 0 is no rotation")
+        raise ValueError("poses: a quaternion of length 0 is not a rotation")
     return poses
 
 

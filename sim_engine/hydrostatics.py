@@ -33,7 +33,7 @@ FLOW_LIMIT = 1e-7
 """Flow below which a pour counts as over: 0.1 mL/s, about two drips a second [m³/s]."""
 
 TIME_STEP = 0.01
-"""Of the outflow equation [s]."""
+"""Time step of the outflow equation [s]."""
 
 
 @dataclass(frozen=True)

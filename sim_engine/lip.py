@@ -129,11 +129,11 @@ class FlowCourse:
         return float(values[order][min(int(place), len(order) - 1)])
 
     def lip_numbers(self, liquid: Liquid) -> FlowNumbers:
-        """Of the film at the lip."""
+        """Dimensionless numbers of the film at the lip."""
         return self._numbers(self.velocity, self.film, liquid)
 
     def stream_numbers(self, liquid: Liquid) -> FlowNumbers:
-        """Of the falling stream at the receiver's rim."""
+        """Dimensionless numbers of the falling stream at the receiver's rim."""
         return self._numbers(self.stream_velocity, self.diameter, liquid)
 
     def _numbers(self, velocity: Floats, thickness: Floats, liquid: Liquid) -> FlowNumbers:

@@ -1,7 +1,7 @@
 """What is minimised, written down once.
 
 Calibration compares the normalised spillage r = spilled / poured, which is undefined below 5 % poured.
-Deployment minimises, by default, (spilled + w·retained) / loaded, so that not pouring is no solution.
+Deployment minimises, by default, (spilled + w·retained) / loaded, so that not pouring is not a solution.
 """
 
 from __future__ import annotations

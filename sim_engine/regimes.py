@@ -46,7 +46,7 @@ PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer none has neighbours all around it, and the stream is a string."""
 
 AIRTIGHT_BOND = 0.842
-"""Of the opening's radius: air does not rise into a narrower one that is full of liquid (Bretherton 1961)."""
+"""Bond number of the opening: air does not rise into a narrower one that is full of liquid (Bretherton 1961)."""
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ class Space:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the axes, in order."""
+        """Names of the axes, in order."""
         return tuple(axis.name for axis in self.axes)
 
     @property

@@ -11,7 +11,7 @@ from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourOutcome
 
 FRACTIONS = ("received", "spilled", "retained", "in_flight", "escaped")
-"""Of a `PourOutcome`; they add up to 1."""
+"""Fractions of a `PourOutcome`; they add up to 1."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread | None:
-        """Of some values; None without any."""
+        """The spread of some values; None without any."""
         if not values:
             return None
         mean = math.fsum(values) / len(values)

@@ -42,11 +42,11 @@ class MotionPath:
         return tuple((phase.name, phase.start / self.factor, phase.end / self.factor) for phase in self.motion.phases)
 
     def tilt(self, times: FloatArray) -> FloatArray:
-        """Of the pourer at times of the pour, shape (T,) [rad]."""
+        """Tilt of the pourer at times of the pour, shape (T,) [rad]."""
         return self.motion.tilt(times * self.factor)
 
     def poses(self, times: FloatArray) -> FloatArray:
-        """Of the pourer in the world at times of the pour, shape (T, 7)."""
+        """Poses of the pourer in the world at times of the pour, shape (T, 7)."""
         return self.motion.sample(times * self.factor)
 
     def slowed(self, factor: float) -> MotionPath:

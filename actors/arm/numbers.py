@@ -33,7 +33,7 @@ POSITION_NOISE = 3e-5
 """Standard deviation of a pose read back [m]: an industrial arm's repeatability."""
 
 FARTHEST_TURN, FARTHEST_WAY = math.radians(10.0), 0.05
-"""Of one step by hand [rad], [m]."""
+"""Noise of one step by hand [rad], [m]."""
 
 _STEP = 0.02
 """Wall time between two looks at a stop button [s]."""

@@ -138,12 +138,12 @@ class Executed(Protocol):
 
     @property
     def times(self) -> FloatArray:
-        """Of the readings, shape (T,), increasing from 0 at the pour's begin [s]."""
+        """Times of the readings, shape (T,), increasing from 0 at the pour's begin [s]."""
         ...
 
     @property
     def poses(self) -> FloatArray:
-        """Of the pourer in the world, shape (T, 7): x y z [m] qw qx qy qz.
+        """Poses of the pourer in the world, shape (T, 7): x y z [m] qw qx qy qz.
 
         An arm knows where its flange is, not how the vessel sits in the fingers: errors of grip are not in it.
         """

@@ -18,7 +18,7 @@ _OUTSIDE = {
 }
 
 REFUSED = "it refuses the question"
-"""Begins the detail of a reading that is no reading."""
+"""Begins the detail of a reading that is not a reading."""
 
 LOST_REFERENCE = (
     "the connection was lost since the last tare. If it stayed switched on, its display still holds the weight (last "

@@ -34,7 +34,7 @@ class CommandError(BalanceError):
 
 
 class UnitError(BalanceError):
-    """The balance shows something that is no mass."""
+    """The balance shows something that is not a mass."""
 
 
 class ReferenceLostError(BalanceError):

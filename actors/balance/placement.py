@@ -37,7 +37,7 @@ class Placement(StrEnum):
     """Under tray and receiver together: it reads what was poured."""
 
     TARED = "tared"
-    """Of the bench of numbers: vessels are tared away, so that each weighing is liquid alone."""
+    """The weighings of the bench of numbers: vessels are tared away, so that each is liquid alone."""
 
     MANUAL = "manual"
     """Anywhere, and not connected: the operator weighs and types."""
@@ -317,11 +317,11 @@ def _check_complete(placement: Placement, weighed: Mapping[str, Weighed]) -> Non
     for key in asked:
         one = weighed[key]
         if not (math.isfinite(one.mass) and math.isfinite(one.uncertainty) and one.uncertainty >= 0.0):
-            raise WeighingError(f"{key} is no weight: {one.mass} kg ± {one.uncertainty} kg")
+            raise WeighingError(f"{key} is not a weight: {one.mass} kg ± {one.uncertainty} kg")
 
 
 def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float | None, tolerance: float) -> None:
-    """Refuse what can't be; rounding of the sums is no offence."""
+    """Refuse what can't be; rounding of the sums is not an offence."""
     slack = {name: SURE * sigma[name] + 1e-9 for name in mass}
     shown = {name: f"{_grams(mass[name]):g} ± {_grams(sigma[name]):g} g" for name in mass}
     if mass["loaded"] <= slack["loaded"]:

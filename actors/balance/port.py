@@ -37,7 +37,7 @@ def _group(port: Path) -> str:
 
 
 def _other_than_a_port(port: Path) -> str | None:
-    """What stands there, if it is no serial port; None where it is one, or can't be opened to see."""
+    """What stands there, if it is not a serial port; None where it is one, or can't be opened to see."""
     if port.is_dir():
         return "a folder"
     if not stat.S_ISCHR(port.stat().st_mode):

@@ -10,7 +10,7 @@ from actors.balance.units import kilograms
 
 
 class FrameError(ValueError):
-    """Bytes that are no line of the dialect: damaged, half a line, or another dialect's."""
+    """Bytes that are not a line of the dialect: damaged, half a line, or another dialect's."""
 
 
 class Status(StrEnum):
@@ -50,7 +50,7 @@ class Reading:
     detail: str = ""
 
     def mass(self, unit: str = "") -> float | None:
-        """The weight [kg]; None without a number, or where its unit is no mass.
+        """The weight [kg]; None without a number, or where its unit is not a mass.
 
         Args:
             unit: taken where the line has none.

@@ -49,7 +49,7 @@ class Recording:
         """Read a file.
 
         Raises:
-            ValueError: it is no recording, or a line is damaged; says which.
+            ValueError: it is not a recording, or a line is damaged; says which.
         """
         lines = path.read_text(encoding="utf-8").splitlines()
         number = 0

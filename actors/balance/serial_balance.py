@@ -44,7 +44,7 @@ COMMAND_TIME = 3.0
 _RETRY_INTERVAL = 0.5
 
 STRANGE_UNITS = 3
-"""Readings in a row in a unit that is no mass, before that is an error."""
+"""Readings in a row in a unit that is not a mass, before that is an error."""
 
 LOSSES = 3
 """How often the connection may be lost during one weighing."""
@@ -336,14 +336,14 @@ class SerialBalance:
             raise self._error(ReferenceLostError, LOST_REFERENCE.format(shown=self._display.last.shown or "nothing"))
 
     def _check_unit(self, reading: Reading) -> None:
-        """Refuse what is no mass; but a unit that lost a letter on the line is none either, so not at once."""
+        """Refuse what is not a mass; but a unit that lost a letter on the line is none either, so not at once."""
         strange = reading.value is not None and bool(reading.unit) and reading.mass() is None
         self._strange_units = self._strange_units + 1 if strange else 0
         if self._strange_units >= STRANGE_UNITS:
             self._strange_units = 0
             raise self._error(
                 UnitError,
-                f"it shows {reading.value} {reading.unit}, and that is no mass that is understood; switch it to g",
+                f"it shows {reading.value} {reading.unit}, and that is not a mass that is understood; switch it to g",
             )
 
     @contextlib.contextmanager

@@ -41,6 +41,6 @@ def typed_weight(text: str) -> TypedWeight:
         raise ValueError(f"'{text.strip()}' has no unit; type '{number} g' if that is what is meant")
     factor = kilograms(match["unit"])
     if factor is None:
-        raise ValueError(f"'{match['unit']}' is no unit of mass that is known; there are {', '.join(KILOGRAMS)}")
+        raise ValueError(f"'{match['unit']}' is not a unit of mass that is known; there are {', '.join(KILOGRAMS)}")
     exponent = int(number.as_tuple().exponent)
     return TypedWeight(float(number) * factor, float(Decimal(1).scaleb(exponent)) * factor)

@@ -20,7 +20,7 @@ damaged `ct` must not become one."""
 
 
 def kilograms(unit: str) -> float | None:
-    """Mass of one unit [kg]; None where it is no mass (pcs, %), or no single one (taels differ between cities).
+    """Mass of one unit [kg]; None where it is not a mass (pcs, %), or no single one (taels differ between cities).
 
     Args:
         unit: as a balance prints it, in any case.

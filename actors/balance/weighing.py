@@ -30,7 +30,7 @@ Ask = Callable[[Question], Awaitable[str]]
 
 
 class Weighings:
-    """Of one pour.
+    """The weighings of one pour.
 
     Args:
         spec: where the balance stands.
@@ -77,7 +77,7 @@ class Weighings:
             await self._do(step)
 
     async def at_once(self) -> None:
-        """Of the steps after the pour the weighings that need no hands, once and without asking anybody.
+        """Make those weighings after the pour that need no hands, once and without asking anybody.
 
         For a pour that was broken off: so that a weight is kept that may be lost later.
 

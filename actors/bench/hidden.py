@@ -48,7 +48,7 @@ def draw_pose_error(spec: VirtualBenchSpec, seed: int) -> PoseError:
         x=float(mean.x + deviation.x * noise[0]),
         y=float(mean.y + deviation.y * noise[1]),
         tilt=float(mean.tilt + deviation.tilt * noise[2]),
-        # A standard deviation is no bound; an arm that stands still or runs away is no error of execution.
+        # A standard deviation is not a bound; an arm that stands still or runs away is not an error of execution.
         speed_factor=float(np.clip(factor, 0.5, 1.5)),
     )
 

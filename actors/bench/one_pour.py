@@ -330,7 +330,7 @@ class OnePour:
         await self._setup.nature.lands(self._executed, self._broken)
 
     async def _keep_what_shows(self) -> None:
-        """Of a pour that was broken off, whatever can be weighed without touching anything."""
+        """Weigh whatever can be weighed of a pour that was broken off without touching anything."""
         with contextlib.suppress(LaboratoryError):
             await self._let_it_land()
             await self._setup.nature.settle(SETTLING_TIME)
@@ -409,7 +409,7 @@ def _largest_tilt(executed: Executed) -> float:
 
 
 def _who(facts: ArmFacts | None) -> dict[str, Any]:
-    """Of the robot, what a later reader will ask for."""
+    """What a later reader will ask about the robot."""
     if facts is None:
         return {}
     told = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}

@@ -27,7 +27,7 @@ class Things:
     on_tray: float = 0.0
 
     def mass(self, name: str) -> float:
-        """Of a thing with what is in it [kg]."""
+        """Mass of a thing with what is in it [kg]."""
         dry = {"dry pourer": POURER, "pourer": POURER, "receiver": RECEIVER, "tray": TRAY}[name]
         return dry + {"pourer": self.in_pourer, "receiver": self.in_receiver, "tray": self.on_tray}.get(name, 0.0)
 

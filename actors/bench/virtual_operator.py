@@ -17,7 +17,7 @@ SCATTER = 1e-3
 """Standard deviation of a filling by hand [kg]."""
 
 TYPED_STEP = 1e-4
-"""Of the scale that typed weights are read from [kg]."""
+"""Step of the scale that typed weights are read from [kg]."""
 
 SHARES = {
     "pourer_full": 4.0,
@@ -31,7 +31,7 @@ SHARES = {
     "receiver_gone": 1.0,
     "tray_after": 1.0,
 }
-"""Of the time for one pour, by what is to be done; answering alone takes `GLANCE`."""
+"""Shares of the time for one pour, by what is to be done; answering alone takes `GLANCE`."""
 
 GLANCE = 0.02
 """Share of the time for one pour that an answer without work takes."""

@@ -61,7 +61,7 @@ class Place:
 
     async def is_gone(self) -> bool:
         """Whether the node has died. Ray itself takes fifteen seconds to be sure of that; a dead node's raylet refuses
-        connections at once. Where nobody answers, a lost packet is no death: Ray decides then."""
+        connections at once. Where nobody answers, a lost packet is not a death: Ray decides then."""
         try:
             _, writer = await asyncio.wait_for(
                 asyncio.open_connection(self.node.address, self.node.port), timeout=_PATIENCE

@@ -12,7 +12,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Versions:
-    """Of one machine.
+    """The versions on one machine.
 
     Attributes:
         python: e.g. '3.11.7'.
@@ -44,7 +44,7 @@ class Versions:
 
 @functools.cache
 def versions() -> Versions:
-    """Of this machine."""
+    """The versions on this machine."""
     return Versions(
         python=sys.version.split()[0],
         decant=_installed("decant"),

@@ -21,7 +21,7 @@ from actors.virtual_ur.watchdogs import Watchdogs
 
 
 class RuntimeState(IntEnum):
-    """Of the program, as RTDE reports it."""
+    """State of the program, as RTDE reports it."""
 
     STOPPING = 0
     STOPPED = 1

@@ -281,7 +281,7 @@ class Faults:
 def _finite(value: Any) -> float:
     result = float(value)
     if not math.isfinite(result):
-        raise ValueError(f"{value} is no number to work with")
+        raise ValueError(f"{value} is not a number to work with")
     return result
 
 

@@ -18,7 +18,7 @@ _SINGULAR_WRIST = 1e-6
 
 
 class Kinematics:
-    """Of one robot model. Poses are of the flange; a tool is composed by the caller.
+    """Kinematics of one robot model. Poses are those of the flange; a tool is composed by the caller.
 
     Args:
         model: lengths and joint ranges.

@@ -161,7 +161,7 @@ class Robot:
 
     @property
     def frame(self) -> Frame:
-        """Of the tool centre point, as measured."""
+        """Frame of the tool centre point, as measured."""
         cached = self._cache.get("frame")
         if cached is None:
             cached = self._cache["frame"] = self.arm.frame(self.q)
@@ -169,7 +169,7 @@ class Robot:
 
     @property
     def pose(self) -> Pose:
-        """Of the tool centre point, as measured."""
+        """Pose of the tool centre point, as measured."""
         cached = self._cache.get("pose")
         if cached is None:
             cached = self._cache["pose"] = pose_of(self.frame)
@@ -177,7 +177,7 @@ class Robot:
 
     @property
     def target_pose(self) -> Pose:
-        """Of the tool centre point, as targeted."""
+        """Pose of the tool centre point, as targeted."""
         cached = self._cache.get("target_pose")
         if cached is None:
             cached = self._cache["target_pose"] = pose_of(self.arm.frame(self.mover.q))

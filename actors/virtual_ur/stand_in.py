@@ -14,7 +14,7 @@ from actors.protocols import LaboratoryError
 from actors.virtual_ur.launcher import VirtualController, VirtualControllerError
 
 PORTS = (29999, 30001, 30002, 30003, 30004, 30011, 30012)
-"""Of a controller: the same at every address."""
+"""Ports of a controller: the same at every address."""
 
 ATTEMPTS = 20
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _TOLD = {"prediction", "predicted_delivered_g", "predicted_delivered_ml", "risk", "window", "not_covered"}
-"""Of a receiver's summary: what a plan for it tells beside the action."""
+"""Fields of a receiver's summary that a plan for it prints beside the action."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FARTHEST = {"deg": 10.0, "mm": 50.0}
 SPEEDS = {"deg": 5.0, "mm": 20.0}
-"""Of every step [deg/s], [mm/s]."""
+"""Speed of every step [deg/s], [mm/s]."""
 
 ANNOUNCEMENT = 1.0
 """From a step's consent to its movement [s]."""
@@ -37,7 +37,7 @@ _HELP = """\
 
 
 class JogError(ValueError):
-    """What was typed is no step; says what would be one."""
+    """What was typed is not a step; says what would be one."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ def parse_step(text: str) -> Step:
     """
     match = _STEP.fullmatch(" ".join(text.lower().split()))
     if match is None:
-        raise JogError(f"'{text.strip()}' is no step; for example 'j5 +2' (deg) or 'z -5' (mm); 'help' shows all")
+        raise JogError(f"'{text.strip()}' is not a step; for example 'j5 +2' (deg) or 'z -5' (mm); 'help' shows all")
     axis = match["axis"]
     unit = "mm" if axis in ("x", "y", "z") else "deg"
     amount = float(match["amount"].replace(",", ".").replace("−", "-").replace(" ", ""))
     if not 0.0 < abs(amount) <= FARTHEST[unit]:
-        raise JogError(f"{amount:g} {unit} is no small step; at most {FARTHEST[unit]:g} {unit}, and not 0")
+        raise JogError(f"{amount:g} {unit} is not a small step; at most {FARTHEST[unit]:g} {unit}, and not 0")
     return Step(f"joint {axis[1]}" if axis[0] == "j" else axis, amount, unit)
 
 
@@ -126,7 +126,7 @@ class Jogging:
         """One line.
 
         Raises:
-            JogError: it is no step.
+            JogError: it is not a step.
             LaboratoryError: refused, or stopped on the way.
         """
         if typed in ("help", "?", "h"):

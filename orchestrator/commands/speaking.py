@@ -25,7 +25,7 @@ class RefusalError(Exception):
 
 def say(text: str) -> None:
     """A line for people: stderr, so that stdout stays for results."""
-    with contextlib.suppress(OSError):  # a terminal that was closed is no reason to leave an arm where it is
+    with contextlib.suppress(OSError):  # a terminal that was closed is not a reason to leave an arm where it is
         print(text, file=sys.stderr, flush=True)
 
 

@@ -16,7 +16,7 @@ PATIENCE = 2.0
 """Nobody asks within this time [s]."""
 
 EVERY = 10.0
-"""Between two lines where stderr is no terminal, such as a log file [s]."""
+"""Between two lines where stderr is not a terminal, such as a log file [s]."""
 
 
 class Waiting:

@@ -33,13 +33,13 @@ class PoseNoiseSection(Section):
     """Standard deviations of the same from pour to pour."""
 
     x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Of the distance."""
+    """Standard deviation of the distance."""
 
     y: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Of the sideways placement."""
+    """Standard deviation of the sideways placement."""
 
     tilt: Annotated[float, Quantity("rad", "0.3 deg", 0.0, 0.2)] = 0.0
-    """Of the tilt."""
+    """Standard deviation of the tilt."""
 
     speed_factor: Spread = 0.0
-    """Of executed over commanded angular velocity."""
+    """Standard deviation of executed over commanded angular velocity."""

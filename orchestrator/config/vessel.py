@@ -175,7 +175,9 @@ def _profile(section: ProfileSection, place: Place, report: Report) -> ProfileSh
 def _mesh(section: VesselBase, place: Place, report: Report) -> MeshShape | None:
     path = resolved(place.directory / str(section.mesh))
     if path.suffix.lower() not in MESH_SUFFIXES:
-        report.add(place.at("mesh"), f"{path.suffix or 'a file without suffix'} is no mesh; use STL, OBJ, PLY or GLB")
+        report.add(
+            place.at("mesh"), f"{path.suffix or 'a file without suffix'} is not a mesh; use STL, OBJ, PLY or GLB"
+        )
         return None
     if (missing := missing_file(path)) is not None:
         report.add(place.at("mesh"), missing)

@@ -190,7 +190,7 @@ class _Translator:
         self.streams.line(text, level, safe_name(source or "campaign"))
 
     def _page(self) -> None:
-        cells = [(name, value.replace("|", "\\|")) for name, value in self._about.items()]  # |Δ| is no border
+        cells = [(name, value.replace("|", "\\|")) for name, value in self._about.items()]  # |Δ| is not a border
         rows = "\n".join(f"| {name} | {value} |" for name, value in cells)
         self.streams.page("/state", f"| | |\n|---|---|\n{rows}\n")
 

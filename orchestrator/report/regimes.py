@@ -20,7 +20,7 @@ from sim_engine.task import Scene
 from sim_engine.vessel.build import build_vessel
 
 MOST_CORNERS = 32
-"""Of a space of many dimensions not all corners are tried."""
+"""A space of many dimensions has too many corners to try them all."""
 
 _vessel = lru_cache(maxsize=16)(build_vessel)
 

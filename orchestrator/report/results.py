@@ -67,7 +67,7 @@ def predictions_of(results: Results) -> dict[str, Foreseen]:
 
 
 def calibrated_label(evaluation: Scores) -> str | None:
-    """Under which label an evaluation scored θ*: the one that is no rival's."""
+    """Under which label an evaluation scored θ*: the one that is not a rival's."""
     rivals = ("random ", UNCALIBRATED)
     return next((label for label in evaluation.discrepancy if not label.startswith(rivals)), None)
 

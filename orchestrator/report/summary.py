@@ -63,7 +63,7 @@ class Totals(Part):
     """How much a run took."""
 
     mode: str = "none"
-    """Of the bench: 'virtual', 'hardware', or 'none' without one."""
+    """Mode of the bench: 'virtual', 'hardware', or 'none' without one."""
 
     simulations: int = 0
     """Finished ones, failed ones included."""
@@ -88,7 +88,7 @@ class NotSimulated(Part):
     """'dribbling', 'wetting', 'viscous', 'thin_stream', 'glugging' or 'airtight'."""
 
     share: float
-    """Of what is poured that leaves under such conditions, at the worst of the actions tried."""
+    """Share of what is poured that leaves under such conditions, at the worst of the actions tried."""
 
     text: str
     """What it is and what to do about it, for people."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.console import JustifyMethod, RenderableType
 
 PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
-"""Columns of the table where stderr is no terminal: at least, at most."""
+"""Columns of the table where stderr is not a terminal: at least, at most."""
 
 
 def summary_table(plan: CampaignPlan, summary: RunSummary) -> RenderableType:
@@ -199,7 +199,7 @@ def _prediction(over_seeds: Mapping[str, Spread]) -> str:
 def print_summary(plan: CampaignPlan, summary: RunSummary) -> None:
     """Write the summary's table to stderr.
 
-    Where that is no terminal, nobody has a width to fit in: lines are as long as names and paths want them.
+    Where that is not a terminal, nobody has a width to fit in: lines are as long as names and paths want them.
     """
     from rich.console import Console
     from rich.measure import Measurement

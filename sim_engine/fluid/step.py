@@ -87,7 +87,7 @@ class Stepper:
 
     @ti.func
     def top_speed(self, s):
-        """Of the moving particles [m/s]."""
+        """Top speed of the moving particles [m/s]."""
         f = self.state
         fastest = ti.cast(0.0, ti.f32)
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):

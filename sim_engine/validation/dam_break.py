@@ -41,7 +41,7 @@ FROM, LATE = 1.2, 1.9
 """Compared from this T on; slopes from this one."""
 STRIPS = 5
 WIDTH = 10.0
-"""Of the channel, in spacings."""
+"""Width of the channel, in spacings."""
 ASPECT = 2.0
 FLOOR = 0.05
 """Coulomb friction of the channel."""

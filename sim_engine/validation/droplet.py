@@ -21,9 +21,9 @@ from sim_engine.validation.stage import DENSITY, EMPTY_SPACE, run
 Floats = NDArray[np.float64]
 
 RADIUS = 0.005
-"""Of the drop, and of the sphere that has the cube's volume [m]."""
+"""Radius of the drop, and of the sphere that has the cube's volume [m]."""
 TENSION = 0.0728
-"""Of water [N/m]."""
+"""Surface tension of water [N/m]."""
 FREQUENCY = math.sqrt(8.0 * TENSION / (DENSITY * RADIUS**3)) / (2.0 * math.pi)
 """10.9 Hz."""
 STRETCH = 1.15

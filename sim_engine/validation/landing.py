@@ -22,15 +22,15 @@ from sim_engine.validation.result import Figure, Measurement, Series, reported, 
 Floats = NDArray[np.float64]
 
 SPEEDS = (30.0, 90.0)
-"""Of the turn [deg/s]."""
+"""Speeds of the turn [deg/s]."""
 FALL = 0.06
 """The jet is looked at so far below the lip [m]."""
 ASIDE = 0.25
 """The receiver is set aside by so much [m]."""
 DISTANCE = 90.0
-"""Of the lip from where the receiver's axis would be [mm]."""
+"""Distance of the lip from where the receiver's axis would be [mm]."""
 TOLERANCE = 1e-3
-"""Of the median and of the spread [m]."""
+"""Tolerance of the median and of the spread [m]."""
 PARTS = 4
 """The pour's course is looked at in so many parts of the same volume."""
 
@@ -53,7 +53,7 @@ class Landing:
 
     @property
     def median(self) -> float:
-        """Of the distance from the lip [m]."""
+        """Median of the distance from the lip [m]."""
         return float(np.median(self.away))
 
     @property

@@ -23,7 +23,7 @@ from sim_engine.vessel.spec import cylinder
 
 TIMES = (2.3, 2.7, 3.1)
 LEFT = (0.945, 0.675, 0.31)
-"""Of the standard pour, at `TIMES` [s]."""
+"""Fraction left in the standard pour, at `TIMES` [s]."""
 TOLERANCE = 0.01
 
 SCENE = Scene(

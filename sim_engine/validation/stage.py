@@ -18,7 +18,7 @@ from sim_engine.vessel.vessel import Vessel
 Floats = NDArray[np.float64]
 
 DENSITY = 998.0
-"""Of water [kg/m³]."""
+"""Density of water [kg/m³]."""
 
 NO_RIM = 1e3
 """Height of a rim that nothing ever reaches [m]."""

@@ -1,4 +1,4 @@
-"""Containers that are no vessels, as distance grids made by hand: a box that is open at the top, a cup with a hole."""
+"""Containers that are not vessels, as distance grids made by hand: a box that is open at the top, a cup with a hole."""
 
 from __future__ import annotations
 

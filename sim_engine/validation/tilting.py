@@ -46,7 +46,7 @@ TOLERANCE = 0.02
 """Largest error, as a fraction of the brimful volume."""
 
 LIP_HEIGHT = 0.3
-"""Of the pivot above the world's origin; spilled liquid is taken out well below the cup [m]."""
+"""Height of the pivot above the world's origin; spilled liquid is taken out well below the cup [m]."""
 
 
 def straight_cup() -> Vessel:

@@ -28,7 +28,7 @@ def build_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
         The vessel in its own frame (z up, underside at z = 0, opening centred on the axis).
 
     Raises:
-        VesselError: the shape is no vessel; the message says why and what would be right.
+        VesselError: the shape is not a vessel; the message says why and what would be right.
         OSError: a file of it can't be read.
     """
     outline = spec.shape.outline()

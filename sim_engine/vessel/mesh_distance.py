@@ -195,7 +195,7 @@ def signed_distance(
 
     square, closest = _band(vertices, faces, layout)
     shape = layout.shape
-    # Faces buried in the solid where bodies overlap are no surface: keep what has the other side within two nodes.
+    # Faces buried in the solid where bodies overlap are not a surface: keep what has the other side within two nodes.
     cube = np.ones((3, 3, 3), dtype=bool)
     near = ndimage.binary_dilation(inside, cube, iterations=2) & ndimage.binary_dilation(~inside, cube, iterations=2)
     exact = np.isfinite(square).reshape(shape) & near

@@ -51,7 +51,7 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
 
     kind = shape.path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
-        raise VesselError(f"{shape.path.name}: '{kind}' is no mesh format known here; use {', '.join(FORMATS)}")
+        raise VesselError(f"{shape.path.name}: '{kind}' is not a mesh format known here; use {', '.join(FORMATS)}")
     content = shape.path.read_bytes()
     try:
         loaded = trimesh.load(io.BytesIO(content), file_type=kind, process=True)
@@ -105,7 +105,7 @@ def _scale(extent: float, shape: MeshShape) -> float:
         size = extent * UNITS[shape.unit]
         if not SMALLEST / 4.0 <= size <= 2.0 * LARGEST:
             raise VesselError(
-                f"{shape.path.name}: its largest extent of {extent:.4g} {shape.unit} is no vessel's size "
+                f"{shape.path.name}: its largest extent of {extent:.4g} {shape.unit} is not a vessel's size "
                 f"({1e3 * SMALLEST / 4.0:g} … {2e3 * LARGEST:g} mm); is its unit {_likely(extent)}?"
             )
         return UNITS[shape.unit]

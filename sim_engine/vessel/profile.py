@@ -32,7 +32,7 @@ def _mm(point: Floats) -> str:
 
 
 def check_profile(shape: ProfileShape) -> Floats:
-    """Refuse profiles that are no vessel.
+    """Refuse profiles that are not a vessel.
 
     Returns:
         The inner profile, shape (n, 2), (r, z) above the inner floor [m].
@@ -182,7 +182,7 @@ def _simplify(curve: Floats, tolerance: float) -> Floats:
 def solid_polygon(inner: Floats, outer: Floats) -> Floats:
     """The solid's half section: along the inner profile to the rim, down the outer one, to the axis; (n, 2) [m].
 
-    The edge that closes it lies on the axis and is no surface.
+    The edge that closes it lies on the axis and is not a surface.
     """
     return np.vstack([inner, outer[::-1], [0.0, outer[0, 1]]])
 
@@ -205,7 +205,7 @@ def distance(polygon: Floats, r: Floats, z: Floats) -> Floats:
     """
     shape = np.broadcast(r, z).shape
     nearest = np.full(shape, np.inf)
-    for a, b in itertools.pairwise(polygon):  # the closing edge on the axis is no surface
+    for a, b in itertools.pairwise(polygon):  # the closing edge on the axis is not a surface
         edge = b - a
         length2 = float(edge @ edge)
         if length2 == 0.0:

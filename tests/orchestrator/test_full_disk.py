@@ -52,7 +52,7 @@ def fill(disk: Path, leave: int = 0) -> None:
             except OSError:
                 continue
         if leave:
-            file.truncate(file.tell() - leave - 4096)  # of which the last page is no whole one
+            file.truncate(file.tell() - leave - 4096)  # of which the last page is not a whole one
 
 
 def tidy(disk: Path) -> None:

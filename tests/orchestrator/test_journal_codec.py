@@ -28,7 +28,7 @@ from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.space import Axis, Space
 from tests.depth import examples
 
-# Numbers below 2e-308 are no numbers of a laboratory, and a process in which Taichi has run takes them for 0.
+# Numbers below 2e-308 are not numbers of a laboratory, and a process in which Taichi has run takes them for 0.
 number = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)
 fraction = st.floats(0, 1, allow_subnormal=False)
 seed = st.integers(0, 2**63)

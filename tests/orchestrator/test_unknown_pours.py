@@ -49,7 +49,7 @@ def test_an_unknown_pour_is_put_to_the_operator(unknown: Callable[[], Path]) -> 
     assert "pour 1 of stage first (angular_velocity" in questions[0][0]
     assert "what came of it?" in questions[0][0]
     assert questions[0][1] == (REPEAT, LOST, WEIGHED)
-    assert "'no idea' is no answer" in questions[1][0]
+    assert "'no idea' is not an answer" in questions[1][0]
     first = next(e.outcome for e in events if isinstance(e, RequestFinished) and hasattr(e.request, "number"))
     assert isinstance(first, Poured)
     assert (first.measurement.loaded, first.measurement.spilled) == (0.2, pytest.approx(0.0032))
@@ -111,8 +111,8 @@ def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("answer", "complaint"),
     [
-        ("", "is no answer"),
-        ("repeat", "is no answer"),
+        ("", "is not an answer"),
+        ("repeat", "is not an answer"),
         ("weighed", "two masses"),
         ("weighed 1", "two masses"),
         ("weighed one two", "numbers in grams"),

@@ -11,7 +11,7 @@ from sim_engine.doors import Door, DoorError
 
 def _numbers_only(loaded: object, name: str) -> int:
     if not isinstance(loaded, int):
-        raise TypeError(f"'{name}' is no number")
+        raise TypeError(f"'{name}' is not a number")
     return loaded
 
 
@@ -42,7 +42,7 @@ def test_a_broken_plug_in_is_named_with_its_package_and_the_others_work(door: Do
     assert door.names == ("eight", "seven")
     with pytest.raises(DoorError, match=r"'gone'.*bad 0\.3.*no_such_module"):
         door.get("gone")
-    with pytest.raises(DoorError, match="'word' is no number"):
+    with pytest.raises(DoorError, match="'word' is not a number"):
         door.get("word")
 
 

@@ -238,8 +238,8 @@ def test_open_sheet_is_refused_as_not_watertight(build: Make) -> None:
     ("unit", "scale", "message"),
     [
         (None, 1.0, r"largest extent would be 68 m.*State its unit: 'mm' \(68 mm\)"),
-        ("m", 1.0, r"largest extent of 68 m is no vessel's size.*'mm'"),
-        ("mm", 1e-3, r"largest extent of 0.068 mm is no vessel's size.*'m'"),
+        ("m", 1.0, r"largest extent of 68 m is not a vessel's size.*'mm'"),
+        ("mm", 1e-3, r"largest extent of 0.068 mm is not a vessel's size.*'m'"),
     ],
 )
 def test_implausible_size_names_the_likely_unit(build: Make, unit: str | None, scale: float, message: str) -> None:

@@ -28,7 +28,7 @@ THROUGH = 0.02
 """Nearer to a singularity than this a path goes through it, as far as speeds are concerned."""
 
 LARGEST_STEP = math.radians(15.0)
-"""Of a joint between two waypoints [rad]: more is no path but a jump."""
+"""The largest step of a joint between two waypoints [rad]: more is not a path but a jump."""
 
 
 def check_stretch(stretch: Stretch, pourer: Vessel, receiver: Vessel) -> list[str]:

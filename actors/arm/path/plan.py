@@ -28,7 +28,7 @@ FINEST = 8
 """So many times the usual waypoints are tried before saying that joints can't follow the motion."""
 
 MOST_WAYPOINTS = 1_200
-"""Of a pour: they travel to the controller as a program."""
+"""The most waypoints of a pour: they travel to the controller as a program."""
 
 OVER = 0.02
 """Height above the receiver, beside `ArmLimits.clearance`, at which the pourer is carried over it [m]."""

@@ -78,13 +78,13 @@ class Stretch:
 
     @cached_property
     def poses(self) -> FloatArray:
-        """Of the pourer in the world, shape (N, 7)."""
+        """Poses of the pourer in the world, shape (N, 7)."""
         world = cell_frames(self.spec).world.inverse @ self.pourer
         return np.concatenate([world.position, quaternions(world.rotation)], axis=-1)
 
     @cached_property
     def tilts(self) -> FloatArray:
-        """Of the pourer from upright, shape (N,), ≥ 0 [rad]."""
+        """Tilts of the pourer from upright, shape (N,), ≥ 0 [rad]."""
         axis = self.pourer.rotation[:, :, 2]
         return np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2])
 
@@ -113,7 +113,7 @@ class Stretch:
         return singularities(self.joints, self.model)
 
     def point_speeds(self, points: FloatArray) -> FloatArray:
-        """Of the fastest of the TCP and points (V, 3) of the pourer, between two samples, shape (N − 1,) [m/s]."""
+        """Speeds of the fastest of the TCP and points (V, 3) of the pourer between samples, shape (N − 1,) [m/s]."""
         turn, shift = np.diff(self.pourer.rotation, axis=0), np.diff(self.pourer.position, axis=0)
         moved = np.linalg.norm(np.einsum("tij,vj->tvi", turn, points) + shift[:, None], axis=-1).max(axis=1)
         tool = np.linalg.norm(np.diff(self.tool, axis=0), axis=-1)

@@ -18,10 +18,10 @@ from actors.arm.spec import UrArmSpec
 FloatArray = NDArray[np.float64]
 
 TOOL_ACCELERATION = 0.5
-"""Of a pourer on its way [m/s²]. Its liquid then leans by 3 deg, twice that while it swings."""
+"""Acceleration of a pourer on its way [m/s²]. Its liquid then leans by 3 deg, twice that while it swings."""
 
 TOOL_SPEED = 0.4
-"""Of the same [m/s], where the limits allow it."""
+"""Speed of a pourer on its way [m/s], where the limits allow it."""
 
 STEP = 0.02
 """Between two waypoints on the way [s]."""
@@ -31,7 +31,7 @@ MOST_TURNS = 3.0
 """Turns of a joint along a line, at its fastest: one that passes near a singularity would make tens or thousands."""
 
 LONGEST = 60.0
-"""Of a line that a joint turns so much for [s]."""
+"""The longest time of a line that a joint turns so much for [s]."""
 
 
 class RacingJointError(Exception):
@@ -84,7 +84,7 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
 
 
 def home_pose(spec: UrArmSpec) -> FloatArray:
-    """Of the pourer in the world while the arm waits, shape (7,)."""
+    """Pose of the pourer in the world while the arm waits, shape (7,)."""
     frame = cell_frames(spec).world.inverse @ pourer_frames(np.array([spec.home]), spec)
     return np.concatenate([frame.position[0], quaternions(frame.rotation)[0]])
 

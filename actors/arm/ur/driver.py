@@ -51,7 +51,7 @@ STOP_TIME = 1.0
 """Each means of stopping gets so long before the next is tried [s]."""
 
 _numbers = itertools.count(os.getpid() % 4096 * 65536 + 1)
-"""Of motions: unlike any that another process may have left in the controller's registers."""
+"""Numbers of motions: unlike any that another process may have left in the controller's registers."""
 
 
 class UrArm:

@@ -64,7 +64,7 @@ class UrFacts(ArmFacts):
 
     @property
     def e_series(self) -> bool:
-        """Of the generation after CB3."""
+        """Whether the robot is of the generation after CB3."""
         return int(self.version.split(".")[0]) >= 5
 
 

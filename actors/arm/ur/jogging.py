@@ -15,7 +15,7 @@ from actors.arm.path.limits import outside
 from actors.arm.spec import UrArmSpec
 
 FARTHEST_TURN, FARTHEST_WAY = math.radians(10.0), 0.05
-"""Of one step [rad], [m]."""
+"""The largest single step [rad], [m]."""
 
 FASTEST_TURN, FASTEST_WAY = math.radians(20.0), 0.1
 """[rad/s], [m/s]."""

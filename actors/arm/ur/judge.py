@@ -20,14 +20,14 @@ PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
 """Likewise of the payload [kg] and its centre [m]."""
 
 MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
-"""How far up may be from where the file says [rad]: the tool's accelerometer is no level. [m/s²]"""
+"""How far up may be from where the file says [rad]: the tool's accelerometer is not a level. [m/s²]"""
 
 HOME_TOLERANCE = math.radians(1.0)
 
 ANSWERS = "is this a UR controller? If it is, and has booted, it hangs: restart it"
 
 GOOD_ROUND_TRIP, GOOD_GAP, LONGEST_GAP = 10e-3, 60e-3, 0.2
-"""Of RTDE [s]: from there a warning; from `LONGEST_GAP` no pour should be tried."""
+"""Limits of RTDE's timing [s]: from there a warning; from `LONGEST_GAP` no pour should be tried."""
 
 KNOWN_SOFTWARE: dict[int, tuple[int, int]] = {3: (14, 15), 5: (6, 17)}
 """Minor versions, by major one, that the client library is tested with by its makers."""

@@ -54,7 +54,7 @@ class Leg:
 
     @property
     def name(self) -> str:
-        """Of its first phase."""
+        """Name of its first phase."""
         return self.phases[0][0]
 
     def phase(self, time: float) -> str:
@@ -62,11 +62,11 @@ class Leg:
         return next((name for name, _, end in self.phases if time < end), self.phases[-1][0])
 
     def tilt(self, time: float) -> float:
-        """Of the pourer then [rad]."""
+        """Tilt of the pourer then [rad]."""
         return float(np.interp(time, self.path.times, self.tilts))
 
     def tilt_left(self, outcome: Outcome) -> float:
-        """Of the pourer where the arm was stopped [rad]: it braked for a while after the path's clock had stopped."""
+        """Tilt of the pourer where the arm was stopped [rad]: it braked for a while after the path's clock stopped."""
         if outcome.standing is not None:
             time, apart = rejoin(self.path, np.array(outcome.joints))
             if apart <= HARDLY:

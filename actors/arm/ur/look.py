@@ -53,7 +53,7 @@ class Findings:
 
     @property
     def serial(self) -> str:
-        """Of the robot; '' if it isn't known."""
+        """Serial number of the robot; '' if it isn't known."""
         return (self.dashboard or {}).get("get serial number", "")
 
     @property

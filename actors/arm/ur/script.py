@@ -28,10 +28,10 @@ from actors.arm.ur.messages import (
 )
 
 LOOKAHEAD, GAIN = 0.03, 300.0
-"""Of servoj: as quick as the manual allows [s]; the usual stiffness."""
+"""Settings of servoj: as quick as the manual allows [s]; the usual stiffness."""
 
 STOP_DECELERATION = 6.0
-"""Of a stop on order [rad/s²]."""
+"""Deceleration of a stop on order [rad/s²]."""
 
 SETTLING = 0.3
 """For which the last target is held, ten times the lookahead [s]."""

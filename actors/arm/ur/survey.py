@@ -222,7 +222,7 @@ def _exchange(talk: _Rtde, rate: float, seconds: float) -> Exchange:
 
 
 def _known(talk: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
-    """Of the values asked for, those that this controller has, with their types; they are sent from now on."""
+    """Those of the values asked for that this controller has, with their types; they are sent from now on."""
     while True:
         answer = talk.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))
         kinds = rtde.names(answer[1:])

@@ -221,7 +221,7 @@ class Covariance:
         return K, pullback
 
     def cross(self, theta: Array, points: Array) -> Array:
-        """Of the noise-free real cost at points (m, d) with the observations: (m, n)."""
+        """Covariance of the noise-free real cost at points (m, d) with the observations: (m, n)."""
         rho = self.value(theta, "rho")
         correlation = matern_correlation(points, self.points, self.lengths(theta))
         K = self.value(theta, "signal") ** 2 * rho * correlation * np.where(self._mask, rho, 1.0)
@@ -229,35 +229,35 @@ class Covariance:
         return K if self._known is None else K + self._known.covariance(points, self.points) / self._unit**2
 
     def between(self, theta: Array, first: Array, second: Array) -> Array:
-        """Of the noise-free real cost at points (m, d) and (k, d): (m, k)."""
+        """Covariance of the noise-free real cost at points (m, d) and (k, d): (m, k)."""
         correlation = matern_correlation(first, second, self.lengths(theta))
         K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * correlation
         K += self._remainder(theta, first, second)
         return K if self._known is None else K + self._known.covariance(first, second) / self._unit**2
 
     def cross_simulated(self, theta: Array, points: Array) -> Array:
-        """Of the noise-free simulated cost at points (m, d) with the observations: (m, n)."""
+        """Covariance of the noise-free simulated cost at points (m, d) with the observations: (m, n)."""
         if self._known is not None:
             return self._known.covariance(points, self.points) / self._unit**2
         K = self.value(theta, "signal") ** 2 * matern_correlation(points, self.points, self.lengths(theta))
         return K * np.where(self._mask, self.value(theta, "rho"), 1.0)
 
     def between_simulated(self, theta: Array, first: Array, second: Array, *, real: bool) -> Array:
-        """Of the noise-free simulated cost at points (m, d) and the simulated, or the real, one at (k, d): (m, k)."""
+        """Covariance of the noise-free simulated cost at points (m, d) with either cost at (k, d): (m, k)."""
         if self._known is not None:
             return self._known.covariance(first, second) / self._unit**2
         rho = self.value(theta, "rho") if real else 1.0
         return self.value(theta, "signal") ** 2 * rho * matern_correlation(first, second, self.lengths(theta))
 
     def variance(self, theta: Array, points: Array) -> Array:
-        """Of the noise-free real cost at points (m, d): (m,)."""
+        """Variance of the noise-free real cost at points (m, d): (m,)."""
         value = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2
         value += self.value(theta, "offset") ** 2 + self.value(theta, "delta_signal") ** 2
         known = 0.0 if self._known is None else (self._known.predict(points)[1] / self._unit) ** 2
         return np.full(len(points), value) + known
 
     def _remainder(self, theta: Array, first: Array, second: Array) -> Array | float:
-        """Of β + δ."""
+        """Covariance of β + δ."""
         offset = self.value(theta, "offset") ** 2
         if not self._scaled:
             return offset

@@ -134,5 +134,5 @@ class _Belief:
         return np.asarray((improvement * (1.0 - np.sqrt(1.0 - removed))).max(axis=1))
 
     def _variance(self, indices: Indices, noise: float) -> Array:
-        """Of an observation; bounded below, since rounding may leave less than nothing."""
+        """Variance of an observation; bounded below, since rounding may leave less than nothing."""
         return np.maximum(self._covariance[indices, indices], 0.0) + noise**2 + self._least

@@ -90,7 +90,7 @@ class Disturbance:
 
     Attributes:
         scales, shifts: one number for each axis of the space.
-        context: errors of execution that are no change of an axis.
+        context: errors of execution that are not a change of an axis.
     """
 
     scales: Point

@@ -22,7 +22,7 @@ _AT_ONCE = 2**16
 def tail_weights(losses: Array, level: float) -> Array:
     """Weights with which equally likely losses make up their CVaR: 1 / ((1 − β) J) for the worst (1 − β) J of them.
 
-    CVaR_β is the mean of the worst share 1 − β. Where (1 − β) J is no whole number, the last one counts in part, so
+    CVaR_β is the mean of the worst share 1 − β. Where (1 − β) J is not a whole number, the last one counts in part, so
     that this is the minimum over c of c + mean(max(loss − c, 0)) / (1 − β).
 
     Args:

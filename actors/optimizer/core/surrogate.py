@@ -35,10 +35,10 @@ class Surrogate(Protocol):
 
 CONSTANT_PRIOR = HyperPrior()
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
-"""Of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
+"""Prior of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
 
 POOLED_PRIOR = HyperPrior(noise=(0.05, 0.4), simulated_noise=(0.3, 1.0))
-"""Of pours little noise, of simulations much: where they contradict each other the simulations must give way."""
+"""Pours have little noise, simulations much: where they contradict each other the simulations must give way."""
 
 SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
 """Wide, so that a simulation that is the wrong way round can be found out."""
@@ -145,7 +145,7 @@ class GaussianProcess:
         return np.asarray(self.scale * solve_triangular(self._fitted.L, cross.T, lower=True, check_finite=False))
 
     def prior_covariance(self, points: Array) -> Array:
-        """Of the noise-free cost between points (m, d): (m, m), in its unit squared."""
+        """Covariance of the noise-free cost between points (m, d): (m, m), in its unit squared."""
         return np.asarray(self.scale**2 * self._covariance.between(self._fitted.theta, points, points))
 
     def joint_covariance(self, simulated: Array, real: Array) -> Array:

@@ -92,7 +92,7 @@ def rotvec2rpy(rotation: Any) -> list[float]:
 def length(v: Any) -> int:
     """Entries of a list."""
     if not isinstance(v, list):
-        raise ScriptError(f"{show(v)} is no list")
+        raise ScriptError(f"{show(v)} is not a list")
     return len(v)
 
 

@@ -37,7 +37,7 @@ class Line(Protocol):
         ...
 
     def distance_to_end(self, s: float) -> float:
-        """Of the tool [m]: what a blend radius is measured by."""
+        """Distance of the tool to the end [m]: what a blend radius is measured by."""
         ...
 
     def speed_limit(self, limits: Joints) -> float:
@@ -128,7 +128,7 @@ class ToolLine:
         self.length = max(norm3(self.shift), norm3(self.turn))
 
     def frame(self, s: float) -> Frame:
-        """Of the tool centre point at s."""
+        """Frame of the tool centre point at s."""
         k = s / self.length if self.length else 1.0
         (x, y, z), (dx, dy, dz), (rx, ry, rz) = self.start[1], self.shift, self.turn
         turned = multiply(self.start[0], rotation_matrix((k * rx, k * ry, k * rz)))

@@ -224,7 +224,7 @@ class Mover:
     def _check(self, q: Joints, dt: float) -> None:
         for i in range(6):
             speed = abs(q[i] - self.q[i]) / dt
-            if not speed <= _SPEED_MARGIN * self.joint_speed[i]:  # so that what is no number is caught too
+            if not speed <= _SPEED_MARGIN * self.joint_speed[i]:  # so that what is not a number is caught too
                 raise ViolationError(
                     f"joint {i} would turn at {degrees(speed):.0f} deg/s; "
                     f"its limit is {degrees(self.joint_speed[i]):.0f} deg/s"

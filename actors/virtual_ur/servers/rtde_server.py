@@ -126,7 +126,7 @@ class RtdeConnection(Connection):
                 return
             (frequency,) = struct.unpack_from(">d", payload)
             payload = payload[8:]
-        if not SLOWEST <= frequency <= highest:  # also where it is no number
+        if not SLOWEST <= frequency <= highest:  # also where it is not a number
             frequency = SLOWEST if frequency < SLOWEST else highest
         names = rtde.names(payload[:LONGEST_NAMES])
         kinds = [self._server.fields[n].kind if n in self._server.fields else "NOT_FOUND" for n in names]

@@ -50,7 +50,7 @@ class Translation:
         lines: for each line of the source, from 0, the program's.
 
     Raises:
-        ScriptError: an unknown function, a wrong use of one, or a name that is no function.
+        ScriptError: an unknown function, a wrong use of one, or a name that is not a function.
     """
 
     def __init__(self, program: Function, commands: Mapping[str, bool]) -> None:

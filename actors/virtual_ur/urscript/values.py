@@ -46,7 +46,7 @@ def numbers(value: Any, count: int) -> list[float]:
     """So many finite numbers.
 
     Raises:
-        ScriptError: it is no list of that length, or not of numbers.
+        ScriptError: it is not a list of that length, or not of numbers.
     """
     if not isinstance(value, list) or len(value) != count:
         raise ScriptError(f"expected {count} numbers, found {show(value)}")
@@ -89,7 +89,7 @@ def index(value: Any) -> int:
         ScriptError: no whole number, or negative.
     """
     if not isinstance(value, int) or value < 0:
-        raise ScriptError(f"{show(value)} is no index")
+        raise ScriptError(f"{show(value)} is not an index")
     return int(value)
 
 

@@ -26,7 +26,7 @@ NEEDED = ("angular_velocity", "max_angle", "x_offset", "height")
 """Dimensions that have no default: each campaign fixes or searches them."""
 
 LEAST_LEFT = 64
-"""Of some 30,000 actions all over the ranges, as many at least must meet the constraints."""
+"""So many at least of some 30,000 actions all over the ranges must meet the constraints."""
 
 DEFAULTS = Action(angular_velocity=1.0, x_offset=0.0, height=0.0).values()
 

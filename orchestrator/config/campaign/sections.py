@@ -253,7 +253,7 @@ class CampaignFile(Section):
     """Its name in run directories and figures."""
 
     seed: Count = 0
-    """Of every random choice: same campaign, seed and outcomes → same requests."""
+    """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
     laboratory: PathOr[LaboratoryFile] | None = None
     """Where it runs."""

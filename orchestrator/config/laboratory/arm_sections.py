@@ -31,10 +31,10 @@ class CentreSection(Section):
     """A point in the flange's frame."""
 
     x: Length = 0.0
-    """Of the flange's frame."""
+    """The x in the flange's frame."""
 
     y: Length = 0.0
-    """Of the flange's frame."""
+    """The y in the flange's frame."""
 
     z: Length = 0.0
     """Out of the flange."""
@@ -44,22 +44,22 @@ class PoseSection(Section):
     """Where a frame stands in another, as the teach pendant shows it: place and rotation vector."""
 
     x: Length = 0.0
-    """Of its origin."""
+    """The x of its origin."""
 
     y: Length = 0.0
-    """Of its origin."""
+    """The y of its origin."""
 
     z: Length = 0.0
-    """Of its origin."""
+    """The z of its origin."""
 
     rx: Turn = 0.0
-    """Of the rotation vector."""
+    """The x of the rotation vector."""
 
     ry: Turn = 0.0
-    """Of the rotation vector."""
+    """The y of the rotation vector."""
 
     rz: Turn = 0.0
-    """Of the rotation vector."""
+    """The z of the rotation vector."""
 
 
 class MountSection(Section):
@@ -120,7 +120,7 @@ class PlaneSection(Section):
     """Direction towards the allowed side, in the room's frame; its length does not matter."""
 
     offset: Length | None = None
-    """Of the plane from the base, along the normal."""
+    """Distance of the plane from the base, along the normal."""
 
 
 class LimitsSection(Section):
@@ -135,10 +135,10 @@ class LimitsSection(Section):
     """That tool and pourer stay on one side of."""
 
     joint_speed: Speed = _LIMITS.joint_speed
-    """Of any joint; the robot's own limits hold besides."""
+    """Largest speed of any joint; the robot's own limits hold besides."""
 
     tool_speed: Annotated[float, Quantity("m/s", "1000 mm/s", 0.0, 3.0, positive=True)] = _LIMITS.tool_speed
-    """Of the tool centre point and of any point of the pourer."""
+    """Largest speed of the tool centre point and of any point of the pourer."""
 
     tilt: Annotated[float, Quantity("rad", "140 deg", 0.0, math.pi, positive=True)] = _LIMITS.tilt
     """Largest tilt of the pourer."""
@@ -172,7 +172,7 @@ class UrArmSection(ArmSettings):
     """Which robot."""
 
     address: Text | None = None
-    """Of its controller in the network; a virtual laboratory starts its own."""
+    """Address of its controller in the network; a virtual laboratory starts its own."""
 
     mount: MountSection = MountSection()
     """How the robot is screwed down; unless given, it stands on a table."""
@@ -196,7 +196,7 @@ class UrArmSection(ArmSettings):
     """What the arm may do here."""
 
     approach_speed: Speed = _ARM.approach_speed
-    """Of the fastest joint between home and pour."""
+    """Speed of the fastest joint between home and pour."""
 
     approach_acceleration: Acceleration = _ARM.approach_acceleration
     """Likewise."""

@@ -22,7 +22,7 @@ _SERIAL = SerialBalanceSpec(port="")
 _BALANCE = BalanceSpec(Placement.TRAY, None)
 
 Error = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
-"""Of a weighing: a balance that is 10 g out tells nothing about a spill."""
+"""Error of a weighing: a balance that is 10 g out tells nothing about a spill."""
 PositiveMass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1, positive=True)]
 Duration = Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0)]
 PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=True)]

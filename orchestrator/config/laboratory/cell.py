@@ -18,10 +18,10 @@ class PointSection(Section):
     required: ClassVar[dict[str, str]] = {"x": "650 mm", "y": "0 mm", "z": "80 mm"}
 
     x: Length | None = None
-    """Of the room's frame."""
+    """The x of the room's frame."""
 
     y: Length | None = None
-    """Of the room's frame."""
+    """The y of the room's frame."""
 
     z: Length | None = None
     """Upwards from where the robot is screwed down."""

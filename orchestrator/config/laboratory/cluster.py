@@ -32,7 +32,7 @@ class RaySection(Section):
     required: ClassVar[dict[str, str]] = {"address": "10.0.0.1:6379"}
 
     address: Address | None = None
-    """Of its head, host:port."""
+    """Address of its head, host:port."""
 
     bench_resource: Name = RaySpec.bench_resource
     """Custom resource of the node that arm, balance and bench run on; 'ray start --resources' gives it one."""

@@ -152,7 +152,7 @@ class StudyFile(Section):
     """Its name; runs go to study-NAME."""
 
     seed: Count = 0
-    """Of every random choice."""
+    """Seed of every random choice."""
 
     campaign: Text | None = None
     """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""

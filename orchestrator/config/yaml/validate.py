@@ -95,7 +95,7 @@ def _tag(section: type[Section]) -> str:
 
 
 def _variant(sections: set[type[Section]], data: Any) -> set[type[Section]]:
-    """Of the sections that may stand somewhere, those that the data there are meant to be."""
+    """Those of the sections that may stand somewhere that the data there are meant to be."""
     if not isinstance(data, dict):
         return sections
     return {

@@ -15,7 +15,7 @@ from sim_engine.space import Space
 Array = NDArray[np.float64]
 
 LEVEL = 0.9
-"""Of the reported regions."""
+"""Probability level of the reported regions."""
 
 WIDE = 0.75
 """Share of a searched range from which a region says next to nothing, in that of a uniform draw's region."""

@@ -40,12 +40,12 @@ class Compromise:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the objectives; empty with a plain loss."""
+        """Names of the objectives; empty with a plain loss."""
         return () if self._costing.objectives is None else self._costing.objectives[0].names
 
     @property
     def exploring(self) -> bool:
-        """The question minimises a random compromise, and its numbers are no losses."""
+        """The question minimises a random compromise, and its numbers are not losses."""
         return self._weights is not None
 
     def weigh(self, *, exploring: bool) -> None:

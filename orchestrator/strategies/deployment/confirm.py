@@ -15,7 +15,7 @@ from sim_engine.losses import normalised_spillage
 from sim_engine.spread import Spread
 
 PURPOSE = "confirm"
-"""Of these pours."""
+"""Purpose of these pours."""
 
 
 class ConfirmingPour(Part):

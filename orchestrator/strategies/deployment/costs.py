@@ -63,7 +63,7 @@ class Costing:
         return objectives.worst(self.scene, actions)
 
     def simulated(self, outcome: Outcome, action: Action) -> Vector | None:
-        """Of a simulation: worst for an action that can't be made, None for one that failed or is not to be used."""
+        """Costs of a simulation: worst for an action that can't be made, None where it failed or is not to be used."""
         match outcome:
             case Simulated(result) if result.invalid is None and is_sound(result.fractions):
                 return self._vector(result.fractions, action)
@@ -73,7 +73,7 @@ class Costing:
                 return None
 
     def poured(self, measurement: PourMeasurement, action: Action) -> Vector:
-        """Of a weighed pour."""
+        """Costs of a weighed pour."""
         return self._vector(measurement.fractions, action)
 
     def total(self, vector: Vector) -> float:
@@ -84,7 +84,7 @@ class Costing:
         if self.objectives is not None:
             return self.objectives[0].vector(fractions, action, self.scene, self.limits)
         loss = self._loss(fractions)
-        # an undefined loss (too little poured) counts as the worst: not pouring is no solution
+        # an undefined loss (too little poured) counts as the worst: not pouring is not a solution
         return self.worst_vector if loss is None else (loss,)
 
     def _loss(self, fractions: Fractions) -> float | None:

@@ -198,7 +198,7 @@ class OneShotPlanning(Deployment[D1Settings]):
             self._pour(suggestion.best_point, self._prediction(suggestion))
 
     def _prediction(self, suggestion: Suggestion) -> Prediction | None:
-        """Of the pour of what is recommended."""
+        """Prediction for the pour of what is recommended."""
         if suggestion.best_mean is None or suggestion.best_deviation is None:
             return None
         return Prediction(
@@ -247,7 +247,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         return self._repeated(action, "window", repeats)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
-        """Of a single seed: what is observed here are means of m1 of them."""
+        """Scatter of a single seed: what is observed here are means of m1 of them."""
         of_means = super()._scatter(suggestion, noise)
         return None if of_means is None else of_means * math.sqrt(self._settings.simulations_per_iteration)
 

@@ -138,14 +138,14 @@ class RobustPlanning(OneShotPlanning):
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _prediction(self, suggestion: Suggestion) -> Prediction | None:
-        """Of one pour: the mean over the disturbances, whatever was minimised, and their spread."""
+        """Prediction for one pour: the mean over the disturbances, whatever was minimised, and their spread."""
         known = self._answer(suggestion)
         if known is None or suggestion.best_deviation is None:
             return None
         return Prediction(known[0], suggestion.best_deviation, self._scatter(suggestion, suggestion.best_noise))
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
-        """Of a single pour: from seed to seed, and from one error and θ to the next."""
+        """Scatter of a single pour: from seed to seed, and from one error and θ to the next."""
         of_seeds, known = Deployment._scatter(self, suggestion, noise), self._answer(suggestion)
         return None if of_seeds is None or known is None else math.hypot(of_seeds, known[1])
 

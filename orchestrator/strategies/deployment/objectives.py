@@ -180,7 +180,7 @@ class Objectives:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the objectives, in order."""
+        """Names of the objectives, in order."""
         return tuple(part.name for part in self.parts)
 
     def vector(self, fractions: Fractions, action: Action, scene: Scene, worst: Vector) -> Vector:

@@ -17,7 +17,7 @@ PLACES = 40
 """Between the action and the box' end, on either side of every dimension: the window's resolution."""
 
 ROUNDS = 4
-"""Of simulations at most: the surrogate's outline, and bisections of what it got wrong."""
+"""Most rounds of simulations: the surrogate's outline, and bisections of what it got wrong."""
 
 Way = Literal["low", "high"]
 _WAYS: tuple[Way, Way] = ("low", "high")
@@ -225,7 +225,7 @@ class SafeWindow:
         return list(self.waiting)
 
     def judge(self, check: Check, loss: float | None) -> None:
-        """What came of a check: mean loss of its simulations; None, nothing that could be used, is no pass."""
+        """What came of a check: mean loss of its simulations; None, nothing that could be used, is not a pass."""
         self.waiting.remove(check)
         self._losses[check] = None if loss is None else max(loss + self._rest.get(check.point, 0.0), 0.0)
         if check.axis:

@@ -48,7 +48,7 @@ def loss_range(study: StudyPlan) -> Range:
 
 
 def mean_loss(study: StudyPlan, losses: Sequence[float]) -> Estimate:
-    """Of one loss a repetition, in the unit that people read."""
+    """Estimate from one loss a repetition, in the unit that people read."""
     return estimate(losses, loss_range(study)).scaled(deployment_unit(study.deployments[0].plan).factor)
 
 
@@ -119,7 +119,7 @@ def level_note(study: StudyPlan, level: str) -> str:
 
 
 def level_title(study: StudyPlan, level: str) -> str:
-    """Of a panel: the level's name, and below it what its bench is like."""
+    """Title of a panel: the level's name, and below it what its bench is like."""
     return "\n".join([f"{level} mismatch", *textwrap.wrap(level_note(study, level), TITLE_WIDTH)])
 
 

@@ -32,10 +32,10 @@ PAPER = "-paper"
 
 LINES = (":", "--", "-", "-.")
 MARKERS = ("v", "^", "<", ">")
-"""Of several D1, by iterations."""
+"""Hatches of several D1, by iterations."""
 
 MARKER = {"D1": "v", "D2": "s", "D3": "o"}
-"""Of each strategy; of calibrations a diamond."""
+"""Marker of each strategy; calibrations have a diamond."""
 
 MOST_ABREAST = 8
 """Entries of a legend's row."""
@@ -102,7 +102,7 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
 
 
 def colour(arm: str) -> str:
-    """Of a strategy; all D1 have one, and a label that is not known that of its strategy."""
+    """Colour of a strategy; all D1 have one, and a label that is not known has that of its strategy."""
     return COLOURS.get(arm) or COLOURS[strategy_of(arm)]
 
 

@@ -43,7 +43,7 @@ class Effect:
 
 
 def effect(first: Mapping[int, float], second: Mapping[int, float], within: Range = ANYTHING) -> Effect:
-    """Of values by repetition; repetitions that only one has, or that are NaN, are left out.
+    """The difference of values by repetition; repetitions that only one has, or that are NaN, are left out.
 
     Args:
         within: what a value can be.

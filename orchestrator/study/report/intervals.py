@@ -1,7 +1,7 @@
 """Means over repetitions with 95 % intervals. Pure functions of numbers; the same numbers give the same interval.
 
 Student's t for means and for mean differences: of normal numbers it covers 95 %, however few they are. The percentile
-bootstrap covers 83 % of five and 91 % of ten; it is kept for what is no mean.
+bootstrap covers 83 % of five and 91 % of ten; it is kept for what is not a mean.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def difference_of(within: Range) -> Range:
 def statistic(
     repetitions: Sequence[Sequence[float]], of: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> Estimate:
-    """What is no mean, with the percentile bootstrap's interval: whole repetitions are drawn, with replacement.
+    """What is not a mean, with the percentile bootstrap's interval: whole repetitions are drawn, with replacement.
 
     Args:
         repetitions: (n, m) numbers.

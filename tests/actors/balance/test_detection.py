@@ -91,7 +91,7 @@ def test_gibberish_is_said_to_be_a_matter_of_speed_and_parity(unknown):
     try:
         far.faults(unasked=0.05)
         _, balance = unknown(far, baud=9600, format="8N1")
-        with pytest.raises(UnknownDialectError, match="What came is no text: speed or parity differ"):
+        with pytest.raises(UnknownDialectError, match="What came is not text: speed or parity differ"):
             balance.connect()
     finally:
         far.close()

@@ -111,7 +111,7 @@ def test_a_missing_weighing_is_named_with_what_to_do_and_never_assumed(placement
 def test_a_weight_that_is_no_number_is_refused(placement):
     readings = weighed(placement, 0.2, 0.004, 0.01)
     readings[next(iter(readings))] = Weighed(float("nan"))
-    with pytest.raises(WeighingError, match="is no weight"):
+    with pytest.raises(WeighingError, match="is not a weight"):
         measurement(placement, readings)
 
 

@@ -53,7 +53,7 @@ def test_typed_weights_are_understood_as_people_type_them(text, mass, step):
         ("203.4", "has no unit; type '203.4 g'"),
         ("about 200 g", "not a weight; type a number and a unit"),
         ("", "not a weight"),
-        ("200 pcs", "'pcs' is no unit of mass"),
+        ("200 pcs", "'pcs' is not a unit of mass"),
         ("1.234.5 g", "not a weight"),
     ],
 )

@@ -126,7 +126,7 @@ BAD: dict[str, str] = {
     "run open-mesh.yaml": "open.stl: not watertight: 3 edge(s)",
     "run solid-mesh.yaml": "solid.stl: no cavity: the mesh is one closed skin",
     "run junk-mesh.yaml": "junk.stl: no triangles in it",
-    "run metres-mesh.yaml": "its largest extent of 80 m is no vessel's size (5 … 1000 mm); is its unit 'mm' (80 mm)?",
+    "run metres-mesh.yaml": "largest extent of 80 m is not a vessel's size (5 … 1000 mm); is its unit 'mm' (80 mm)?",
     "run unitless-mesh.yaml": "its largest extent would be 80 m; a vessel measures 20 … 500 mm. State its unit: 'mm'",
     # CSV
     "calibrate number-csv.yaml": "number.csv:3:9: poured_g: '9x5' is not a number",

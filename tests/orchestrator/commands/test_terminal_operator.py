@@ -94,7 +94,7 @@ def test_enter_alone_and_keys_typed_before_the_question_confirm_nothing(keyboard
         await asyncio.sleep(0.2)
         assert not asking.done()
         keyboard.type("what?\n")
-        await keyboard.shows("'what?' is no answer")
+        await keyboard.shows("'what?' is not an answer")
         keyboard.type("  Done \n")
         assert await asking == "done"
 

@@ -26,7 +26,7 @@ BAD_VESSELS = {
     ),
     "bare wall": (VESSEL.replace("wall: 4 mm", "wall: 4"), "5:9: profile.wall: 4 has no unit; write '4 mm'"),
     "point in space": (VESSEL.replace("[40, 100]", "[40, 0, 100]"), "profile.inner[2]: has 3 items; should have 2"),
-    "mesh of another kind": ("name: mug\nmesh: mug.step\n", "2:7: mesh: .step is no mesh; use STL, OBJ, PLY or GLB"),
+    "mesh of another kind": ("name: mug\nmesh: mug.step\n", "2:7: mesh: .step is not a mesh; use STL, OBJ, PLY or GLB"),
     "mesh that is not there": ("name: mug\nmesh: mug.stl\n", "2:7: mesh: no such file: "),
     "two shapes": (VESSEL + "mesh: mug.stl\n", "7:1: mesh: the vessel has a profile already"),
     "unknown unit": (VESSEL.replace("unit: mm", "unit: feet"), "profile.unit: 'feet' is not known here; should be"),

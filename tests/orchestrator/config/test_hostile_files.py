@@ -1,4 +1,4 @@
-"""Files that are no files, or far too much of one: refused at once, with the place and the limit."""
+"""Files that are not files, or far too much of one: refused at once, with the place and the limit."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from sim_engine.action import Action
 from sim_engine.task import Scene
 
 READINGS = 50.0
-"""Of the motor's encoder per bench second [Hz]."""
+"""Readings of the motor's encoder per bench second [Hz]."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class Plain(Dialect):
     def encode(self, reading: Reading) -> bytes:
         """See `Dialect.encode`."""
         if reading.value is None:
-            raise ValueError("it has no words for what is no weight")
+            raise ValueError("it has no words for what is not a weight")
         moving = "!" if reading.status is Status.UNSTABLE else ""
         return f"{reading.value} {reading.unit}{moving}\r\n".encode()
 

@@ -94,7 +94,7 @@ def test_the_price_of_a_simulation_is_what_outcomes_say() -> None:
     assert prices.simulation(2) == 1.0
     for seconds in (10.0, 500.0, 12.0, 0.0):
         prices.learn(seconds)
-    assert prices.simulation(2) == 6.0  # the median; 0 is no measurement
+    assert prices.simulation(2) == 6.0  # the median; 0 is not a measurement
     assert prices.prefers_pour(0.001, 0.1, 2)
     assert not prices.prefers_pour(0.01, 0.1, 2)
     assert prices.is_idle(0.005 * 6.0 / 90.0 * 0.99, 2)

@@ -147,7 +147,7 @@ def test_a_missed_volume_costs_beyond_its_tolerance_on_either_side() -> None:
     assert missed(0.120 * LITRE, spilled=0.05) == pytest.approx(0.05)
 
 
-# -- not pouring is no solution ------------------------------------------------------------------------------------
+# -- not pouring is not a solution ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -159,7 +159,7 @@ def test_on_a_wrong_simulator_d3_ends_no_worse_than_d2_and_on_a_right_one_it_is_
     real = np.array([ends(RealOnly(plan, PLAYED, THETA, seed)) for seed in seeds])
     for model in ("residual", "scaled"):
         wrong = np.array([ends(hybrid(seed, pours=15, model=model), upside_down) for seed in seeds])
-        # 1 % of the load is what a simulator may be wrong by: less is no difference
+        # 1 % of the load is what a simulator may be wrong by: less is not a difference
         assert wrong.mean() - real.mean() < 0.01 + 2 * np.hypot(real.std(), wrong.std()) / np.sqrt(len(seeds))
         first = [np.min(Play(narrow_cup)(hybrid(seed, pours=3, model=model)).real_spills) for seed in seeds]
         of_d2 = [
