@@ -263,7 +263,10 @@ def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect])
             "these protocols, is it the right port and the right cable (some need a crossed one)?"
         )
     elif sum(not 0x20 <= byte < 0x7F and byte not in b"\r\n" for byte in everything) * 5 > len(everything):
-        advice = "What came is not text: speed or parity differ; read them in the balance's menu and set 'baud' and 'format'."
+        advice = (
+            "What came is not text: speed or parity differ; read them in the balance's menu, and set 'baud' and "
+            "'format'."
+        )
     elif any(_OTHER_KERN.match(line) for data in came for line in data.splitlines()):
         advice = (
             "Lines like 'ST,GS 1.000 kg' are another protocol of Kern's; choose KCP, or remote control (rE Cr), in "

@@ -248,7 +248,8 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     for line in lines:
         say(f"  {line}")
     say(
-        "\nA software stop is not a safety function: keep the emergency stop within reach and everybody out of the box.\n"
+        "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of the "
+        "box.\n"
         f"Type the laboratory's name ({laboratory.name}) to arm it for this run; anything else ends here."
     )
     termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # keys pressed before this was read mean something else
