@@ -273,6 +273,7 @@ def test_cases_are_found_by_name_and_a_wrong_name_lists_them() -> None:
 # What the solver did not reach when the case was written, by case: a case that begins to pass, or one that passes no
 # longer, fails the slow test, so that this list stays true.
 NOT_MET: dict[str, str] = {
+    "retention": "12.7 mL too much with 500 particles at 80°, 10.6 with 1,000 at 60°, 9.2 in the jug at 60°",
     "landing": "the spread at 30 °/s is 1.1 mm more with 1,000 particles than with 10,000",
     "convergence": "a fast pour into a bowl splashes out the more the finer the particles are",
 }
