@@ -5,10 +5,10 @@
                                            [--fold-simulations 72] [--workers 1] [--fresh] [--json]
 
 Sets: the campaign's own calibration (C4), again and again with one more parameter to search and the same budget. What
-is not searched has the campaign's fixed value, or Decant's default, and `--particles`. θ* is then simulated on each
-recorded pour: mean |measured − simulated| of the normalised spillage on training, test and transfer pours. The first
-row calibrates nothing. With `--known` a last row searches all but these, which have the values given: what somebody
-knows of the walls, say.
+is not searched has the campaign's fixed value, or Decant's default; the number of particles, where the campaign doesn't
+fix it, that of `--particles`. θ* is then simulated on each recorded pour: mean |measured − simulated| of the normalised
+spillage on training, test and transfer pours. The first row calibrates nothing. With `--known` a last row searches all
+but these, which have the values given: what somebody knows of the walls, say.
 
 Folds: all pours of the campaign's scene, by angular velocity, are dealt to the folds in turn, so that each has slow and
 fast ones. θ*, of what the campaign searches, comes of all other folds; the fold's pours judge it. Beside it what needs
@@ -52,7 +52,7 @@ from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask
 
 CAMPAIGN = ROOT / "configs" / "campaigns" / "recorded.yaml"
-STEPS = (("viscosity",), ("cohesion",), ("friction",), ("particles",), ("wall_distance", "lip_drop"))
+STEPS = (("viscosity",), ("cohesion",), ("friction",), ("wall_distance", "lip_drop"))
 """Which parameters join the search, one step after the other."""
 
 RANGES = {"friction": Axis("friction", 0.0, 0.3)}
@@ -73,7 +73,7 @@ def searching(
 
     Args:
         names: not empty.
-        particles: N where it is not searched.
+        particles: N where it is neither searched nor fixed by the campaign.
         known: values of parameters that are not searched, in place of the campaign's.
     """
     axes = {**RANGES, **{axis.name: axis for axis in plan.parameters.axes}}
@@ -307,7 +307,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="with recorded pours")
     parser.add_argument("--seeds", type=int, nargs="*", default=(11, 12), help="of the sets; none leaves them out")
     parser.add_argument("--simulations", type=int, help="budget of each set; the campaign's unless given")
-    parser.add_argument("--particles", type=int, default=1_000, metavar="N", help="where they are not searched")
+    parser.add_argument("--particles", type=int, default=1_000, metavar="N", help="where the campaign doesn't fix them")
     parser.add_argument(
         "--known", nargs="*", default=[], metavar="NAME=VALUE", help="for a last row that searches the rest"
     )

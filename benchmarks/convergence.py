@@ -71,7 +71,7 @@ def limit(store: Store, pour: str, finest: list[int]) -> float | None:
 def table(store: Store, finest: list[int], limits: dict[str, float] | None = None) -> dict[str, Any]:
     """Everything that is known: rows of pours, columns of numbers of particles; how far each is from the limit."""
     numbers = store.numbers()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for pour in POURS:
         at_zero = limit(store, pour.name, finest) if limits is None else limits.get(pour.name)
         means = {n: float(np.mean([v for v, _ in found])) for n in numbers if (found := store.of(pour.name, n))}

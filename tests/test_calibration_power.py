@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -71,15 +72,23 @@ def test_each_set_searches_one_step_more_at_the_same_budget(
     jobs = [power.job(calibration, options, f"set {k} 11").calibration for k in range(len(power.growing_sets()))]
     nothing, first, second, *_, last = jobs
     assert nothing.simulations == 0
-    assert nothing.fixed_parameters["particles"] == 700
+    assert nothing.fixed_parameters == calibration.fixed_parameters
     assert {job.simulations for job in jobs[1:]} == {10}
     assert first.parameters.names == ("viscosity",)
     assert second.parameters.names == ("viscosity", "cohesion")
-    assert first.fixed_parameters == {**calibration.fixed_parameters, "particles": 700}
-    assert set(last.parameters.names) >= set(calibration.parameters.names)
-    assert not last.fixed_parameters
+    assert first.fixed_parameters == calibration.fixed_parameters
+    assert set(last.parameters.names) == {*calibration.parameters.names, "friction"}
+    assert last.fixed_parameters == {"particles": 1000}
     ours = {axis.name: axis for axis in calibration.parameters.axes}
     assert all(ours.get(axis.name, axis) == axis for axis in last.parameters.axes)
+
+
+def test_particles_are_the_options_where_the_campaign_does_not_fix_them(
+    power: ModuleType, calibration: CalibrationPlan, options: argparse.Namespace
+) -> None:
+    unfixed = replace(calibration, fixed_parameters={"friction": 0.05})
+    for k in range(len(power.growing_sets())):
+        assert power.job(unfixed, options, f"set {k} 11").calibration.fixed_parameters["particles"] == 700
 
 
 def found(train: float, test: float, errors: list[float]) -> dict[str, Any]:
@@ -144,8 +153,8 @@ def test_a_last_row_takes_some_parameters_as_known(
 ) -> None:
     options.known = ["wall_distance=1.5", "lip_drop=0"]
     last = power.job(calibration, options, f"set {len(power.growing_sets())} 11").calibration
-    assert set(last.parameters.names) == {"particles", "cohesion", "viscosity", "friction"}
-    assert last.fixed_parameters == {"wall_distance": 1.5, "lip_drop": 0.0}
+    assert set(last.parameters.names) == {"cohesion", "viscosity", "friction"}
+    assert last.fixed_parameters == {"particles": 1000, "wall_distance": 1.5, "lip_drop": 0.0}
     options.known = ["wall_distanse=1.5"]
     with pytest.raises(SystemExit, match="wall_distanse"):
         power.wanted_sets(options)

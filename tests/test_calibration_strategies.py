@@ -33,7 +33,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.fixture
 def plan(bench: ModuleType) -> CampaignPlan:
-    found: CampaignPlan = bench.searched(load_campaign(bench.CAMPAIGN), ["particles", "wall_distance"], {})
+    found: CampaignPlan = bench.searched(load_campaign(bench.CAMPAIGN), ["wall_distance", "lip_drop"], {})
     return found
 
 
@@ -68,8 +68,8 @@ def test_budgets_are_the_papers_and_none_is_exceeded(bench: ModuleType, plan: Ca
         bench.at_price(calibration, bench.Row(name, budget))
         for name, budget in (("C1", 2800), ("C2", 504), ("C3", 1652), ("C4", 108))
     )
-    assert c1.grid == {"particles": 10, "wall_distance": 10}
-    assert (c2.thetas, c3.thetas, c4.simulations) == (18, 59, 108)
+    assert c1.settings.grid == {"wall_distance": 10, "lip_drop": 10}
+    assert (c2.settings.thetas, c3.settings.thetas, c4.simulations) == (18, 59, 108)
     assert [one.simulations for one in (c1, c2, c3)] == [2800, 504, 1652]
     for name in ("C1", "C2", "C3", "C4"):
         assert bench.at_price(calibration, bench.Row(name, 300)).simulations <= 300
@@ -115,8 +115,8 @@ def test_what_can_t_be_compared_is_refused(bench: ModuleType, monkeypatch: pytes
         return str(refused.value)
 
     assert "--rows C7=3: should be a strategy and its simulations" in refusal("--rows", "C7=3")
-    assert "not searched by recorded.yaml; it searches particles" in refusal("--search", "friction")
-    assert "--known particles: searched as well" in refusal("--known", "particles=700")
+    assert "not searched by recorded.yaml; it searches cohesion, viscosity, wall" in refusal("--search", "friction")
+    assert "--known lip_drop: searched as well" in refusal("--known", "lip_drop=0")
     quickstart = BENCHMARKS.parent / "configs" / "campaigns" / "quickstart.yaml"
     assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
 

@@ -84,6 +84,7 @@ def test_every_package_of_an_extra_is_declared_in_it() -> None:
         assert not any(text.startswith(name) for text in declared["dependencies"]), name
 
 
+@pytest.mark.slow
 def test_without_extras_one_simulates_and_plans(tmp_path: Path) -> None:
     done = run(command("init", "lab"), tmp_path)
     assert done.returncode == 0, done.stderr

@@ -35,6 +35,7 @@ def released(scale=0.0):
     return arm
 
 
+@pytest.mark.realtime
 def test_arm_reads_back_the_motion_it_was_given_up_to_its_repeatability(path, motion):
     executed = released().execute(path)
     assert executed.completed
@@ -45,6 +46,7 @@ def test_arm_reads_back_the_motion_it_was_given_up_to_its_repeatability(path, mo
     assert np.abs(difference[:, 3:]).max() < 1e-12
 
 
+@pytest.mark.realtime
 def test_a_slow_arm_takes_longer_over_the_tilt_and_reaches_the_same_angle(path, motion):
     arm = released()
     arm.grip(Grip(speed_factor=0.8))
@@ -56,6 +58,7 @@ def test_a_slow_arm_takes_longer_over_the_tilt_and_reaches_the_same_angle(path, 
     assert np.interp(tilted, executed.times, tilts) < np.deg2rad(90.0)
 
 
+@pytest.mark.realtime
 def test_same_grip_reads_back_the_same_bits_at_any_pace_and_after_other_pours(path):
     fresh, used = released(), released(40.0)
     used.execute(path)
@@ -66,6 +69,7 @@ def test_same_grip_reads_back_the_same_bits_at_any_pace_and_after_other_pours(pa
     np.testing.assert_array_equal(a.times, b.times)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("scale", [10.0, 40.0])
 def test_motion_takes_its_duration_over_the_time_scale(path, motion, scale):
     arm = released(scale)
@@ -82,6 +86,7 @@ def make_arm(request):
     return lambda spec: DeviceArm(LocalDevice("arm", lambda: NumbersArm(spec)), spec)
 
 
+@pytest.mark.realtime
 def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, motion):
     async def play():
         arm = make_arm(NumbersSpec(0.2))
@@ -114,6 +119,7 @@ def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, m
     assert moving.phase == "approach"
 
 
+@pytest.mark.realtime
 def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
     seen = []
 
@@ -142,6 +148,7 @@ class UnreachableSpec(NumbersSpec):
         return Unreachable, (self,)
 
 
+@pytest.mark.realtime
 def test_any_arm_can_be_looked_at_and_one_that_does_not_answer_says_so():
     (there,) = NumbersSpec().look().checks(None, accept="", virtual=True)
     assert (there.state, there.found) == ("ok", "numbers")
@@ -149,6 +156,7 @@ def test_any_arm_can_be_looked_at_and_one_that_does_not_answer_says_so():
     assert (lost.state, lost.found) == ("fail", "nobody answers at 192.168.0.10")
 
 
+@pytest.mark.realtime
 def test_safety_settings_that_nobody_has_accepted_fail_on_hardware():
     look = ArmLook(checksum="AB", serial="7", model="arm")
     record = SafetyRecord("AB", "7", "arm", "1", "2026-01-01", "Ada")

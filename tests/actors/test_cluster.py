@@ -77,6 +77,7 @@ def decant(folder: Path, address: str, environment: dict[str, str]) -> subproces
     )
 
 
+@pytest.mark.realtime
 def test_an_address_where_nothing_answers_is_refused_at_once(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.2", 0))
@@ -89,6 +90,8 @@ def test_an_address_where_nothing_answers_is_refused_at_once(tmp_path: Path) -> 
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.realtime
+@pytest.mark.slow
 def test_a_cluster_without_the_bench_s_resource_is_refused_before_anything_starts(
     cluster: LocalCluster, tmp_path: Path
 ) -> None:
@@ -100,6 +103,8 @@ def test_a_cluster_without_the_bench_s_resource_is_refused_before_anything_start
     assert [cluster.workers(node) for node in (0, 1)] == [[], []]
 
 
+@pytest.mark.realtime
+@pytest.mark.slow
 def test_when_a_node_dies_its_simulations_are_repeated_elsewhere_and_people_are_told(
     cluster: LocalCluster, tmp_path: Path
 ) -> None:

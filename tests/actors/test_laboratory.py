@@ -35,22 +35,26 @@ def laboratory(in_process, fake, **changes):
     )
 
 
+@pytest.mark.realtime
 def test_a_campaign_that_pours_is_refused_a_laboratory_without_a_bench():
     with pytest.raises(LaboratoryError, match="desk has no bench, but the campaign pours"):
         open_laboratory(LaboratorySpec("desk"), need_bench=True)
 
 
+@pytest.mark.realtime
 def test_an_unknown_mode_is_refused_before_anything_starts():
     with pytest.raises(LaboratoryError, match="mode 'dream' is not known"):
         open_laboratory(LaboratorySpec("desk", mode="dream"), need_bench=False)
 
 
+@pytest.mark.realtime
 def test_an_arm_of_hardware_is_not_opened_without_a_person_to_ask():
     spec = load_laboratory(Path(__file__).parents[2] / "configs" / "laboratories" / "ur10-kern.yaml")
     with pytest.raises(LaboratoryError, match="ur10-kern needs a person beside it who answers questions"):
         open_laboratory(spec, need_bench=True)
 
 
+@pytest.mark.realtime
 def test_no_bench_is_made_where_none_is_needed(fake, bench_spec, task):
     async def play():
         async with laboratory(True, fake, bench=bench_spec) as opened:
@@ -60,6 +64,7 @@ def test_no_bench_is_made_where_none_is_needed(fake, bench_spec, task):
     assert asyncio.run(play()) == 4
 
 
+@pytest.mark.realtime
 def test_a_question_that_makes_no_sense_is_an_error_that_says_so(fake):
     async def play():
         async with laboratory(True, fake) as opened:
@@ -71,6 +76,7 @@ def test_a_question_that_makes_no_sense_is_an_error_that_says_so(fake):
         asyncio.run(play())
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running, fake):
     async def play():
@@ -93,6 +99,7 @@ def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running,
         assert ours == pytest.approx(theirs, abs=1e-6)
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_liquid(
     ray_running, bench_spec, scene, action

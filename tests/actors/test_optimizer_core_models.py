@@ -171,14 +171,6 @@ def test_around_simulations_the_pours_noise_may_vary_too():
 # -- travelling ----------------------------------------------------------------------------------------------------
 
 
-def test_a_question_of_an_earlier_journal_is_still_read():
-    problem = SuggestProblem(PLANE, data_of(points_of(3), (0.1, 0.2, 0.3)))
-    written = json.loads(canonical(to_json(problem, SuggestProblem)))
-    for newer in ("infeasible", "constraints", "noise"):
-        del written[newer]
-    assert from_json(written, SuggestProblem) == problem
-
-
 def test_a_question_with_everything_in_it_survives_the_journal():
     problem = SuggestProblem(
         PLANE,

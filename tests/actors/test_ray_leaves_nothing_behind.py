@@ -37,7 +37,7 @@ def open_ports():
     processes = [me, *me.children(recursive=True)]
     return sorted({c.laddr.ip for p in processes for c in p.net_connections() if c.status == "LISTEN"})
 
-async def main(how):
+async def main(how, patience):
     caught = asyncio.Event()
     if how == "own handler":
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, caught.set)
@@ -49,10 +49,10 @@ async def main(how):
     actor.spin.remote()
     pids = [p.pid for p in psutil.Process().children(recursive=True)]
     print(json.dumps({"pids": pids, "folder": str(ray_folder()), "listens": open_ports()}), flush=True)
-    await asyncio.wait_for(caught.wait(), PATIENCE)
+    await asyncio.wait_for(caught.wait(), float(patience))
     print(json.dumps("caught"), flush=True)
 
-asyncio.run(main(sys.argv[1]))
+asyncio.run(main(*sys.argv[1:]))
 """
 
 
@@ -60,7 +60,7 @@ def start(how: str, home: Path) -> tuple[subprocess.Popen[str], dict[str, list[i
     environment = {**os.environ, "HOME": str(home)}
     environment.pop("TMPDIR", None)
     program = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, how],
+        [sys.executable, "-c", PROGRAM, how, str(PATIENCE)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -92,6 +92,7 @@ def assert_clean(facts, home: Path, seconds: float = 15.0) -> None:
     assert list(home.iterdir()) == []
 
 
+@pytest.mark.realtime
 def test_kill_9_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
     program.kill()
@@ -99,6 +100,7 @@ def test_kill_9_leaves_nothing(tmp_path):
     assert_clean(facts, tmp_path)
 
 
+@pytest.mark.realtime
 def test_ctrl_c_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
     os.killpg(program.pid, signal.SIGINT)
@@ -107,6 +109,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     assert_clean(facts, tmp_path)
 
 
+@pytest.mark.realtime
 def test_sigterm_ends_in_order_without_a_frightening_stack(tmp_path):
     program, facts = start("wait", tmp_path)
     program.terminate()
@@ -116,18 +119,20 @@ def test_sigterm_ends_in_order_without_a_frightening_stack(tmp_path):
     assert_clean(facts, tmp_path)
 
 
+@pytest.mark.realtime
 def test_a_normal_end_leaves_nothing_was_closed_to_the_network_and_kept_the_loops_own_signal_handler(tmp_path):
     program, facts = start("own handler", tmp_path)
     program.terminate()
     output, errors = program.communicate(timeout=PATIENCE)
-    assert json.loads(output) == "caught"
     assert errors == ""
+    assert json.loads(output) == "caught"
     assert program.returncode == 0
     assert len(facts["pids"]) > 5
     assert all(address.removeprefix("::ffff:") in ("127.0.0.1", "::1") for address in facts["listens"])
     assert_clean(facts, tmp_path)
 
 
+@pytest.mark.realtime
 def test_clusters_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp_path):
     dead, alive = tmp_path / "dead", tmp_path / "alive"
     for folder in (dead, alive):
@@ -155,6 +160,7 @@ def test_clusters_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp
     assert ray_private.prune_clusters(tmp_path) == [alive]
 
 
+@pytest.mark.realtime
 def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(ray_running, monkeypatch):
     import ray
 

@@ -46,6 +46,7 @@ def make_pool(request):
     return lambda make: InProcessSimulatorPool(make=make)
 
 
+@pytest.mark.realtime
 def test_vessels_that_touch_are_an_invalid_action_and_the_pool_goes_on(make_pool, fake, task):
     async def play():
         pool = make_pool(fake())
@@ -58,6 +59,7 @@ def test_vessels_that_touch_are_an_invalid_action_and_the_pool_goes_on(make_pool
     assert asyncio.run(play()).outcome.seed == 1
 
 
+@pytest.mark.realtime
 def test_an_error_of_the_engine_names_itself_and_the_pool_goes_on(make_pool, fake, task):
     async def play():
         pool = make_pool(fake())
@@ -70,6 +72,7 @@ def test_an_error_of_the_engine_names_itself_and_the_pool_goes_on(make_pool, fak
     asyncio.run(play())
 
 
+@pytest.mark.realtime
 def test_a_cancelled_simulation_really_stops_and_the_next_one_runs_at_once(make_pool, fake, task, tmp_path):
     log = tmp_path / "log"
 
@@ -96,6 +99,7 @@ def test_a_cancelled_simulation_really_stops_and_the_next_one_runs_at_once(make_
     assert count(log, "closed") == 1
 
 
+@pytest.mark.realtime
 def test_a_job_cancelled_in_the_queue_never_begins(make_pool, fake, task, tmp_path):
     log = tmp_path / "log"
 
@@ -114,6 +118,7 @@ def test_a_job_cancelled_in_the_queue_never_begins(make_pool, fake, task, tmp_pa
     assert count(log, "begin") == 2
 
 
+@pytest.mark.realtime
 def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
     async def play():
         pool = make_pool(fake(0.3))
@@ -130,6 +135,7 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
     assert busy == pytest.approx(0.9, abs=0.25)
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running, fake, task):
     async def play():
@@ -145,6 +151,7 @@ def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running,
     assert asyncio.run(play()) == [own, *[min(own + 15, 19)] * 2]
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_running, fake, task, tmp_path):
     log = tmp_path / "log"
@@ -167,6 +174,7 @@ def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_runn
     assert victim not in members
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_job_that_kills_every_simulator_is_given_up_and_the_pool_survives(ray_running, fake, task):
     async def play():
@@ -180,6 +188,7 @@ def test_a_job_that_kills_every_simulator_is_given_up_and_the_pool_survives(ray_
     asyncio.run(play())
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_running, fake, task):
     async def play():
@@ -192,6 +201,7 @@ def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_runni
     asyncio.run(play())
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_simulator_goes_on_with_the_next_job_while_the_program_is_held_up(ray_running, fake, task, tmp_path):
     log = tmp_path / "log"
@@ -209,6 +219,7 @@ def test_a_simulator_goes_on_with_the_next_job_while_the_program_is_held_up(ray_
     assert asyncio.run(play()) == 2
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_once(ray_running, fake, task, tmp_path):
     log = tmp_path / "log"
@@ -234,6 +245,7 @@ def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_o
     assert count(log, "begin") == 3
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_simulator_with_other_code_than_this_machine_s_is_not_used_and_named(ray_running, fake, task):
     told = []
@@ -249,6 +261,7 @@ def test_a_simulator_with_other_code_than_this_machine_s_is_not_used_and_named(r
     assert len(told) == 1
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path):
     told, log = [], tmp_path / "log"
@@ -267,6 +280,7 @@ def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path)
     assert "2 simulation(s) are repeated" in told[0]
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
     tasks = [task(seed=s, record_rate=5.0) for s in range(3)]
@@ -286,6 +300,7 @@ def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_closed_pool_lets_no_process_live_and_says_so(ray_running, fake, task):
     async def play():

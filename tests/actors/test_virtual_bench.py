@@ -36,6 +36,7 @@ def open_bench(fake, bench_spec):
     return open_it
 
 
+@pytest.mark.realtime
 def test_same_seed_and_action_measure_the_same_bits_whatever_was_poured_before(open_bench, scene, action):
     async def play():
         async with open_bench() as fresh:
@@ -51,6 +52,7 @@ def test_same_seed_and_action_measure_the_same_bits_whatever_was_poured_before(o
     assert first != other
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_bench_in_processes_measures_what_its_twin_measures(ray_running, open_bench, scene, action):
     async def play(ray):
@@ -60,6 +62,7 @@ def test_bench_in_processes_measures_what_its_twin_measures(ray_running, open_be
     assert asyncio.run(play(True)) == asyncio.run(play(False))
 
 
+@pytest.mark.realtime
 def test_measured_masses_are_those_of_the_hidden_liquid_within_the_balance(open_bench, scene, action, fake, bench_spec):
     """The fake liquid retains exactly a tenth, and spills what its seed says."""
 
@@ -76,6 +79,7 @@ def test_measured_masses_are_those_of_the_hidden_liquid_within_the_balance(open_
     assert max(m.spilled for m in measured) - min(m.spilled for m in measured) > 0.02
 
 
+@pytest.mark.realtime
 def test_a_clean_pour_never_gains_liquid(scene, action):
     dry = PourOutcome(1.0, 0.0, 0.0, 0.0, 0.0, 1000, 4e-3, 0.0, 5.0, 10, 0.1, 1)
     assert spill_of(dry, 0.2).spilled == 0.0
@@ -83,6 +87,7 @@ def test_a_clean_pour_never_gains_liquid(scene, action):
     assert spill_of(dripping, 1.0).spilled == pytest.approx(0.2 + 0.1 * 0.25)
 
 
+@pytest.mark.realtime
 def test_pose_errors_scatter_about_the_systematic_one_and_follow_the_seed(bench_spec):
     errors = [draw_pose_error(bench_spec, seed) for seed in range(500)]
     assert draw_pose_error(bench_spec, 3) == errors[3]
@@ -93,6 +98,7 @@ def test_pose_errors_scatter_about_the_systematic_one_and_follow_the_seed(bench_
     assert draw_pose_error(exact, 3) == PoseError()
 
 
+@pytest.mark.realtime
 def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_bench, scene, action):
     seen = []
 
@@ -111,6 +117,7 @@ def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_bench, 
     assert max(p.balance for p in seen if p.balance is not None) > 0.15
 
 
+@pytest.mark.realtime
 def test_a_watcher_that_fails_does_not_disturb_the_pour(open_bench, scene, action):
     def watcher(progress):
         raise RuntimeError("the screen is gone")
@@ -122,6 +129,7 @@ def test_a_watcher_that_fails_does_not_disturb_the_pour(open_bench, scene, actio
     assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.realtime
 def test_the_operator_takes_bench_time(open_bench, scene, action):
     async def play():
         async with open_bench(time_scale=100.0, operator_time=85.0) as laboratory:
@@ -133,6 +141,7 @@ def test_the_operator_takes_bench_time(open_bench, scene, action):
     assert 0.85 < asyncio.run(play()) < 3.0
 
 
+@pytest.mark.realtime
 def test_touching_vessels_are_refused_before_the_operator_has_been_called(open_bench, scene, action):
     seen = []
 
@@ -150,6 +159,7 @@ def test_touching_vessels_are_refused_before_the_operator_has_been_called(open_b
     assert state.time == 0.0
 
 
+@pytest.mark.realtime
 def test_vessels_that_touch_as_they_truly_stand_make_the_pour_fail_and_the_bench_pours_on(open_bench, scene, action):
     async def play():
         async with open_bench() as laboratory:
@@ -160,6 +170,7 @@ def test_vessels_that_touch_as_they_truly_stand_make_the_pour_fail_and_the_bench
     assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.realtime
 def test_a_load_beyond_the_brim_is_refused(open_bench, scene, action):
     async def play():
         async with open_bench() as laboratory:
@@ -185,6 +196,7 @@ async def tilting(arm):
         await asyncio.sleep(0.02)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("ray", [False, pytest.param(True, marks=pytest.mark.ray)])
 def test_a_stop_during_the_pour_leaves_it_unknown_and_the_bench_usable(request, open_bench, scene, action, ray):
     if ray:
@@ -203,6 +215,7 @@ def test_a_stop_during_the_pour_leaves_it_unknown_and_the_bench_usable(request, 
     assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.realtime
 def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action):
     async def play():
         async with open_bench(time_scale=2.0, operator_time=0.5) as laboratory:
@@ -220,6 +233,7 @@ def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action
     asyncio.run(play())
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_the_death_of_the_arm_fails_the_pour_and_the_next_one_has_a_new_arm(ray_running, open_bench, scene, action):
     async def play():
@@ -240,6 +254,7 @@ def test_the_death_of_the_arm_fails_the_pour_and_the_next_one_has_a_new_arm(ray_
     assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_a_pour_needs_no_simulator_of_the_pool(ray_running, open_bench, scene, action, task, fake):
     async def play():

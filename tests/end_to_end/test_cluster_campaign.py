@@ -85,6 +85,7 @@ def assert_same_run(entries: list[Entry], undisturbed: list[Entry]) -> None:
     assert started_after_they_were_finished(entries) == []
 
 
+@pytest.mark.realtime
 def test_a_campaign_that_loses_a_node_ends_where_an_undisturbed_one_ends(cluster, places):
     cluster.start_node(cpus=1, bench=True)
     cluster.start_node(cpus=1)
@@ -109,6 +110,7 @@ def test_a_campaign_that_loses_a_node_ends_where_an_undisturbed_one_ends(cluster
     assert cluster.is_alive()
 
 
+@pytest.mark.realtime
 def test_a_bench_lost_during_a_pour_leaves_it_unknown_and_a_resumed_run_ends_as_if_it_had_not_been(cluster, places):
     cluster.start_node(cpus=1)
     cluster.start_node(cpus=1, bench=True)
@@ -142,6 +144,7 @@ def test_a_bench_lost_during_a_pour_leaves_it_unknown_and_a_resumed_run_ends_as_
     assert_same_run(place.entries(), undisturbed.entries())
 
 
+@pytest.mark.realtime
 def test_a_killed_program_leaves_no_actor_in_the_cluster_and_gives_the_bench_back(cluster, places):
     cluster.start_node(cpus=1, bench=True)
     cluster.start_node(cpus=1)
@@ -166,6 +169,7 @@ def test_a_killed_program_leaves_no_actor_in_the_cluster_and_gives_the_bench_bac
     assert cluster.workers(0) == cluster.workers(1) == []
 
 
+@pytest.mark.realtime
 def test_a_program_that_loses_its_own_node_ends_with_a_word_whether_ray_lets_it_or_not(cluster, places):
     cluster.start_node(cpus=1)
     cluster.start_node(cpus=1, bench=True)
@@ -245,6 +249,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.realtime
 def test_nodes_that_share_no_files_get_the_mesh_and_have_warm_kernels_after_their_first_pour(cluster, tmp_path):
     shutil.copy(ROOT / "configs" / "vessels" / "meshes" / "mug.stl", tmp_path)
     for number in range(2):
@@ -253,6 +258,7 @@ def test_nodes_that_share_no_files_get_the_mesh_and_have_warm_kernels_after_thei
     assert said.splitlines() == ["True ['mug.stl']"] * 2
 
 
+@pytest.mark.realtime
 def test_clusters_that_can_t_be_joined_say_why(cluster, tmp_path):
     cluster.start_node(cpus=1)
     assert program(CHECK, cluster) == ""
@@ -265,6 +271,7 @@ def test_clusters_that_can_t_be_joined_say_why(cluster, tmp_path):
     assert "Ray: 2.9.0" in differs
 
 
+@pytest.mark.realtime
 def test_a_machine_without_a_node_of_the_cluster_can_t_use_it(cluster):
     cluster.start_node(cpus=1)
     cluster.kill_node(0)  # the head goes on, and takes a while to see that

@@ -65,6 +65,8 @@ def assert_same_run(place: Workplace, undisturbed: Finished) -> None:
     assert started_after_they_were_finished(entries) == []
 
 
+@pytest.mark.realtime
+@pytest.mark.slow
 def test_a_campaign_learns_from_calibration_to_its_last_pour(undisturbed: Finished) -> None:
     entries = undisturbed.entries
     stages = ["pours", "calibration", "evaluation", "deployment:narrow"]
@@ -78,12 +80,15 @@ def test_a_campaign_learns_from_calibration_to_its_last_pour(undisturbed: Finish
     assert 0.0 <= narrow["best_spillage"] <= 1.0
     assert narrow["best_loss"] <= narrow["first_loss"]
     assert 0.0 <= summary["theta"]["cohesion"] <= 0.1
+    learnt = summary.pop("results")
+    assert {"calibration", "deployment:narrow"} <= learnt.keys()
     assert {**undisturbed.summary, "run": None} == {**summary, "run": None}
     assert json.loads((undisturbed.directory / "theta.json").read_text())["theta"] == summary["theta"]
     for figure in summary["figures"].values():
         assert Path(figure).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.realtime
 def test_its_recording_can_be_read_and_shows_vessels_liquid_and_every_pour(undisturbed: Finished) -> None:
     rows = recording(Path(undisturbed.summary["recording"]))
     assert rows["/scene/pourer/mesh"] >= 1
@@ -105,6 +110,8 @@ def recording(path: Path) -> dict[str, int]:
     return rows
 
 
+@pytest.mark.realtime
+@pytest.mark.slow
 def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undisturbed(
     workplace: Workplace, undisturbed: Finished
 ) -> None:
@@ -159,6 +166,7 @@ def closed(stage: str, entries: list[Entry]) -> bool:
     return any(e.stage == stage and e.kind == Kind.STAGE_CLOSED for e in entries)
 
 
+@pytest.mark.realtime
 def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Workplace, undisturbed: Finished) -> None:
     process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN)
     assert process.returncode == 130, errors
@@ -175,6 +183,8 @@ def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Wo
     assert result["receivers"] == undisturbed.summary["receivers"]
 
 
+@pytest.mark.realtime
+@pytest.mark.slow
 def test_a_simulator_killed_under_way_is_replaced_and_nobody_notices(
     workplace: Workplace, undisturbed: Finished
 ) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 
 import psutil
 import pytest
+from ruamel.yaml import YAML
 
 from actors.arm.joint_path import unpack
 from orchestrator.journal import Entry, Kind
@@ -23,34 +25,25 @@ RUN = ("run", "small.yaml")
 
 def write_wired(folder: Path) -> None:
     """The small campaign on the shipped virtual laboratory, with few particles."""
-    laboratory = (LABORATORIES / "virtual.yaml").read_text(encoding="utf-8")
-    (folder / "lab.yaml").write_text(
-        replaced(
-            laboratory,
-            ("particles: 4000", "particles: 400"),
-            ("x: -9 mm, y: 1 mm", "x: 1 mm"),
-            ("simulators: 0 ", "simulators: 2 "),
-        ),
-        encoding="utf-8",
-    )
-    before, rest = small.CAMPAIGN.split("laboratory:\n")
-    after = rest[rest.index("liquid: {name: water") :]
-    campaign = replaced(
-        f"{before}laboratory: lab.yaml\n{after}",
-        ("return_velocity: 180 deg/s", "return_velocity: 100 deg/s"),
-        ("[60 deg/s, 180 deg/s]", "[60 deg/s, 100 deg/s]"),
-        ("height: 60 mm", "height: 80 mm"),
-        ("x_offset: 66 mm", "x_offset: 75 mm"),
-        ("x_offset: [60 mm, 100 mm]", "x_offset: [70 mm, 100 mm]"),
-    )
-    small.write_campaign(folder, campaign)
+    yaml = YAML()
+    laboratory = yaml.load(LABORATORIES / "virtual.yaml")
+    laboratory["simulators"] = 2
+    laboratory["bench"]["liquid"]["particles"] = 400
+    laboratory["bench"]["pose_error"] = {"x": "1 mm", "tilt": "0.5 deg"}
+    yaml.dump(laboratory, folder / "lab.yaml")
 
-
-def replaced(text: str, *pairs: tuple[str, str]) -> str:
-    for old, new in pairs:
-        assert old in text, old
-        text = text.replace(old, new)
-    return text
+    campaign = yaml.load(small.CAMPAIGN)
+    campaign["laboratory"] = "lab.yaml"
+    campaign["motion"]["return_velocity"] = "100 deg/s"
+    calibration, deployment = campaign["calibration"], campaign["deployment"]
+    for stage in (calibration, deployment):
+        stage["motion"]["height"] = "80 mm"
+        stage["actions"]["angular_velocity"] = ["60 deg/s", "100 deg/s"]
+    calibration["motion"]["x_offset"] = "75 mm"
+    deployment["actions"]["x_offset"] = ["70 mm", "100 mm"]
+    text = StringIO()
+    yaml.dump(campaign, text)
+    small.write_campaign(folder, text.getvalue())
 
 
 @pytest.fixture
@@ -74,6 +67,7 @@ def far_ends(place: Workplace) -> list[psutil.Process]:
     return found
 
 
+@pytest.mark.realtime
 def test_a_campaign_over_wires_is_killed_in_a_pour_resumed_and_comes_to_its_end(workplace: Workplace) -> None:
     def tilting(entries: list[Entry]) -> bool:
         announced = [e for e in entries if e.kind == Kind.NOTE and "The arm moves in" in e.body["text"]]
@@ -102,6 +96,7 @@ def test_a_campaign_over_wires_is_killed_in_a_pour_resumed_and_comes_to_its_end(
     workplace.assert_nothing_is_left()
 
 
+@pytest.mark.realtime
 def test_ctrl_c_during_a_pour_over_wires_finishes_and_weighs_it(workplace: Workplace) -> None:
     process, errors = workplace.interrupt(pour_under_way, signal.SIGINT, *RUN)
     assert process.returncode == 130, errors

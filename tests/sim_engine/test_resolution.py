@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from sim_engine.liquid import SimulationParameters
@@ -21,6 +22,7 @@ def spilled(simulator: PourSimulator, pours: tuple[Pour, ...], particles: int, f
     return np.array([spillage(simulator, pour, theta, seed=1)[0] for pour in pours])
 
 
+@pytest.mark.slow
 def test_what_is_calibrated_with_few_particles_predicts_with_more(simulator: PourSimulator) -> None:
     """Friction that is found by 1,000 particles on pours of 3,000 is theirs, and holds for other vessels at 500."""
     weighed = spilled(simulator, TRAINING, 3_000, HIDDEN)

@@ -147,6 +147,7 @@ def test_parcels_of_the_jet_fall_with_g(simulator: PourSimulator) -> None:
     assert len(figure.series[0].x) > 20
 
 
+@pytest.mark.slow
 def test_nothing_crosses_thin_walls_in_random_pours(simulator: PourSimulator) -> None:
     assert failures(walls.walls(5, 1_200, seed=3)) == []
 

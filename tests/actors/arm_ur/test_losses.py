@@ -75,6 +75,7 @@ def goes_on_only_by_an_operator(rig: Rig) -> None:
 # ---- lines
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("fault", ["drop", "stall"])
 def test_a_lost_line_ends_the_pour_and_the_arm_stands_until_released(make_rig: Make, fault: str) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER)
@@ -92,6 +93,7 @@ def test_a_lost_line_ends_the_pour_and_the_arm_stands_until_released(make_rig: M
     goes_on_only_by_an_operator(rig)
 
 
+@pytest.mark.realtime
 def test_after_a_reboot_in_mid_pour_tool_and_payload_are_set_again(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT)
     rig.fault("reboot", seconds=4.0, joint=5, above=START[5] + 0.4)
@@ -113,11 +115,13 @@ def test_after_a_reboot_in_mid_pour_tool_and_payload_are_set_again(make_rig: Mak
     assert rig.joints == pytest.approx(START, abs=1e-3)
 
 
+@pytest.mark.realtime
 def test_nobody_there_is_told_with_what_to_look_at() -> None:
     with pytest.raises(ArmLostError, match=r"no robot at 127\..*RTDE.*Is the controller on"):
         UrArm(settings(next_address())).connect()
 
 
+@pytest.mark.realtime
 def test_a_controller_that_accepts_and_says_nothing_does_not_hang_the_driver() -> None:
     address = next_address()
     with contextlib.ExitStack() as stack:
@@ -134,6 +138,7 @@ def test_a_controller_that_accepts_and_says_nothing_does_not_hang_the_driver() -
 # ---- processes
 
 
+@pytest.mark.realtime
 def test_killing_the_worker_in_mid_pour_stops_the_arm(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER)
     pouring = rig.pouring()
@@ -147,6 +152,7 @@ def test_killing_the_worker_in_mid_pour_stops_the_arm(make_rig: Make) -> None:
     goes_on_only_by_an_operator(rig)
 
 
+@pytest.mark.realtime
 def test_a_program_that_a_stop_left_paused_never_goes_on(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT)
     pouring = rig.pouring()
@@ -167,6 +173,7 @@ def test_a_program_that_a_stop_left_paused_never_goes_on(make_rig: Make) -> None
     assert rig.joints == pytest.approx(START, abs=1e-3)
 
 
+@pytest.mark.realtime
 def test_a_stop_takes_effect_while_the_worker_hangs(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER)
     pouring = rig.pouring()
@@ -179,6 +186,7 @@ def test_a_stop_takes_effect_while_the_worker_hangs(make_rig: Make) -> None:
     stood_soon(rig, began, 1.5)
 
 
+@pytest.mark.realtime
 def test_killing_the_driver_s_process_in_mid_pour_stops_the_arm(make_rig: Make, tmp_path: Path) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER, connect=False)
     (tmp_path / "pour").write_bytes(pickle.dumps((rig.arm._spec, rig.path)))
@@ -226,6 +234,7 @@ def test_a_driver_that_hangs_in_mid_pour_stops_the_arm(make_rig: Make, tmp_path:
         process.wait()
 
 
+@pytest.mark.realtime
 def test_an_interrupt_at_the_keyboard_stops_the_arm(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER)
     rig.to_start()
@@ -247,6 +256,7 @@ def test_an_interrupt_at_the_keyboard_stops_the_arm(make_rig: Make) -> None:
 # ---- others at the same robot
 
 
+@pytest.mark.realtime
 def test_somebody_else_s_program_ends_the_pour(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT)
     pouring = rig.pouring()
@@ -258,6 +268,7 @@ def test_somebody_else_s_program_ends_the_pour(make_rig: Make) -> None:
     assert "other" in str(caught.value)
 
 
+@pytest.mark.realtime
 def test_a_program_that_runs_already_is_not_replaced(rig: Rig) -> None:
     _upload(rig, "while True:\n  sync()\n end")
     rig.arm.release()
@@ -266,6 +277,7 @@ def test_a_program_that_runs_already_is_not_replaced(rig: Rig) -> None:
     assert rig.fault("state")["program"] == "other"
 
 
+@pytest.mark.realtime
 def test_a_second_driver_is_told_that_somebody_has_the_robot(resting: Rig) -> None:
     second = UrArm(resting.arm._spec)
     with pytest.raises(ArmError, match="in use"):
@@ -273,12 +285,14 @@ def test_a_second_driver_is_told_that_somebody_has_the_robot(resting: Rig) -> No
     assert resting.arm.facts().program == "STOPPED"  # the first doesn't mind
 
 
+@pytest.mark.realtime
 def test_another_robot_than_set_up_is_refused(make_rig: Make) -> None:
     rig = make_rig(connect=False, model="ur10")
     with pytest.raises(ArmRefusedError, match=r"is a UR10E.*set up as UR10"):
         rig.arm.connect()
 
 
+@pytest.mark.realtime
 def test_a_controller_that_did_not_take_the_payload_keeps_the_arm_still(
     resting: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -319,6 +333,7 @@ def test_what_is_no_path_is_refused_before_it_reaches_the_robot(times: Any, join
         arm.move_to_start(replace(pour_path(), approach=JointPath(np.array(times), joints)))
 
 
+@pytest.mark.realtime
 def test_a_path_that_leaves_the_box_is_refused(resting: Rig) -> None:
     resting.arm.release()
     low = np.array(START) + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0])
@@ -327,6 +342,7 @@ def test_a_path_that_leaves_the_box_is_refused(resting: Rig) -> None:
         resting.arm.move_to_start(replace(pour_path(), approach=way))
 
 
+@pytest.mark.realtime
 def test_without_the_client_library_it_is_said_which_one_is_missing(
     make_rig: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -337,6 +353,7 @@ def test_without_the_client_library_it_is_said_which_one_is_missing(
         rig.arm.connect()
 
 
+@pytest.mark.realtime
 def test_the_driver_does_not_load_the_client_library() -> None:
     program = (
         "import sys, actors.arm.ur.driver; "
@@ -357,6 +374,7 @@ def test_errors_survive_the_way_between_processes() -> None:
 # ---- small steps
 
 
+@pytest.mark.realtime
 def test_a_step_moves_the_tool_as_asked_and_needs_a_word_each_time(rig: Rig) -> None:
     rig.arm.release()
     before = np.array(rig.fault("state")["pose"])
@@ -372,6 +390,7 @@ def test_a_step_moves_the_tool_as_asked_and_needs_a_word_each_time(rig: Rig) -> 
     assert np.array(rig.fault("state")["pose"])[:3] == pytest.approx(before[:3], abs=1e-4)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("axis", "amount", "speed"),
     [("joint 6", 0.2, 0.1), ("x", 0.06, 0.05), ("x", 0.01, 0.5), ("joint 7", 0.1, 0.1), ("y", math.nan, 0.05)],

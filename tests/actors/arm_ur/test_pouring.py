@@ -17,6 +17,7 @@ from .pours import HOME, START, pour_path
 Make = Callable[..., Rig]
 
 
+@pytest.mark.realtime
 def test_a_whole_pour_comes_back_home_and_tells_what_was_done(make_rig: Make) -> None:
     path = pour_path(angle=math.radians(40.0), speed=math.radians(80.0), hold=0.3)
     rig = make_rig(path, time_scale=1.0, frequency=500.0)
@@ -44,6 +45,7 @@ def test_a_whole_pour_comes_back_home_and_tells_what_was_done(make_rig: Make) ->
     assert len(executed.times) > 60.0 * path.pour.duration  # 125 Hz on a machine with nothing else to do
 
 
+@pytest.mark.realtime
 def test_what_was_executed_at_scaled_time_is_the_same_pour(rig: Rig) -> None:
     rig.to_start()
     executed = rig.arm.execute(rig.path)
@@ -52,6 +54,7 @@ def test_what_was_executed_at_scaled_time_is_the_same_pour(rig: Rig) -> None:
     assert executed.tracking["longest_gap"] > 0.05  # ten times as far apart as at time scale 1
 
 
+@pytest.mark.realtime
 def test_the_older_generation_pours_too(make_rig: Make) -> None:
     rig = make_rig(there="ur10", model="ur10")
     assert rig.arm.facts().remote is None  # it knows no such thing
@@ -62,6 +65,7 @@ def test_the_older_generation_pours_too(make_rig: Make) -> None:
     assert rig.joints == pytest.approx(HOME, abs=1e-4)
 
 
+@pytest.mark.realtime
 def test_tool_and_payload_are_set_whatever_was_there_before(rig: Rig) -> None:
     rig.to_start()
     state = rig.fault("state")
@@ -69,6 +73,7 @@ def test_tool_and_payload_are_set_whatever_was_there_before(rig: Rig) -> None:
     assert (state["payload"], state["cog"]) == (1.2, [0.0, 0.0, 0.08])
 
 
+@pytest.mark.realtime
 def test_a_payload_that_the_controller_refuses_keeps_the_arm_still(make_rig: Make) -> None:
     rig = make_rig(payload=50.0)
     rig.arm.release()
@@ -78,6 +83,7 @@ def test_a_payload_that_the_controller_refuses_keeps_the_arm_still(make_rig: Mak
     assert rig.moved(began) == 0.0
 
 
+@pytest.mark.realtime
 def test_state_is_answered_at_once_during_a_pour(rig: Rig) -> None:
     pouring = rig.pouring()
     rig.await_phase("tilt")
@@ -99,6 +105,7 @@ def test_state_is_answered_at_once_during_a_pour(rig: Rig) -> None:
 # ---- consent
 
 
+@pytest.mark.realtime
 def test_nothing_moves_before_an_operator_has_released_the_arm(resting: Rig) -> None:
     for motion in (resting.arm.move_to_start, resting.arm.execute, resting.arm.retreat, resting.arm.untilt):
         with pytest.raises(ArmNotReleasedError):
@@ -110,6 +117,7 @@ def test_nothing_moves_before_an_operator_has_released_the_arm(resting: Rig) -> 
     assert resting.fault("state")["messages"] == []  # not even a program was started
 
 
+@pytest.mark.realtime
 def test_consent_is_for_one_cycle(rig: Rig) -> None:
     rig.to_start()
     rig.arm.execute(rig.path)
@@ -118,6 +126,7 @@ def test_consent_is_for_one_cycle(rig: Rig) -> None:
         rig.arm.move_to_start(rig.path)
 
 
+@pytest.mark.realtime
 def test_movement_begins_after_the_announced_delay(make_rig: Make) -> None:
     rig = make_rig(announcement=8.0)
     began = rig.now
@@ -127,6 +136,7 @@ def test_movement_begins_after_the_announced_delay(make_rig: Make) -> None:
     assert moving[0] - began > 7.0  # of the controller's seconds: its clock may lag a little
 
 
+@pytest.mark.realtime
 def test_a_stop_while_movement_is_announced_keeps_the_arm_still(make_rig: Make) -> None:
     rig = make_rig(announcement=30.0)
     began = rig.now
@@ -140,6 +150,7 @@ def test_a_stop_while_movement_is_announced_keeps_the_arm_still(make_rig: Make) 
     assert rig.moved(began) == 0.0
 
 
+@pytest.mark.realtime
 def test_no_program_runs_while_hands_are_in(rig: Rig) -> None:
     rig.to_start()
     rig.arm.hands_in()
@@ -148,12 +159,14 @@ def test_no_program_runs_while_hands_are_in(rig: Rig) -> None:
         rig.arm.execute(rig.path)
 
 
+@pytest.mark.realtime
 def test_hands_in_ends_somebody_else_s_program(rig: Rig) -> None:
     _upload(rig, "while True:\n sync()\n end")
     rig.arm.hands_in()
     assert rig.fault("state")["runtime_state"] == "STOPPED"
 
 
+@pytest.mark.realtime
 def test_hands_are_not_invited_by_a_controller_that_says_nothing(rig: Rig) -> None:
     rig.fault("stall")
     with pytest.raises(ArmLostError):

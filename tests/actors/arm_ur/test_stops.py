@@ -59,6 +59,7 @@ def comes_home(rig: Rig) -> None:
 # ---- on request
 
 
+@pytest.mark.realtime
 def test_a_stop_while_tilting_takes_effect_at_once_and_can_be_untilted(make_rig: Make) -> None:
     rig = make_rig(time_scale=1.0, frequency=500.0)
     pouring = rig.pouring()
@@ -80,6 +81,7 @@ def test_a_stop_while_tilting_takes_effect_at_once_and_can_be_untilted(make_rig:
     rig.arm.stop()  # not before the slow part: un-tilting 25 deg takes three seconds
 
 
+@pytest.mark.realtime
 def test_a_stop_of_an_arm_that_stands_locks_it(resting: Rig) -> None:
     resting.arm.release()
     assert resting.arm.stop() == 0.0
@@ -101,6 +103,7 @@ def test_after_a_stop_in_any_phase_the_pourer_is_brought_upright_slowly(make_rig
     comes_home(rig)
 
 
+@pytest.mark.realtime
 def test_an_arm_stopped_on_its_way_to_the_pour_goes_back_the_way_it_came(rig: Rig) -> None:
     rig.fault("protective_stop", joint=0, above=6.0 * DEG)
     rig.arm.release()
@@ -117,6 +120,7 @@ def test_an_arm_stopped_on_its_way_to_the_pour_goes_back_the_way_it_came(rig: Ri
 # ---- by the safety system
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("phase", ["tilt", "hold", "return"])
 def test_a_protective_stop_holds_the_tilted_pourer_until_an_operator_has_looked(make_rig: Make, phase: str) -> None:
     rig = make_rig(LONG_HOLD)
@@ -143,6 +147,7 @@ def test_a_protective_stop_holds_the_tilted_pourer_until_an_operator_has_looked(
     comes_home(rig)
 
 
+@pytest.mark.realtime
 def test_an_emergency_stop_is_recovered_from_once_its_button_is_released(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
     rig.fault("emergency_stop", joint=5, above=START[5] + 0.6)
@@ -159,6 +164,7 @@ def test_an_emergency_stop_is_recovered_from_once_its_button_is_released(make_ri
     comes_home(rig)
 
 
+@pytest.mark.realtime
 def test_a_safeguard_stop_does_not_go_on_by_itself_when_it_is_released(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
     rig.fault("safeguard", joint=5, above=START[5] + 0.6)
@@ -170,6 +176,7 @@ def test_a_safeguard_stop_does_not_go_on_by_itself_when_it_is_released(make_rig:
     comes_home(rig)
 
 
+@pytest.mark.realtime
 def test_a_protective_stop_from_before_keeps_the_arm_still(rig: Rig) -> None:
     rig.fault("protective_stop")
     rig.arm.release()
@@ -182,6 +189,7 @@ def test_a_protective_stop_from_before_keeps_the_arm_still(rig: Rig) -> None:
 # ---- by people at the panel
 
 
+@pytest.mark.realtime
 def test_switching_to_local_control_stops_the_pour(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
     rig.fault("remote", active=False, joint=5, above=START[5] + 0.6)
@@ -196,6 +204,7 @@ def test_switching_to_local_control_stops_the_pour(make_rig: Make) -> None:
     comes_home(rig)
 
 
+@pytest.mark.realtime
 def test_a_slower_slider_is_refused_before_anything_moves(resting: Rig) -> None:
     resting.fault("slider", fraction=0.5)
     resting.arm.release()
@@ -203,6 +212,7 @@ def test_a_slower_slider_is_refused_before_anything_moves(resting: Rig) -> None:
         resting.arm.move_to_start(resting.path)
 
 
+@pytest.mark.realtime
 def test_a_slider_moved_during_a_pour_is_told_with_what_was_executed(make_rig: Make) -> None:
     rig = make_rig()
     rig.fault("slider", fraction=0.5, joint=5, above=START[5] + 0.6)
@@ -211,12 +221,14 @@ def test_a_slider_moved_during_a_pour_is_told_with_what_was_executed(make_rig: M
     assert executed.tracking["slider"] == 0.5
 
 
+@pytest.mark.realtime
 def test_an_arm_that_stands_elsewhere_is_asked_to_go_home_first(resting: Rig) -> None:
     resting.arm.release()
     with pytest.raises(ArmRefusedError, match="away from where it should be"):
         resting.arm.execute(resting.path)
 
 
+@pytest.mark.realtime
 def test_an_arm_that_was_moved_off_its_way_is_not_moved_blindly(rig: Rig) -> None:
     rig.arm.release()
     rig.arm.jog("joint 2", -9.0 * DEG, 10.0 * DEG)

@@ -40,6 +40,7 @@ def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable
         balance.close()
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("voice", ["kcp", "kern-swt", "kern-swt-short", "mt-sics", "sbi", "sbi-identified"])
 def test_the_dialect_is_found_out_and_then_used(unknown, voice):
     far, balance = unknown(voice)
@@ -58,6 +59,7 @@ def test_finding_out_tares_and_zeroes_nothing(unknown, each_dialect):
     assert far.state()["shown"] == before == "50.0 g, stable"
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("dialect", "baud"), [("kcp", 19200), ("kern-swt", 4800), ("sbi", 1200)])
 def test_the_speed_is_found_out(unknown, dialect, baud):
     far = VirtualSerialBalance.start(dialect, baud=baud, time_scale=PACE)
@@ -86,6 +88,7 @@ def test_where_nothing_answers_it_is_said_what_was_tried(unknown):
     assert "9600 baud 8N1: Sartorius SBI → nothing, older Kern (s/w/t) → nothing, Kern KCP, Mettler-Toledo" in said
 
 
+@pytest.mark.realtime
 def test_gibberish_is_said_to_be_a_matter_of_speed_and_parity(unknown):
     far = VirtualSerialBalance.start("mt-sics", baud=2400, time_scale=PACE)
     try:

@@ -35,12 +35,13 @@ def weighed(
         Placement.TRAY: lambda: TRAY + (spilled if poured else 0.0),
         Placement.RECEIVER: lambda: 0.0,
         Placement.EVERYTHING: lambda: TRAY + (spilled if poured else 0.0),
+        Placement.TARED: lambda: 0.0 if pourer else TRAY + (spilled if poured else 0.0),  # one or the other
         Placement.MANUAL: lambda: 0.0,
     }[placement]
     readings: dict[str, Weighed] = {}
     poured = receiver_on = False
     for step in weighings(placement):
-        pourer = 0.0
+        pourer = EMPTY_POURER if step.about.startswith("dry_pourer") else 0.0
         match step.key:
             case "pourer_empty":
                 pourer = EMPTY_POURER

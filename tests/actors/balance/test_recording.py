@@ -61,6 +61,7 @@ def test_what_is_no_recording_is_refused_with_its_line(tmp_path, text):
         Recording.load(path)
 
 
+@pytest.mark.realtime
 def test_the_driver_weighs_what_was_recorded(tmp_path):
     path = tmp_path / "kern.jsonl"
     KERN_TYPED.save(path)
@@ -81,6 +82,7 @@ def _later(driver: SerialBalance):
     return driver.read()
 
 
+@pytest.mark.realtime
 def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
     path = tmp_path / "damaged.jsonl"
     lines = [b"S S 0.01230 kg", b"S S 0.01230 k", b"S S 12.30 g", *[b"S S 0.01230 kg"] * 6]
@@ -99,6 +101,7 @@ def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
         far.close()
 
 
+@pytest.mark.realtime
 def test_a_late_answer_to_another_command_is_not_taken_for_the_one_awaited(tmp_path):
     path = tmp_path / "late.jsonl"
     events = [Event(0.0, "out", b"T\r\n"), Event(0.01, "in", b"Z +\r\n"), Event(0.1, "in", b"T S 350.00 g\r\n")]
@@ -114,6 +117,7 @@ def test_a_late_answer_to_another_command_is_not_taken_for_the_one_awaited(tmp_p
         far.close()
 
 
+@pytest.mark.realtime
 def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
     path = tmp_path / "slow.jsonl"
     Recording("typed", (Event(0.0, "out", b"w"), Event(0.1, "in", b"12"), Event(0.5, "in", b"34"))).save(path)
@@ -131,6 +135,7 @@ def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
         far.close()
 
 
+@pytest.mark.realtime
 def test_a_question_that_was_never_asked_gets_no_answer_and_the_next_one_does(tmp_path):
     path = tmp_path / "kern.jsonl"
     KERN_TYPED.save(path)
@@ -146,6 +151,7 @@ def test_a_question_that_was_never_asked_gets_no_answer_and_the_next_one_does(tm
         far.close()
 
 
+@pytest.mark.realtime
 def test_a_session_with_a_balance_is_recorded_and_played_back_to_the_driver(virtual, tmp_path, capsys):
     far = virtual("mt-sics")
     far.put(0.0123)
@@ -177,6 +183,7 @@ def test_listening_records_what_comes_unasked(virtual, tmp_path):
     assert b"".join(event.data for event in events).count(b"\n") >= 3
 
 
+@pytest.mark.realtime
 def test_the_recorder_is_a_command_and_says_why_it_can_not(tmp_path):
     ended = subprocess.run(
         [sys.executable, "-m", "actors.balance.record", "--port", "/dev/no-balance", "--to", str(tmp_path / "x.jsonl")],

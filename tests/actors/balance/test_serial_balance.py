@@ -15,6 +15,7 @@ from actors.balance.virtual_balance import Load
 from .conftest import SOON
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("voice", voices())
 def test_a_tared_balance_weighs_what_is_added(driver, voice):
     far, balance = driver(voice)

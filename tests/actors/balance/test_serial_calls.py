@@ -17,6 +17,7 @@ from actors.device import LocalDevice, RayDevice
 from .conftest import spec_for
 
 
+@pytest.mark.realtime
 def test_an_interrupt_ends_a_wait_and_resume_lets_it_last_again(driver, each_dialect):
     far, balance = driver(each_dialect, settling=SettlingRule(deadline=200.0))
     balance.connect()
@@ -31,6 +32,7 @@ def test_an_interrupt_ends_a_wait_and_resume_lets_it_last_again(driver, each_dia
     assert balance.weigh().mass == 0.0
 
 
+@pytest.mark.realtime
 def test_an_interrupt_ends_the_wait_for_an_answer_too(driver):
     far, balance = driver("kcp", answer_time=10.0)
     balance.connect()
@@ -42,6 +44,7 @@ def test_an_interrupt_ends_the_wait_for_an_answer_too(driver):
     assert time.monotonic() - started < 3.0
 
 
+@pytest.mark.realtime
 def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(driver, each_dialect):
     far, balance = driver(each_dialect)
     far.put(0.35)
@@ -66,6 +69,7 @@ def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(
     assert seen[-1].status == "stable"
 
 
+@pytest.mark.realtime
 def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver):
     _, balance = driver("kcp")
     shown = balance.weigh().shown
@@ -78,6 +82,7 @@ def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(drive
     listening.join()
 
 
+@pytest.mark.realtime
 def test_questions_keep_the_pace_that_the_manual_asks_for(driver):
     far, balance = driver("kcp", time_scale=1.0, interval=0.0, settling=SettlingRule(deadline=1.0))
     balance.connect()
@@ -88,6 +93,7 @@ def test_questions_keep_the_pace_that_the_manual_asks_for(driver):
     assert far.state()["questions"] - before <= 11  # Kern: no sooner than 100 ms after the last
 
 
+@pytest.mark.realtime
 def test_the_display_is_read_five_to_ten_times_a_second(driver):
     _, balance = driver("kern-swt", time_scale=1.0)
     balance.connect()
@@ -100,6 +106,7 @@ def test_the_display_is_read_five_to_ten_times_a_second(driver):
     assert 10 <= len(times) <= 21
 
 
+@pytest.mark.realtime
 def test_behind_its_device_it_is_a_balance_like_any_other(driver):
     far, balance = driver("mt-sics")
     far.put(0.35)
@@ -126,6 +133,7 @@ def test_behind_its_device_it_is_a_balance_like_any_other(driver):
     assert counts["lines"] > 5
 
 
+@pytest.mark.realtime
 @pytest.mark.ray
 def test_in_a_process_of_its_own_it_weighs_and_its_errors_keep_their_kind(ray_running, virtual):
     far = virtual("mt-sics")

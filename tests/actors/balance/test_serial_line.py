@@ -13,6 +13,7 @@ from actors.balance.settling import SettlingRule
 from .conftest import SOON
 
 
+@pytest.mark.realtime
 def test_silence_is_not_taken_for_rest(driver, each_dialect):
     far, balance = driver(each_dialect, **SOON)
     balance.connect()

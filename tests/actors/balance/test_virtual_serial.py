@@ -96,6 +96,7 @@ def test_same_seed_and_loads_weigh_the_same_however_often_one_looks(virtual):
     assert weighings(0, 5) == weighings(7, 5)
 
 
+@pytest.mark.realtime
 def test_a_pour_whose_time_passes_by_order_weighs_the_same_to_the_bit_however_the_clock_runs():
     """What a virtual bench needs: drift and settling depend on bench time, and bench time on nothing else."""
     sheet = ScaleSettings(resolution=1e-5, noise=1e-4, drift=1e-6, settling_time=1.5)
@@ -121,6 +122,7 @@ def test_a_pour_whose_time_passes_by_order_weighs_the_same_to_the_bit_however_th
     assert masses[0] == pytest.approx(5.7e-3, abs=5e-4)
 
 
+@pytest.mark.realtime
 def test_noise_of_a_seed_is_the_same_over_the_line_and_another_with_another_seed():
     far = VirtualSerialBalance.start(
         "mt-sics", baud=0, scale=ScaleSettings(resolution=1e-6, noise=1e-3), time_scale=20.0
@@ -138,6 +140,7 @@ def test_noise_of_a_seed_is_the_same_over_the_line_and_another_with_another_seed
     assert masses[0] == masses[1] != masses[2]
 
 
+@pytest.mark.realtime
 def test_characters_take_their_time_on_the_line():
     far = VirtualSerialBalance.start("mt-sics", baud=1200, latency=0.0)
     try:
@@ -153,6 +156,7 @@ def test_characters_take_their_time_on_the_line():
     assert passed >= len(line) * 10 / 1200
 
 
+@pytest.mark.realtime
 def test_at_another_speed_it_hears_nothing_and_says_gibberish():
     far = VirtualSerialBalance.start("mt-sics", baud=9600)
     try:
@@ -166,6 +170,7 @@ def test_at_another_speed_it_hears_nothing_and_says_gibberish():
         far.close()
 
 
+@pytest.mark.realtime
 def test_repeated_output_goes_on_until_it_is_cancelled():
     far = VirtualSerialBalance.start("mt-sics", baud=0, time_scale=20.0)
     try:
@@ -212,6 +217,7 @@ def test_a_command_that_finds_no_rest_is_given_up_where_the_dialect_has_words_fo
         assert port.read_until(b"\n") == b"S I\r\n"
 
 
+@pytest.mark.realtime
 def test_an_order_that_is_unknown_or_comes_too_late_is_refused():
     far = VirtualSerialBalance.start("sbi")
     with pytest.raises(LaboratoryError, match="unexpected keyword argument 'quiet'"):
@@ -227,6 +233,7 @@ def test_an_order_that_is_unknown_or_comes_too_late_is_refused():
         far.put(0.1)
 
 
+@pytest.mark.realtime
 def test_it_dies_with_a_parent_that_was_killed():
     code = (
         "import time\n"

@@ -226,6 +226,7 @@ LATE = 3.2
 """The operator takes so long to come [s of the clock]: meanwhile the arm is looked at."""
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("name", "phase"), cases(ARM))
 def test_a_fault_of_the_arm(open_stage, name, phase):
     fault = ARM[name]
@@ -267,6 +268,7 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
     assert f"{1e3 * loaded:.1f}"[:4] in str(outcome)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("name", "phase"), cases(BALANCE))
 def test_a_fault_of_the_balance(open_stage, name, phase):
     """Whenever the balance fails, the arm finishes; the weights are taken once it is mended."""
@@ -280,6 +282,7 @@ def test_a_fault_of_the_balance(open_stage, name, phase):
     assert outcome.retained == pytest.approx(stage.things.in_pourer, abs=3e-4)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     "phase", ["tilt", *(pytest.param(p, marks=pytest.mark.slow) for p in ("approach", "hold", "return"))]
 )
@@ -311,6 +314,7 @@ def test_an_operator_who_does_not_want_the_stopped_arm_to_move(open_stage, how, 
     assert "What was poured is unknown" in str(tale.outcome)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("how", ["no", pytest.param("never", marks=pytest.mark.slow)])
 def test_an_operator_who_leaves_the_balance_as_it_is(open_stage, how):
     """No weight that was taken is lost, and the spill still lies where it can be weighed."""
@@ -323,6 +327,7 @@ def test_an_operator_who_leaves_the_balance_as_it_is(open_stage, how):
     assert "weighed, pourer_full:" in tale.stage.said("note")
 
 
+@pytest.mark.realtime
 def test_a_balance_that_was_switched_off_during_the_pour_is_not_believed(open_stage):
     """Its new zero would count the spill as nothing; the operator says that it was off, and the spill is unknown."""
 

@@ -23,6 +23,7 @@ def without_a_robot():
     return replace(wired_spec(pace=PACE, hurried=True), arm=NumbersSpec(PACE, announcement=1.0))
 
 
+@pytest.mark.realtime
 def test_what_an_arm_read_back_is_poured_and_weighed_on_the_wire(open_stage):
     async def play():
         async with open_stage(without_a_robot()) as stage:
@@ -36,6 +37,7 @@ def test_what_an_arm_read_back_is_poured_and_weighed_on_the_wire(open_stage):
     assert stage.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
 
 
+@pytest.mark.realtime
 def test_of_a_pour_that_was_broken_off_nobody_makes_up_what_became_of_the_liquid(open_stage):
     seen = []
 

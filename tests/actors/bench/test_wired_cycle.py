@@ -18,6 +18,7 @@ from actors.protocols import InvalidActionError, NotPouredError
 from .conftest import ACTION, SCENE, reach, wired_spec
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("placement", Placement)
 def test_wherever_the_balance_stands_what_was_executed_is_what_is_measured(open_stage, placement):
     async def play():
@@ -35,6 +36,7 @@ def test_wherever_the_balance_stands_what_was_executed_is_what_is_measured(open_
     assert unsafe == []
 
 
+@pytest.mark.realtime
 def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_when_hands_come_in(open_stage):
     async def play():
         async with open_stage() as stage:
@@ -54,6 +56,7 @@ def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_wh
     assert seconds == pytest.approx(spec.announcement / spec.time_scale)  # of the clock
 
 
+@pytest.mark.realtime
 def test_the_record_says_what_was_executed_asked_and_weighed(open_stage):
     async def play():
         async with open_stage() as stage:
@@ -73,6 +76,7 @@ def test_the_record_says_what_was_executed_asked_and_weighed(open_stage):
         assert f"weighed, {key}: {grams:.2f} g" in stage.said("note")
 
 
+@pytest.mark.realtime
 def test_the_empty_pourer_is_weighed_once_and_every_pour_is_confirmed(open_stage):
     async def play():
         async with open_stage() as stage:
@@ -85,6 +89,7 @@ def test_the_empty_pourer_is_weighed_once_and_every_pour_is_confirmed(open_stage
     assert heard.count("start") == 2
 
 
+@pytest.mark.realtime
 def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_stage):
     seen = []
 
@@ -102,6 +107,7 @@ def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_stage):
     assert max(p.balance for p in seen if p.balance is not None) > 0.15
 
 
+@pytest.mark.realtime
 def test_a_pour_that_is_refused_asks_nobody_and_moves_nothing(open_stage):
     async def play():
         async with open_stage() as stage:
@@ -117,6 +123,7 @@ def test_a_pour_that_is_refused_asks_nobody_and_moves_nothing(open_stage):
     assert moved == 0.0
 
 
+@pytest.mark.realtime
 def test_no_consent_no_movement(open_stage):
     async def play():
         async with open_stage(answers={"start": ["no"]}) as stage:
@@ -132,6 +139,7 @@ def test_no_consent_no_movement(open_stage):
     assert loaded == pytest.approx(0.2, abs=5e-3)
 
 
+@pytest.mark.realtime
 def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
     patience = OperatorSpec(answers="virtual", time=2.0, reminder=4.0, deadline=12.0)
 
@@ -147,6 +155,7 @@ def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
     assert moved < 1e-6
 
 
+@pytest.mark.realtime
 def test_a_pourer_filled_wrongly_is_filled_anew_before_anything_is_poured(open_stage):
     async def play():
         # 'done', although nothing was: the empty pourer is weighed as the full one
@@ -160,6 +169,7 @@ def test_a_pourer_filled_wrongly_is_filled_anew_before_anything_is_poured(open_s
     assert measured.loaded == pytest.approx(0.2, abs=5e-3)
 
 
+@pytest.mark.realtime
 def test_a_mistyped_weight_is_asked_for_again(open_stage):
     async def play():
         async with open_stage(placement=Placement.MANUAL, answers={"tray_after": ["43", "437.2 bananas"]}) as stage:
@@ -170,6 +180,7 @@ def test_a_mistyped_weight_is_asked_for_again(open_stage):
     assert measured.spilled == pytest.approx(stage.things.on_tray, abs=3e-4)
 
 
+@pytest.mark.realtime
 def test_a_pour_given_up_before_consent_was_not_made(open_stage):
     seen = []
 
@@ -187,6 +198,7 @@ def test_a_pour_given_up_before_consent_was_not_made(open_stage):
     assert asyncio.run(play()) < 1e-6
 
 
+@pytest.mark.realtime
 def test_a_pour_given_up_while_it_tilts_stops_the_arm_where_it_is(open_stage):
     seen = []
 
@@ -206,6 +218,7 @@ def test_a_pour_given_up_while_it_tilts_stops_the_arm_where_it_is(open_stage):
     assert program == "STOPPED"
 
 
+@pytest.mark.realtime
 def test_an_error_of_the_grip_changes_what_is_poured_and_not_what_the_arm_reads(open_stage):
     async def play(tilt):
         spec = wired_spec()

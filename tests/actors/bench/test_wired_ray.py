@@ -40,6 +40,8 @@ async def stopped(opened: RayLaboratory, action: Any, how: Any) -> tuple[Unknown
     return error.value, seen
 
 
+@pytest.mark.realtime
+@pytest.mark.slow
 def test_a_stop_and_the_death_of_the_driver_are_told_and_the_bench_pours_on(laboratory):
     slow = ACTION.with_values(angular_velocity=0.4)
 

@@ -84,6 +84,7 @@ def near(values: list[float], tolerance: float = 2e-5) -> Any:
 # ---- moves
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("move", ["moveJ", "moveL", "moveJ_IK"])
 def test_a_move_returns_true_and_ends_at_its_target(seen: Seen, move: str) -> None:
     moves = seen("moves")
@@ -91,12 +92,14 @@ def test_a_move_returns_true_and_ends_at_its_target(seen: Seen, move: str) -> No
     assert moves[f"{move} reached"] == near(moves[f"{move} target"])
 
 
+@pytest.mark.realtime
 def test_a_tool_move_to_joint_positions_ends_there(seen: Seen) -> None:
     moves = seen("moves")
     assert moves["moveL_FK"] is True
     assert moves["moveL_FK reached"] == near(moves["moveJ target"])
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("move", "expected"),
     # 0.5 rad at 1.05 rad/s and 1.4 rad/s² never reaches full speed; 0.1 m at 0.25 m/s and 1.2 m/s² does.
@@ -115,6 +118,7 @@ def test_moves_take_as_long_as_their_trapezoids_say(robot: Robot, seen: Seen, mo
 # ---- streams
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("stream", ["servoJ", "servoL"])
 def test_a_stream_of_targets_is_followed_to_its_end(seen: Seen, stream: str) -> None:
     streams = seen("streams")
@@ -128,6 +132,7 @@ def test_servoc_goes_to_its_pose_and_the_library_loses_the_next_command(shared: 
     assert seen["stop"] == [False, True]
 
 
+@pytest.mark.realtime
 def test_speeds_are_reached_and_stopped(seen: Seen) -> None:
     streams = seen("streams")
     assert streams["speedJ"] == near([0.0, 0.0, 0.0, 0.0, 0.0, -0.4], 2e-3)
@@ -140,12 +145,14 @@ def test_speeds_are_reached_and_stopped(seen: Seen) -> None:
 # ---- paths
 
 
+@pytest.mark.realtime
 def test_a_joint_path_is_run_through_to_its_last_point(seen: Seen) -> None:
     paths = seen("paths")
     assert paths["moveJ path"] is True
     assert paths["moveJ path end"] == near([*HOME[:5], 0.5])
 
 
+@pytest.mark.realtime
 def test_a_tool_path_keeps_to_its_corners_within_the_blend_radius(robot: Robot, seen: Seen) -> None:
     paths = seen("paths")
     assert paths["moveL path"] is True
@@ -164,6 +171,7 @@ def test_a_tool_path_keeps_to_its_corners_within_the_blend_radius(robot: Robot, 
         assert 0.001 < np.linalg.norm(points[:, 1:] - corner, axis=1).min() < 0.02
 
 
+@pytest.mark.realtime
 def test_an_asynchronous_path_tells_its_progress(seen: Seen) -> None:
     paths = seen("paths")
     assert paths["movePath progress"] == [0, 1]
@@ -173,6 +181,7 @@ def test_an_asynchronous_path_tells_its_progress(seen: Seen) -> None:
 # ---- questions
 
 
+@pytest.mark.realtime
 def test_kinematics_agree_with_the_lengths_of_the_model(robot: Robot, seen: Seen) -> None:
     asked = seen("questions")
     flange = Kinematics(MODELS[robot.model]).flange(asked["q"])
@@ -182,6 +191,7 @@ def test_kinematics_agree_with_the_lengths_of_the_model(robot: Robot, seen: Seen
     assert asked["flange"] == near(asked["pose"], 1e-9)
 
 
+@pytest.mark.realtime
 def test_inverse_kinematics_give_the_branch_that_is_nearest(seen: Seen) -> None:
     asked = seen("questions")
     assert asked["inverse"] == near(asked["q"], 1e-6)
@@ -189,12 +199,14 @@ def test_inverse_kinematics_give_the_branch_that_is_nearest(seen: Seen) -> None:
     assert asked["has solution"] == [True, False]
 
 
+@pytest.mark.realtime
 def test_limits_can_be_asked_for(seen: Seen) -> None:
     asked = seen("questions")
     assert asked["pose within limits"] == [True, False]
     assert asked["joints within limits"] == [True, False]
 
 
+@pytest.mark.realtime
 def test_tool_and_payload_are_read_back_as_set(seen: Seen) -> None:
     asked = seen("questions")
     assert asked["tcp before"] == near([0.0] * 6)
@@ -204,6 +216,7 @@ def test_tool_and_payload_are_read_back_as_set(seen: Seen) -> None:
     assert asked["payload"] == near([0.75, 0.0, 0.0, 0.06])
 
 
+@pytest.mark.realtime
 def test_state_is_told_as_a_real_controller_does(robot: Robot, seen: Seen) -> None:
     asked = seen("questions")
     assert asked["robot"] == [7, 1, 2]  # running, normal, playing
@@ -216,6 +229,7 @@ def test_state_is_told_as_a_real_controller_does(robot: Robot, seen: Seen) -> No
         assert asked["waypoint"] == near(asked["pose with tcp"], 1e-6)
 
 
+@pytest.mark.realtime
 def test_joint_torques_hold_the_arm_s_weight(seen: Seen) -> None:
     torques = seen("questions")["torques"]
     assert torques[0] == near(0.0)
@@ -225,6 +239,7 @@ def test_joint_torques_hold_the_arm_s_weight(seen: Seen) -> None:
 # ---- asynchronous moves
 
 
+@pytest.mark.realtime
 def test_an_asynchronous_move_runs_and_can_be_stopped(seen: Seen) -> None:
     asynchronous = seen("asynchronous")
     assert asynchronous["started"] is True
@@ -241,6 +256,7 @@ def test_an_asynchronous_move_runs_and_can_be_stopped(seen: Seen) -> None:
 # ---- signals and programs
 
 
+@pytest.mark.realtime
 def test_outputs_and_registers_are_set_and_read_back(seen: Seen) -> None:
     signals = seen("signals")
     assert signals["sent"] == [True] * 8
@@ -252,10 +268,12 @@ def test_outputs_and_registers_are_set_and_read_back(seen: Seen) -> None:
     assert signals["off"] is True
 
 
+@pytest.mark.realtime
 def test_inputs_that_are_wired_are_seen(seen: Seen) -> None:
     assert seen("signals")["inputs"] == [True, False, 3.3]
 
 
+@pytest.mark.realtime
 def test_custom_programs_run_and_the_library_s_own_comes_back(seen: Seen) -> None:
     scripts = seen("scripts")
     assert (scripts["function"], scripts["script"], scripts["still works"]) == (True, True, True)
@@ -264,6 +282,7 @@ def test_custom_programs_run_and_the_library_s_own_comes_back(seen: Seen) -> Non
     assert scripts["script reached"] == near([0.0, -1.5, 1.5, -1.5, -1.5, 0.2])
 
 
+@pytest.mark.realtime
 def test_the_dashboard_answers_in_the_manual_s_words(robot: Robot, seen: Seen) -> None:
     dashboard = seen("dashboards")
     assert dashboard["robotmode"] == "Robotmode: RUNNING"
@@ -286,12 +305,14 @@ def test_the_dashboard_answers_in_the_manual_s_words(robot: Robot, seen: Seen) -
 # ---- several at once
 
 
+@pytest.mark.realtime
 def test_a_second_control_interface_is_told_that_the_registers_are_in_use(seen: Seen) -> None:
     second = seen("second")
     assert "already in use" in second["second"]
     assert second["first still moves"] is True
 
 
+@pytest.mark.realtime
 def test_what_can_not_be_reached_ends_the_program_and_a_new_upload_helps(seen: Seen) -> None:
     unreachable = seen("unreachable")
     assert (unreachable["moveL"], unreachable["program runs"], unreachable["inverse"]) == (False, False, [])
@@ -299,6 +320,7 @@ def test_what_can_not_be_reached_ends_the_program_and_a_new_upload_helps(seen: S
     assert unreachable["force mode ends program"] is True
 
 
+@pytest.mark.realtime
 def test_two_robots_side_by_side_keep_out_of_each_other_s_way(robots: dict[str, Robot]) -> None:
     # All the scenarios above ran on both at the same time; each moved and told of its own arm only.
     poses = [robot.sightings["questions"].result()["pose"] for robot in robots.values()]
@@ -310,6 +332,7 @@ def test_two_robots_side_by_side_keep_out_of_each_other_s_way(robots: dict[str, 
 # ---- time
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("model_name", "rate"), [("ur10e", 500), ("ur10", 125)])
 def test_in_real_time_the_clock_is_right_and_packages_come_at_the_controller_s_rate(model_name: str, rate: int) -> None:
     with VirtualController.start(address=next_address(), model=model_name) as controller:

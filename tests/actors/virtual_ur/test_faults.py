@@ -46,6 +46,7 @@ def arrives(controller: VirtualController, seconds: float = 5.0) -> bool:
 # ---- stops
 
 
+@pytest.mark.realtime
 def test_a_protective_stop_in_a_move_and_the_way_back(fresh: Start) -> None:
     controller = fresh()
     client = Client("protective_stop", controller.address)
@@ -68,6 +69,7 @@ def test_a_protective_stop_in_a_move_and_the_way_back(fresh: Start) -> None:
     assert seen["moves again"] is True
 
 
+@pytest.mark.realtime
 def test_an_emergency_stop_in_a_move_and_the_way_back(fresh: Start) -> None:
     controller = fresh(time_scale=8.0)
     client = Client("emergency_stop", controller.address)
@@ -87,6 +89,7 @@ def test_an_emergency_stop_in_a_move_and_the_way_back(fresh: Start) -> None:
     assert seen["moves again"] is True
 
 
+@pytest.mark.realtime
 def test_after_a_protective_stop_the_library_says_for_ever_that_the_move_is_running(fresh: Start) -> None:
     controller = fresh()
     client = moving(controller, 0.5)
@@ -99,6 +102,7 @@ def test_after_a_protective_stop_the_library_says_for_ever_that_the_move_is_runn
     assert max(map(abs, seen["qd"])) < 1e-6
 
 
+@pytest.mark.realtime
 def test_a_stop_can_be_asked_for_at_a_time(fresh: Start) -> None:
     controller = fresh()
     client = moving(controller, 1.0)
@@ -117,6 +121,7 @@ def test_a_stop_can_be_asked_for_at_a_time(fresh: Start) -> None:
     assert 0.5 < still - began < 1.0
 
 
+@pytest.mark.realtime
 def test_a_safeguard_stop_holds_the_arm_until_it_is_released(fresh: Start) -> None:
     controller = fresh()
     client = moving(controller, 0.5)
@@ -132,6 +137,7 @@ def test_a_safeguard_stop_holds_the_arm_until_it_is_released(fresh: Start) -> No
 # ---- lines
 
 
+@pytest.mark.realtime
 def test_a_silent_controller_is_noticed_after_two_and_a_half_seconds_and_values_go_stale(fresh: Start) -> None:
     controller = fresh()
     client = listener_while_moving(controller, seconds=4.0, anew=False)
@@ -144,6 +150,7 @@ def test_a_silent_controller_is_noticed_after_two_and_a_half_seconds_and_values_
     assert controller.fault("state")["joints"][0] > seen["q"][0] + 0.3
 
 
+@pytest.mark.realtime
 def test_a_controller_that_hangs_holds_the_arm_too(fresh: Start) -> None:
     controller = fresh()
     client = moving(controller, 0.0)
@@ -160,6 +167,7 @@ def test_a_controller_that_hangs_holds_the_arm_too(fresh: Start) -> None:
     client.result()
 
 
+@pytest.mark.realtime
 def test_cut_connections_are_noticed_and_the_arm_finishes_its_move(fresh: Start) -> None:
     controller = fresh()
     client = listener_while_moving(controller)
@@ -174,6 +182,7 @@ def test_cut_connections_are_noticed_and_the_arm_finishes_its_move(fresh: Start)
     assert observe("connect", controller.address)["control"] == "connected"
 
 
+@pytest.mark.realtime
 def test_dropped_connections_can_be_made_anew_at_once(fresh: Start) -> None:
     controller = fresh()
     client = listener_while_moving(controller)
@@ -185,6 +194,7 @@ def test_dropped_connections_can_be_made_anew_at_once(fresh: Start) -> None:
     assert seen["fresh"] > seen["stale"][0]
 
 
+@pytest.mark.realtime
 def test_after_a_reboot_the_robot_is_off_and_has_forgotten_its_tool(fresh: Start) -> None:
     controller = fresh(time_scale=8.0)
     observe("questions", controller.address)
@@ -200,6 +210,7 @@ def test_after_a_reboot_the_robot_is_off_and_has_forgotten_its_tool(fresh: Start
 # ---- the panel
 
 
+@pytest.mark.realtime
 def test_in_local_control_the_library_refuses_to_connect(fresh: Start) -> None:
     controller = fresh(local=True)
     seen = observe("connect", controller.address)
@@ -209,6 +220,7 @@ def test_in_local_control_the_library_refuses_to_connect(fresh: Start) -> None:
     assert observe("connect", controller.address)["control"] == "connected"
 
 
+@pytest.mark.realtime
 def test_switching_to_local_control_stops_the_program_and_the_arm(fresh: Start) -> None:
     controller = fresh()
     client = moving(controller, 0.5)
@@ -220,6 +232,7 @@ def test_switching_to_local_control_stops_the_program_and_the_arm(fresh: Start) 
     assert seen["q"][0] < 2.4
 
 
+@pytest.mark.realtime
 def test_the_speed_slider_slows_a_move_that_runs(fresh: Start) -> None:
     controller = fresh()
     client = moving(controller, 0.3)
@@ -228,6 +241,7 @@ def test_the_speed_slider_slows_a_move_that_runs(fresh: Start) -> None:
     assert client.result()["qd"][0] == pytest.approx(0.1, abs=0.005)
 
 
+@pytest.mark.realtime
 def test_noise_on_joint_positions_is_seen_in_what_is_measured_only(fresh: Start) -> None:
     controller = fresh(time_scale=16.0)
     controller.fault("noise", sigma=0.01)
@@ -239,6 +253,7 @@ def test_noise_on_joint_positions_is_seen_in_what_is_measured_only(fresh: Start)
     assert 1e-5 < abs(seen["q"][0] - 2.5) < 0.06
 
 
+@pytest.mark.realtime
 def test_a_wrong_checksum_is_told(fresh: Start) -> None:
     controller = fresh()
     true = controller.fault("state")["checksum"]
@@ -251,18 +266,21 @@ def test_a_wrong_checksum_is_told(fresh: Start) -> None:
 # ---- watchdogs
 
 
+@pytest.mark.realtime
 def test_a_watchdog_that_is_kicked_lets_the_move_go_on(fresh: Start) -> None:
     seen = observe("watched", fresh().address, kick=True)
     assert seen["running"] is True
     assert seen["q"] > 0.9
 
 
+@pytest.mark.realtime
 def test_a_watchdog_that_is_not_kicked_stops_the_arm(fresh: Start) -> None:
     seen = observe("watched", fresh().address, kick=False)
     assert seen["running"] is False
     assert seen["q"] < 0.8
 
 
+@pytest.mark.realtime
 def test_a_client_that_dies_leaves_the_watchdog_to_stop_the_arm(fresh: Start) -> None:
     controller = fresh(time_scale=1.0)
     client = Client("watched", controller.address, exits=True)
@@ -278,6 +296,7 @@ def test_a_client_that_dies_leaves_the_watchdog_to_stop_the_arm(fresh: Start) ->
 # ---- the port itself
 
 
+@pytest.mark.realtime
 def test_an_unknown_fault_is_told_with_those_there_are(shared: VirtualController) -> None:
     with pytest.raises(VirtualControllerError, match=r"no fault 'pizza'.*protective_stop"):
         shared.fault("pizza")

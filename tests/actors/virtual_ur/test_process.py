@@ -47,6 +47,7 @@ def greeting(address: str) -> bytes:
         return connection.recv(100)
 
 
+@pytest.mark.realtime
 def test_it_is_ready_when_it_says_so_and_gone_when_it_is_closed() -> None:
     controller = VirtualController.start(address=next_address())
     assert greeting(controller.address).startswith(b"Connected: Universal Robots Dashboard Server")
@@ -58,6 +59,7 @@ def test_it_is_ready_when_it_says_so_and_gone_when_it_is_closed() -> None:
     controller.close()  # once more does no harm
 
 
+@pytest.mark.realtime
 def test_the_arm_begins_where_it_is_told_to() -> None:
     joints = [0.1, -1.2, 1.3, -1.4, -1.5, 1.6]
     with VirtualController.start(address=next_address(), joints=joints, state="idle") as controller:
@@ -66,11 +68,13 @@ def test_the_arm_begins_where_it_is_told_to() -> None:
     assert state["robot_mode"] == "IDLE"
 
 
+@pytest.mark.realtime
 def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
     with pytest.raises(VirtualControllerError, match=f"{shared.address}.*is another one running there"):
         VirtualController.start(address=shared.address)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -102,6 +106,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("how", ["plain", "fork"])
 def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
     address = next_address()
@@ -135,6 +140,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.realtime
 def test_an_interpreter_that_hangs_ends_all_the_same() -> None:
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
@@ -162,6 +168,7 @@ def send(controller: VirtualController, text: bytes, most: float = 60.0) -> floa
     return float(controller.fault("state", patience=most)["timing"]["worst"])
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -189,6 +196,7 @@ def test_no_program_takes_the_clock_its_time(fresh: Callable[..., VirtualControl
 sizes = st.integers(0, 70_000)
 
 
+@pytest.mark.realtime
 @settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(port=st.sampled_from((*PORTS, 0)), data=st.one_of(st.binary(max_size=200), sizes.map(os.urandom)))
 def test_no_bytes_on_any_port_bring_it_down(shared: VirtualController, port: int, data: bytes) -> None:
@@ -202,6 +210,7 @@ def test_no_bytes_on_any_port_bring_it_down(shared: VirtualController, port: int
     assert greeting(shared.address).startswith(b"Connected")
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("port", PORTS)
 def test_connections_that_come_and_go_or_never_read_do_no_harm(shared: VirtualController, port: int) -> None:
     connections = [socket.create_connection((shared.address, port), timeout=5) for _ in range(50)]

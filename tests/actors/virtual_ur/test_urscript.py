@@ -239,7 +239,7 @@ def test_what_can_not_be_read_is_told_with_its_line(text: str, line: int, says: 
         ("x = 1\ny = x / 0", 3, "division by zero"),
         ("out(x)", 2, "'x' has no value yet"),
         ("x = [1, 2]\nout(x[5])", 3, "no such entry"),
-        ("x = [1, 2]\ni = 0 - 1\nout(x[i])", 4, "no index"),
+        ("x = [1, 2]\ni = 0 - 1\nout(x[i])", 4, "is not an index"),
         ("x = [1] + [2]", 2, "can't compute"),
         ("x = sqrt(0 - 1)", 2, "computed"),
         ("out(1, 2, 3)", 2, "wrong use"),

@@ -49,6 +49,7 @@ def joints(controller: VirtualController) -> Any:
     return controller.fault("state")["joints"]
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("verb", ["run", "pour", "jog"])
 def test_hardware_doesn_t_move_without_the_flag(campaign: Path, verb: str) -> None:
     file = campaign if verb != "jog" else campaign.with_name("rig.yaml")
@@ -60,6 +61,7 @@ def test_hardware_doesn_t_move_without_the_flag(campaign: Path, verb: str) -> No
     assert not (campaign.parent / "runs").exists()
 
 
+@pytest.mark.realtime
 def test_the_flag_alone_doesn_t_arm_where_nobody_is_at_a_terminal(campaign: Path) -> None:
     for command in (["run", str(campaign)], ["jog", str(campaign.with_name("rig.yaml"))]):
         result = CliRunner().invoke(app, [*command, "--arm"], input="rig\nrig\n", catch_exceptions=False)
@@ -68,6 +70,7 @@ def test_the_flag_alone_doesn_t_arm_where_nobody_is_at_a_terminal(campaign: Path
     assert not (campaign.parent / "runs").exists()
 
 
+@pytest.mark.realtime
 def test_settings_that_nobody_has_accepted_can_t_be_armed(campaign: Path) -> None:
     record_path(campaign.with_name("rig.yaml")).unlink()
     result = decant("run", str(campaign), "--arm")
@@ -76,6 +79,7 @@ def test_settings_that_nobody_has_accepted_can_t_be_armed(campaign: Path) -> Non
     assert "decant doctor" in result.stderr
 
 
+@pytest.mark.realtime
 def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path) -> None:
     other = campaign.with_name("other.yaml")
     other.write_text(campaign.with_name("rig.yaml").read_text().replace("name: rig", "name: other"))
@@ -87,6 +91,7 @@ def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path)
     assert accepted(load_campaign(campaign, other)) == "0A0B0C0D"
 
 
+@pytest.mark.realtime
 def test_a_wrong_name_moves_nothing(campaign: Path, controller: VirtualController) -> None:
     before = joints(controller)
     with Terminal("jog", str(campaign.with_name("rig.yaml")), "--arm", cwd=str(campaign.parent)) as terminal:
@@ -99,6 +104,7 @@ def test_a_wrong_name_moves_nothing(campaign: Path, controller: VirtualControlle
     assert joints(controller) == before
 
 
+@pytest.mark.realtime
 def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to_the_terminal(
     campaign: Path, controller: VirtualController
 ) -> None:
@@ -121,6 +127,7 @@ def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to
     assert decant("run", str(campaign), "--resume").exit_code == 2  # armed once is not armed for ever
 
 
+@pytest.mark.realtime
 def test_settings_that_were_changed_since_stop_a_run_before_anybody_is_asked(
     campaign: Path, controller: VirtualController
 ) -> None:
@@ -135,6 +142,7 @@ def test_settings_that_were_changed_since_stop_a_run_before_anybody_is_asked(
     assert "nothing moves before that" not in terminal.screen
 
 
+@pytest.mark.realtime
 def test_envelope_covers_the_actions_of_the_campaign_and_grows_with_them(campaign: Path) -> None:
     def worst(text: str) -> Envelope:
         campaign.write_text(text, encoding="utf-8")
@@ -152,6 +160,7 @@ def test_envelope_covers_the_actions_of_the_campaign_and_grows_with_them(campaig
     assert low.worst.high[2] + 0.05 < high.worst.high[2] < low.worst.high[2] + 0.15
 
 
+@pytest.mark.realtime
 def test_limits_of_the_laboratory_refuse_a_campaign_that_would_break_all_of_them(campaign: Path) -> None:
     laboratory = campaign.with_name("rig.yaml")
     laboratory.write_text(laboratory.read_text().replace("tilt: 135 deg", "tilt: 60 deg"))
@@ -161,6 +170,7 @@ def test_limits_of_the_laboratory_refuse_a_campaign_that_would_break_all_of_them
     assert "lean" in result.stderr or "tilt" in result.stderr
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("file", "old", "new", "said"),
     [

@@ -55,6 +55,7 @@ def checked(path: Path, *options: str) -> dict[str, dict[str, Any]]:
     return {check["name"]: check for check in reversed(table)}
 
 
+@pytest.mark.realtime
 def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance
 ) -> None:
@@ -82,6 +83,7 @@ def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     assert balance.state()["heard"].count("T") == 0 if "heard" in balance.state() else True
 
 
+@pytest.mark.realtime
 def test_virtual_laboratory_is_started_looked_at_and_called_virtual() -> None:
     result = doctor(Path("configs/laboratories/virtual.yaml"))
     assert result.exit_code == 0, result.output
@@ -98,6 +100,7 @@ def test_a_bench_of_numbers_and_a_bad_file_are_refused_with_exit_code_2(tmp_path
     assert "hardwear" in bad.stderr
 
 
+@pytest.mark.realtime
 def test_nobody_at_the_address(tmp_path: Path) -> None:
     path = hardware.write_laboratory(tmp_path / "rig.yaml", "127.81.3.9")  # loopback: every port refuses
     network = checked(path)["network"]
@@ -108,6 +111,7 @@ def test_nobody_at_the_address(tmp_path: Path) -> None:
     assert "stands for no machine" in checked(path)["address"]["found"]
 
 
+@pytest.mark.realtime
 def test_one_closed_port_is_named_with_what_it_is_for(tmp_path: Path) -> None:
     servers = [socket.create_server(("127.81.3.8", port)) for port in (30001, 30003, 30004)]
     path = hardware.write_laboratory(tmp_path / "rig.yaml", "127.81.3.8")
@@ -122,6 +126,7 @@ def test_one_closed_port_is_named_with_what_it_is_for(tmp_path: Path) -> None:
     assert table["answers"]["state"] == "fail"  # the others accept, and say nothing
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("model", "options", "name", "found", "advice"),
     [
@@ -143,6 +148,7 @@ def test_a_controller_that_was_started_otherwise(
     assert advice in line["advice"]
 
 
+@pytest.mark.realtime
 def test_stops_are_named_and_never_unlocked(tmp_path: Path) -> None:
     with VirtualController.start("127.81.3.5", "ur10", joints=JOINTS) as started:
         path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
@@ -155,6 +161,7 @@ def test_stops_are_named_and_never_unlocked(tmp_path: Path) -> None:
         assert checked(path)["safety"]["found"] == "robot emergency stop"
 
 
+@pytest.mark.realtime
 def test_another_tool_or_payload_than_the_file_s(laboratory: Path, controller: VirtualController) -> None:
     hardware.install(controller, tool=0.12, payload=0.3)
     try:
@@ -167,6 +174,7 @@ def test_another_tool_or_payload_than_the_file_s(laboratory: Path, controller: V
     assert checked(laboratory)["tool"]["state"] == "ok"
 
 
+@pytest.mark.realtime
 def test_changed_safety_settings_are_shown_with_both_checksums(laboratory: Path, controller: VirtualController) -> None:
     doctor(laboratory, "--accept-safety")
     before = accepted_checksum(laboratory)
@@ -180,6 +188,7 @@ def test_changed_safety_settings_are_shown_with_both_checksums(laboratory: Path,
     assert str(before) in line["found"]
 
 
+@pytest.mark.realtime
 def test_settings_that_were_accepted_for_another_robot_don_t_count(
     laboratory: Path, controller: VirtualController
 ) -> None:
@@ -191,6 +200,7 @@ def test_settings_that_were_accepted_for_another_robot_don_t_count(
     assert "1999999999" in line["found"]
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("content", ["", "[]", '{"checksum": "12345678"}', "{"])
 def test_a_spoilt_record_is_an_error_and_not_a_missing_one(laboratory: Path, content: str) -> None:
     record_path(laboratory).write_text(content)
@@ -199,6 +209,7 @@ def test_a_spoilt_record_is_an_error_and_not_a_missing_one(laboratory: Path, con
     assert doctor(laboratory).exit_code == 2
 
 
+@pytest.mark.realtime
 def test_balance_that_is_unplugged_or_silent_is_told_with_what_to_do(
     tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance
 ) -> None:
@@ -235,6 +246,7 @@ def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_chang
         require_accepted("22C99AA2", None, "robot")
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("up", "state"), [("0, 9.82, 0", "fail"), ("0, 0.5, 9.8", "ok")])
 def test_a_robot_that_hangs_where_the_file_has_it_stand_is_told(
     laboratory: Path, controller: VirtualController, up: str, state: str

@@ -118,6 +118,7 @@ def test_home_from_home_is_no_step() -> None:
     assert sum(step.amount for step in steps if step.axis == "joint 1") == pytest.approx(25.0)
 
 
+@pytest.mark.realtime
 def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: Path) -> None:
     start = [radians(q) for q in hardware.HOME]
     with VirtualController.start("127.83.3.2", "ur10", joints=start) as controller:

@@ -63,6 +63,7 @@ def test_dry_run_tells_and_draws_the_whole_path_and_connects_to_nobody(tmp_path:
     assert report["at_home"] is None
 
 
+@pytest.mark.realtime
 def test_dry_run_can_look_where_the_arm_stands(tmp_path: Path, controller: VirtualController) -> None:
     campaign = hardware.write_rig(tmp_path, controller.address)
     before = controller.fault("state")
@@ -98,6 +99,7 @@ def test_pours_that_can_t_be_are_refused_before_anything_is_reached(
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.realtime
 def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_record(
     tmp_path: Path, controller: VirtualController
 ) -> None:
@@ -126,6 +128,7 @@ def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_recor
     assert joints[-1] == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)
 
 
+@pytest.mark.realtime
 def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, controller: VirtualController) -> None:
     campaign = hardware.write_rig(tmp_path, controller.address)
     checksum = controller.fault("state")["checksum"]

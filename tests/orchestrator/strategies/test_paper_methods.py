@@ -114,7 +114,14 @@ def test_noise_makes_no_draws_of_theta_for_a_deployment_under_risk(folder: Path)
         run(
             path,
             RunOptions(
-                resume=False, run_id=None, answer=None, in_process=True, laboratory=None, as_json=False, armed=False
+                resume=False,
+                run_id=None,
+                answer=None,
+                in_process=True,
+                laboratory=None,
+                seed=None,
+                as_json=False,
+                armed=False,
             ),
         )
 

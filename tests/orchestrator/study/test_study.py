@@ -75,6 +75,8 @@ def _imports(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
+@pytest.mark.realtime
+@pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_comes_to(tmp_path: Path) -> None:
     arms = read("quick")["calibration"]
     changes = {
@@ -121,6 +123,7 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
     assert load_campaign(resolved).parameters.model_dump() == theta
 
 
+@pytest.mark.realtime
 def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial": 4}}, read("quick")["mismatch"][:1]
     deployment = {"D3": {**read("quick")["deployment"]["D3"], "pours": 1, "repetitions": 1}}

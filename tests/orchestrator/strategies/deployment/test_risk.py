@@ -105,13 +105,6 @@ def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
     assert [decode_request(one) for one in written] == first.asked
 
 
-def test_requests_of_before_there_were_errors_can_still_be_read() -> None:
-    request = Simulate("cup", SCENE.action({"angular_velocity": 1.0}), THETA, 7)
-    written = encode_request(request)
-    del written["pose_error"]
-    assert decode_request(written) == request
-
-
 def test_the_pour_is_predicted_with_the_spread_of_the_errors() -> None:
     played = Play(two_valleys)(risky(1, pours=1))
     (pour,) = played.pours
