@@ -17,6 +17,7 @@ from PIL import Image
 from orchestrator.journal import JOURNAL_NAME, JournalReader
 from orchestrator.report import style
 from orchestrator.report.results import deployments_of
+from orchestrator.results import decode_results
 from orchestrator.strategies.deployment.learnt import Deployed
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -46,7 +47,7 @@ def main(runs: list[Path]) -> None:
 def learnt_in(run: Path) -> Deployed:
     """What a run's deployment learnt."""
     with JournalReader(run / JOURNAL_NAME) as journal:
-        (deployed,) = deployments_of(journal.stage_results()).values()
+        (deployed,) = deployments_of(decode_results(journal.stage_results())).values()
     return deployed
 
 
