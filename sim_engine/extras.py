@@ -10,6 +10,12 @@ EXTRAS = {
     "psutil": "lab",
     "rtde_receive": "lab",
     "rerun": "live",
+    "apprise": "daemon",
+    "fastapi": "daemon",
+    "httpx": "daemon",
+    "prometheus_client": "daemon",
+    "pythonjsonlogger": "daemon",
+    "uvicorn": "daemon",
     "pandas": "tables",
     "pyarrow": "tables",
 }
