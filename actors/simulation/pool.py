@@ -14,10 +14,10 @@ from actors.cluster.versions import Versions
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.actor import CONTROL, Answer, simulator_actor
 from actors.simulation.crew import Crew
+from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.member import Job, Member, Sent
 from actors.simulation.parcel import Packer
 from actors.simulation.statistics import Account, PoolStatistics
-from actors.simulation.worker import Simulator, pour_simulator
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
