@@ -21,7 +21,7 @@ class JobCancelledError(Exception):
 
 
 class Simulator(Protocol):
-    """What a worker needs of the engine; `sim_engine.pour.PourSimulator` is one."""
+    """What a job runner needs of the engine; `sim_engine.pour.PourSimulator` is one."""
 
     def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """Run one pour."""
@@ -39,7 +39,7 @@ def pour_simulator() -> Simulator:
     return PourSimulator()
 
 
-class SimulationWorker:
+class JobRunner:
     """Runs jobs one after the other on one simulator.
 
     Kernels reach the cache when a simulator is closed. A process may be killed before that, and the next one on its
