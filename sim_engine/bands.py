@@ -3,8 +3,10 @@
 What lands beyond the rim is the tail of a stream whose landing places scatter about their median, to a good
 approximation normally: r = Φ(z), where z is the median's distance past the rim in the stream's own width. A simulator
 whose stream lands a little off is wrong by a shift of z, whatever spills: by next to nothing where the whole stream
-hits or misses, by most where half of it does. So errors of the simulator are stated, and added, as standard deviations
-of that shift. A band is the interval of r in which a single pour lies with probability `LEVEL`.
+hits or misses, by most where half of it does. So errors of the simulator are stated as standard deviations of that
+shift. What calibration left over was found with coarse particles, and holds their error in its own scene: it is not added
+to what they are off in others, the larger of the two counts. A band is the interval of r in which a single pour lies with
+probability `LEVEL`.
 
 Source: ours, by the above; measured in `docs/validation.md` (landing, convergence), held against unseen pours in
 `docs/results.md`.
@@ -132,9 +134,11 @@ def band(spillages: Sequence[float], particles: int, discrepancy: float | None =
     mean = math.fsum(places) / count
     spread = math.fsum((z - mean) ** 2 for z in places) / (count - 1) if count > 1 else 0.0
     coarse = resolution_shift(particles)
+    # What calibration left over was found with coarse particles, too, and holds their error: the larger of both counts.
+    lacking = max(coarse, discrepancy or 0.0)
     # The mixture of the simulations has a variance of s² (n − 1) / n; a further one differs from their mean by
     # s² (n + 1) / n.
-    width = math.sqrt(coarse**2 + (discrepancy or 0.0) ** 2 + 2.0 * spread / count)
+    width = math.sqrt(lacking**2 + 2.0 * spread / count)
     steep, half = _NORMAL.pdf(mean), 0.5 / (particles + 1)
     low, high = (_NORMAL.cdf(_quantile(places, width, 0.5 * (1.0 + side * level))) for side in (-1.0, 1.0))
     return Band(
