@@ -4,9 +4,9 @@ What lands beyond the rim is the tail of a stream whose landing places scatter a
 approximation normally: r = Φ(z), where z is the median's distance past the rim in the stream's own width. A simulator
 whose stream lands a little off is wrong by a shift of z, whatever spills: by next to nothing where the whole stream
 hits or misses, by most where half of it does. So errors of the simulator are stated as standard deviations of that
-shift. What calibration left over was found with coarse particles, and holds their error in its own scene: it is not added
-to what they are off in others, the larger of the two counts. A band is the interval of r in which a single pour lies with
-probability `LEVEL`.
+shift. What calibration left over was found with coarse particles, and holds their error in its own scene: it is not
+added to what they are off in others, the larger of the two counts. A band is the interval of r in which a single pour
+lies with probability `LEVEL`.
 
 Source: ours, by the above; measured in `docs/validation.md` (landing, convergence), held against unseen pours in
 `docs/results.md`.
