@@ -102,6 +102,7 @@ class Bench:
         self._sign = np.random.default_rng([seed, 999]).choice([-1.0, 1.0], problem.dimension)
         self._free = asyncio.Semaphore(asked.slots)
         self.size = asked.slots
+        self.separate = False
         self.simulators = self.bench = self.optimizer = self
         self.occupancy = Occupancy(asked.slots)
         self.poured: list[float] = []

@@ -35,6 +35,11 @@ class InProcessSimulatorPool:
         """One."""
         return 1
 
+    @property
+    def separate(self) -> bool:
+        """They share this process with the bench."""
+        return False
+
     def statistics(self) -> PoolStatistics:
         """What the pool has done so far."""
         return self._account.statistics()

@@ -88,6 +88,11 @@ class RaySimulatorPool:
         """Number of members, those included that are waited for."""
         return self._crew.size
 
+    @property
+    def separate(self) -> bool:
+        """In processes of their own."""
+        return True
+
     def statistics(self) -> PoolStatistics:
         """What the pool has done so far."""
         return self._account.statistics()

@@ -41,6 +41,7 @@ def spilled(action: Action, theta: SimulationParameters, seed: int) -> float:
 
 class _Simulators:
     size = 1
+    separate = False
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
         await asyncio.sleep(float(os.environ.get(PAUSE, "0")))
