@@ -18,6 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from orchestrator.catalogue.columns import TABLES as CATALOGUE
 from orchestrator.config import pose, vessel
 from orchestrator.config.campaign import sections as campaign
 from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
@@ -213,6 +214,12 @@ def states() -> str:
     return _table(("state", "meaning"), [(f"{state}", said[state.name]) for state in State])
 
 
+def catalogued(table: str) -> str:
+    """What the columns of one of the catalogue's tables mean."""
+    rows = [(f"`{c.name}`", c.unit.replace("1", "fraction"), _one_line(c.meaning)) for c in CATALOGUE[table]]
+    return _table(("column", "unit", "meaning"), rows)
+
+
 def section(model: type[Section]) -> str:
     """Keys of a section as people write them."""
     rows = []
@@ -248,6 +255,8 @@ def _arms(model: type[Section]) -> dict[str, type[Section]]:
 
 
 TABLES: dict[str, Callable[[], str]] = {
+    "catalogue-runs": partial(catalogued, "run"),
+    "catalogue-pours": partial(catalogued, "pour"),
     "actions": actions,
     "parameters": parameters,
     "effects": effects,
