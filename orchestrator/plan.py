@@ -25,6 +25,7 @@ class RecordedPour:
     Attributes:
         poured, spilled, retained: masses [kg].
         split: 'train', 'test' or 'transfer'.
+        scene: name of the one that it was made in; '' for that of its `RecordSet`.
     """
 
     action: Action
@@ -32,6 +33,7 @@ class RecordedPour:
     spilled: float
     retained: float
     split: str
+    scene: str = ""
 
     @property
     def poured_fraction(self) -> float:
@@ -117,6 +119,7 @@ class CalibrationPlan:
         constraints: on actions, beside the bounds of their space.
         prior: dimensions along which g is not uniform.
         parameter_prior: searched parameters that were measured beforehand, each with its tolerance.
+        further: scenes beside the first one, with other receivers, into which pours are made by turns.
     """
 
     settings: CalibrationSettings
@@ -132,6 +135,12 @@ class CalibrationPlan:
     constraints: tuple[Linear, ...] = ()
     prior: tuple[NormalPrior, ...] = ()
     parameter_prior: tuple[NormalPrior, ...] = ()
+    further: tuple[Scene, ...] = ()
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """All scenes that calibration pours are made in."""
+        return (self.scene, *self.further)
 
     @property
     def strategy(self) -> str:

@@ -14,6 +14,7 @@ from orchestrator.flights import Order
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
 from orchestrator.results import Results, learnt_by
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
@@ -67,7 +68,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     """
     found: list[Scene] = []
     if plan.calibration is not None:
-        found.append(plan.calibration.scene)
+        found += plan.calibration.scenes
         found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
     if plan.deployment is not None:
         found += plan.deployment.scenes
@@ -95,7 +96,7 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
 
         def pours(results: Results, seed: int) -> Strategy:
             return DesignedPours(
-                plan.scene, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
+                plan.scenes, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
             )
 
         stages.append(StageDefinition(POURS, pours, pours=True))
@@ -108,8 +109,9 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
         theta = calibrated_theta(results).theta
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        plain = SimulationParameters.from_values(plan.fixed_parameters) if rivals else None
-        return Scorecard(theta, rivals, pours, plan.actions, seed, uncalibrated=plain)
+        measured = {prior.name: prior.mean for prior in plan.parameter_prior}
+        plain = SimulationParameters.from_values(plan.fixed_parameters | measured) if rivals else None
+        return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain)
 
     found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
     return [*stages, found, StageDefinition(EVALUATION, evaluation)]
@@ -230,14 +232,16 @@ def calibrated_theta(results: Results) -> CalibratedTheta:
 
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
     """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
-    made = []
+    made, scenes = [], {scene.name: scene for scene in plan.scenes}
     for pour in learnt_by(results, POURS, DesignPoured).measured if POURS in results else ():
-        action = plan.scene.action(dict(pour.action_si))
-        made.append(ScoredPour(plan.scene.name, MeasuredPour(action, pour.spillage, pour.poured, pour.split)))
+        scene = scenes.get(pour.scene, plan.scene)
+        action = scene.action(dict(pour.action_si))
+        measured = MeasuredPour(action, pour.spillage, pour.poured, pour.split, scene.name)
+        made.append(ScoredPour(scene.name, measured))
     return [*made, *_recorded(plan.records)]
 
 
 def _recorded(records: RecordSet | None) -> list[ScoredPour]:
     if records is None:
         return []
-    return [ScoredPour(records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]
+    return [ScoredPour(pour.scene or records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]

@@ -129,7 +129,7 @@ class _Translator:
             for records in (plan.calibration.records, plan.calibration.transfer):
                 if records is not None:
                     self._scenes[records.scene.name] = records.scene
-            self._scenes[plan.calibration.scene.name] = plan.calibration.scene
+            self._scenes.update({scene.name: scene for scene in plan.calibration.scenes})
         if plan.deployment is not None:
             self._scenes.update({scene.name: scene for scene in plan.deployment.scenes})
         self._names = receiver_names(plan)

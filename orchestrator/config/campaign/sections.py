@@ -86,6 +86,9 @@ class CalibrationSection(Section):
     receiver: PathOr[VesselFile] | None = None
     """The campaign's unless given."""
 
+    receivers: list[PathOr[VesselFile]] | None = None
+    """Several receivers, into which calibration pours are made by turns."""
+
     motion: Motion | None = None
     """What has other values than in the campaign's `motion`."""
 
