@@ -11,8 +11,9 @@ import numpy as np
 
 from orchestrator.errors import RunError
 from orchestrator.flights import Order
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, KnownSimulation, RecordSet
 from orchestrator.results import Results, learnt_by
+from orchestrator.strategies.calibration.active import ActivePours
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
@@ -83,18 +84,24 @@ def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
     """All stages of a campaign in order: pours, calibration, evaluation, then a deployment for each receiver."""
     stages: list[StageDefinition] = []
     if plan.calibration is not None:
-        stages += calibration_stages(plan.calibration)
+        stages += calibration_stages(plan.calibration, plan.deployment)
     if plan.deployment is not None:
         stages += deployment_stages(plan, plan.deployment)
     return tuple(stages)
 
 
-def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
-    """Pours (unless records take their place), the strategy, and what came of it beside its rivals."""
+def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None = None) -> list[StageDefinition]:
+    """Pours (unless records take their place), the strategy, and what came of it beside its rivals.
+
+    Args:
+        deployment: what pours that are chosen actively are to teach about; None: about calibration's own actions.
+    """
     stages = []
     if plan.pour_count > 0:
 
         def pours(results: Results, seed: int) -> Strategy:
+            if plan.design == "active":
+                return ActivePours(plan, deployment, seed)
             return DesignedPours(
                 plan.scenes, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
             )
@@ -103,7 +110,7 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
 
     def calibration(results: Results, seed: int) -> Strategy:
         pours = [scored.pour for scored in measured_pours(plan, results)]
-        return plan.settings.build(plan, pours, seed)
+        return plan.settings.build(replace(plan, known=known_simulations(plan, results)), pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
         theta = calibrated_theta(results).theta
@@ -239,6 +246,16 @@ def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
         measured = MeasuredPour(action, pour.spillage, pour.poured, pour.split, scene.name)
         made.append(ScoredPour(scene.name, measured))
     return [*made, *_recorded(plan.records)]
+
+
+def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSimulation, ...]:
+    """What the stage that made the pours has simulated in the calibration's scenes."""
+    simulated = learnt_by(results, POURS, DesignPoured).simulated if POURS in results else ()
+    scenes = {scene.name: scene for scene in plan.scenes}
+    return tuple(
+        KnownSimulation(dict(one.theta), one.scene, scenes[one.scene].action(dict(one.action_si)), one.spillage)
+        for one in simulated
+    )
 
 
 def _recorded(records: RecordSet | None) -> list[ScoredPour]:

@@ -14,6 +14,9 @@ from orchestrator.plan import CalibrationPlan, NormalPrior
 from orchestrator.strategies.doors import calibrations
 from sim_engine.space import Axis, Space
 
+DESIGN_SIMULATIONS = 64
+"""Simulations of an active design unless a campaign says how many."""
+
 
 def resolve_calibration(
     section: CalibrationSection,
@@ -68,8 +71,8 @@ def resolve_calibration(
     count = holdout = 0
     if pours is not None and (from_file or from_run is not None):
         source = "a file" if from_file else "a run"
-        for key in ("count", "holdout"):
-            if pours.value(key) is not None:
+        for key in ("count", "holdout", "design", "simulations"):
+            if at.at(key).loc in at.document.marks:
                 report.add(
                     at.at(key), f"belongs to pours that are still to be made; these are read 'from' {source}", key=True
                 )
@@ -86,6 +89,8 @@ def resolve_calibration(
             scenes = (scene, *(other for other in further if other is not None))
             records = records_of_run(from_run, at.at("from_run"), scenes, actions, laboratory, report)
     elif pours is not None:
+        if pours.simulations is not None and pours.design != "active":
+            report.add(at.at("simulations"), "belongs to 'design: active'; remove it, or add that", key=True)
         count = pours.count or 0
         if (
             not count
@@ -106,6 +111,7 @@ def resolve_calibration(
         train = count - holdout if records is None else records.training_pours
         complaints = PlacedComplaints(place, report, frozenset(CalibrationSection.model_fields))
         settings = section.settings.settled(tuple(searched), train, complaints)
+    active = pours is not None and pours.design == "active" and count > 0
     others = tuple(other for other in further if other is not None)
     if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:
         return None
@@ -124,6 +130,8 @@ def resolve_calibration(
         random_baseline=section.random_baseline,
         parameter_prior=known,
         further=others,
+        design="stratified" if pours is None else pours.design,
+        design_simulations=(pours.simulations or DESIGN_SIMULATIONS) if pours is not None and active else 0,
     )
 
 

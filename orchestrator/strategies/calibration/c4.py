@@ -130,6 +130,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         self._measured_at: tuple[float, ...] = ()
         self._expected_at: dict[Simulate, float] = {}
         self._posterior: Posterior | None = None
+        self._before = Data()
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -145,13 +146,16 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         """c_r(a), and whether it is defined, along the prior's sequence of actions."""
         contexts = self._contexts
         sequence = contexts.sequence(self._plan, 2 * self._settings.budget, self._seeds.next())
+        scenes = {scene.name: scene for scene in self._plan.scenes}
+        known = tuple(contexts.place(scenes[one.scene], one.action) for one in self._plan.known)
+        everywhere = (*sequence, *known)
         spillage, poured = Data(), Data()
         for pour in self._train:
             point = contexts.point(pour)
             poured = poured.added(point, pour.poured)
             if pour.spillage is not None:
                 spillage = spillage.added(point, pour.spillage)
-        problem = SuggestProblem(contexts.space, spillage, count=0, predict_at=sequence)
+        problem = SuggestProblem(contexts.space, spillage, count=0, predict_at=everywhere)
 
         def with_poured(regression: Suggestion, likely: Suggestion | None) -> None:
             keep = [
@@ -168,6 +172,10 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             order = [keep[i % len(keep)] for i in range(self._settings.budget)]
             self._actions = tuple(sequence[i] for i in order)
             self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
+            expected = regression.predictions[len(sequence) :]
+            for one, place, measured in zip(self._plan.known, known, expected, strict=True):
+                theta = tuple(map(float, self._plan.parameters.encode(one.theta)))
+                self._before = self._before.added((*theta, *place), min(max(measured, 0.0), 1.0) - one.spillage)
             self.decisions.append(
                 Decision(f"c_r(a) regressed from {len(self._usable)} pours", dict(regression.hyperparameters or {}))
             )
@@ -247,6 +255,8 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
     def _problem(self, *, everything: bool = False, acquisition: str = "lcb", resolution: int = 0) -> SuggestProblem:
         data = self._trials.data(everything=everything)
+        if self._knows_actions:
+            data = Data(self._before.points + data.points, self._before.costs + data.costs)
         return SuggestProblem(
             self._plan.parameters,
             data,

@@ -42,8 +42,15 @@ class Contexts:
         Raises:
             ValueError: a searched dimension is switched off in it.
         """
-        values = {name: _number(pour.action, name) for name in self._actions.names}
-        return self.at(tuple(map(float, self._actions.encode(values))), self._names.get(pour.scene, 0))
+        return self.at(self._encoded(pour.action), self._names.get(pour.scene, 0))
+
+    def place(self, scene: Scene, action: Action) -> Point:
+        """Where an action in one of the scenes lies; raises as `point`."""
+        return self.at(self._encoded(action), self._names[scene.name])
+
+    def _encoded(self, action: Action) -> Point:
+        values = {name: _number(action, name) for name in self._actions.names}
+        return tuple(map(float, self._actions.encode(values)))
 
     def at(self, action: Point, scene: int) -> Point:
         """An action of the unit cube in the scene with that number."""

@@ -152,6 +152,22 @@ class GivenUpPoint(DesignPoint):
     """Why."""
 
 
+class SimulatedPoint(Part):
+    """A simulation that an active design made in a scene of the calibration, which C4 learns from as well."""
+
+    theta: dict[str, float]
+    """Searched parameters."""
+
+    scene: str
+    """Where."""
+
+    action_si: dict[str, float]
+    """Searched dimensions of the action."""
+
+    spillage: float
+    """c_s."""
+
+
 class DesignPoured(Learnt):
     """The pours that calibration learns from."""
 
@@ -159,6 +175,9 @@ class DesignPoured(Learnt):
 
     pours: tuple[PouredPoint | GivenUpPoint, ...]
     """In the order made."""
+
+    simulated: tuple[SimulatedPoint, ...] = ()
+    """What an active design simulated in the calibration's scenes."""
 
     @property
     def measured(self) -> tuple[PouredPoint, ...]:
