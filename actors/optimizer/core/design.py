@@ -36,13 +36,13 @@ def expected_reductions(
 
     Given θ, weighed less simulated spillage at a context is Gaussian: e ~ N(0, S + σ_δ² M) as in the posterior, and the
     pours made so far say what it is near them: its mean and variance v(c) there are conditional on them. Over equally
-    likely θ what is expected at c, so corrected, and what is simulated at t have the covariance C(c, t). To second order
-    in these moments weighing c takes from the variance at t, whatever comes of it,
+    likely θ what is expected at c, so corrected, and what is simulated at t have the covariance C(c, t). To second
+    order in these moments weighing c takes from the variance at t, whatever comes of it,
 
         C(c, t)² / (C(c, c) + v(c) + n²).
 
     So a pour counts for little where all θ agree, where one was made already, where the surrogate is vague, or where
-    what it tells concerns no target. At targets the surrogate's own doubt is left out: they can be simulated.
+    what it tells concerns no target. The surrogate's own doubt at targets is left out: they can be simulated.
 
     Args:
         process: of signed differences (to nothing: minus the simulated spillage) over (θ, context).
