@@ -172,7 +172,7 @@ def _table(vessel: Vessel) -> _Table:
 
 
 def _surfaces(heights: Floats, each: float, volumes: Floats) -> Floats:
-    """Heights below which points make up some volumes, to a `BINS`th of their extent: counting costs a tenth of sorting.
+    """Heights below which points make up some volumes, to a `BINS`th of their extent: a tenth of the price of sorting.
 
     Args:
         heights: of points [m].

@@ -229,7 +229,7 @@ class _Pool(Generic[T]):
 
 
 def _without_places() -> None:
-    """Keep Taichi from drawing, for each of 20,000 nodes of the kernels' source, the line and carets of an error message.
+    """Keep Taichi from drawing the line and carets of an error message for each of the thousands of nodes of a kernel.
 
     Nobody reads them while kernels compile, and they are half of the time that even known kernels take to be looked up
     in the cache. `DECANT_KERNEL_PLACES=1` leaves them in, for who changes a kernel.

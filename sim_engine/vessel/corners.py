@@ -28,7 +28,7 @@ def half_space(q: Floats) -> Floats:
 
 
 def _convolved(values: Floats, kernel: Floats) -> Floats:
-    """Where the kernel lies inside the values as a whole; scipy.signal would do so too, and takes half a second to load.
+    """Sums over the kernel where all of it lies inside the values; scipy.signal, which has that, takes long to load.
 
     Args:
         values: (a, b, c).
