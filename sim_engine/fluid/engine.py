@@ -237,7 +237,7 @@ def _without_places() -> None:
     from taichi.lang.ast import ast_transformer_utils
 
     context = getattr(ast_transformer_utils, "ASTTransformerContext", None)
-    if not os.environ.get("DECANT_KERNEL_PLACES") and hasattr(context, "get_pos_info"):
+    if context is not None and hasattr(context, "get_pos_info") and not os.environ.get("DECANT_KERNEL_PLACES"):
         context.get_pos_info = _no_place
 
 
