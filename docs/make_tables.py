@@ -159,10 +159,12 @@ def parameters() -> str:
     default = SimulationParameters().model_dump()
     rows = []
     for name, info in SimulationParameters.info().items():
-        unit = "" if info.unit == "1" else f" {info.unit}"
-        rows.append(
-            (f"`{name}`", f"{info.lower:g} … {info.upper:g}{unit}", f"{default[name]:g}{unit}", _one_line(info.meaning))
+        unit = "" if info.shown == "1" else f" {info.shown}"
+        lower, upper, usual = (
+            f"{round(value / info.factor, 6):g}" for value in (info.lower, info.upper, default[name])
         )
+        beforehand = f" Beforehand ± {info.tolerance / info.factor:.2g}{unit}." if info.nuisance else ""
+        rows.append((f"`{name}`", f"{lower} … {upper}{unit}", f"{usual}{unit}", _one_line(info.meaning) + beforehand))
     return _table(("name", "bounds", "default", "meaning"), rows)
 
 
@@ -171,6 +173,8 @@ def effects() -> str:
     found = {(e.parameter, e.pour): e for e in sensitivity.effects(_measured("sensitivity"))}
     rows = []
     for name, info in SimulationParameters.info().items():
+        if info.nuisance:
+            continue
         cells = []
         for pour in sensitivity.POURS:
             e = found.get((name, pour))
