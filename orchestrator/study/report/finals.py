@@ -89,8 +89,8 @@ def final_rows(study: StudyPlan, found: Gathered) -> tuple[list[str], list[list[
 
 
 def final_pairs(arms: Sequence[str]) -> list[tuple[str, str]]:
-    """Which strategies' recommended actions are compared: D3 with D2, the paper's form and the longest D1; that form with
-    D2; those of packages with D2."""
+    """Which strategies' recommended actions are compared: D3 with D2, the paper's form and the longest D1; the paper's
+    form with D2; those of packages with D2."""
     longest = max((arm for arm in arms if arm.startswith("D1-")), key=lambda arm: int(arm[3:]), default="")
     pairs = [
         ("D3", "D2"),
