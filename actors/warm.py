@@ -8,9 +8,9 @@ from collections.abc import Callable
 from actors.laboratory import ClosablePool
 from actors.protocols import LaboratoryError
 from actors.simulation.in_process import InProcessSimulatorPool
+from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
 from actors.simulation.shared import FairPool, Share
-from actors.simulation.worker import Simulator, pour_simulator
 from actors.spec import LaboratorySpec
 
 

@@ -87,6 +87,11 @@ class Share:
         """Of the whole pool: where nobody else wants it, all of it."""
         return self._fair.pool.size
 
+    @property
+    def separate(self) -> bool:
+        """As the pool's are."""
+        return self._fair.pool.separate
+
     async def simulate(self, task: PourTask) -> SimulatedPour:
         """See `SimulatorPool.simulate`."""
         return await self._fair.simulate(task, self)

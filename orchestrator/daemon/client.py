@@ -13,8 +13,9 @@ from typing import Any
 import httpx
 
 from orchestrator.daemon.auth import Role, token_of
-from orchestrator.daemon.settings import PORT, default_state
+from orchestrator.daemon.settings import PORT
 from orchestrator.errors import RunError
+from orchestrator.state_directory import state_directory
 
 V1 = "/api/v1"
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
@@ -50,7 +51,7 @@ class Client:
     """
 
     def __init__(self, url: str | None = None, state: Path | None = None, token: str | None = None) -> None:
-        state = state or default_state()
+        state = state or state_directory()
         self.url = (url or os.environ.get("DECANT_URL") or _told(state) or f"http://127.0.0.1:{PORT}").rstrip("/")
         token = token or os.environ.get("DECANT_TOKEN") or _token(state)
         self._http = httpx.Client(

@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Place:
+class Common:
     """What all campaigns of a daemon share."""
 
     settings: Settings
@@ -72,13 +72,13 @@ class Running:
     """One part of a campaign's run: from now until it rests.
 
     Args:
-        place: what it shares with others.
+        common: what it shares with others.
         item: which campaign.
         rig: that it has leased.
     """
 
-    def __init__(self, place: Place, item: Item, rig: Rig) -> None:
-        self._place, self.item, self._rig = place, item, rig
+    def __init__(self, common: Common, item: Item, rig: Rig) -> None:
+        self._common, self.item, self._rig = common, item, rig
         self.watching: Watching | None = None
         self._laboratory: Laboratory | None = None
         self._task: asyncio.Task[CampaignResult] | None = None
@@ -95,15 +95,15 @@ class Running:
             asyncio.CancelledError: it was paused, stopped, aborted.
             RunError, LaboratoryError, ConfigError, OSError: it can't go on.
         """
-        work = await asyncio.to_thread(job_of, self._place.settings, self.item, self._rig)
+        work = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
         directory = await asyncio.to_thread(self._directory, work.plan)
-        await self._place.warm.open()
+        await self._common.warm.open()
         self.watching = Watching(work.plan)
         monitor = self._recording(work.plan, directory)
-        watchers: list[Watcher] = [self._place.feed.watcher(self.item.id), self.watching, self._note_state]
+        watchers: list[Watcher] = [self._common.feed.watcher(self.item.id), self.watching, self._note_state]
         if monitor is not None:
             watchers.append(monitor)
-        for hook in self._place.hooks:
+        for hook in self._common.hooks:
             if (watcher := hook(self.item.id, work.plan, directory)) is not None:
                 watchers.append(watcher)
         try:
@@ -117,12 +117,12 @@ class Running:
     async def _run(self, work: Job, directory: Path, watchers: list[Watcher], checksum: str) -> CampaignResult:
         spec = work.plan.laboratory
         spec = replace(
-            spec, in_process=spec.in_process or self._place.settings.in_process, accepted_checksum=checksum, ray=None
+            spec, in_process=spec.in_process or self._common.settings.in_process, accepted_checksum=checksum, ray=None
         )
-        asking, key, rig = self._place.asking, self.item.id, self._rig.name
+        asking, key, rig = self._common.asking, self.item.id, self._rig.name
         operator = RemoteOperator(asking, key, rig, self._announce) if work.pours and needs_person(spec) else None
         self._laboratory = open_laboratory(
-            spec, need_bench=work.pours, operator=operator, kept=self._place.warm.share()
+            spec, need_bench=work.pours, operator=operator, kept=self._common.warm.share()
         )
         self._task = asyncio.create_task(
             run_campaign(
@@ -131,7 +131,7 @@ class Running:
                 directory,
                 resume=(directory / JOURNAL_NAME).is_file(),
                 watchers=watchers,
-                ask_operator=RunQuestions(asking, self._place.store, key, rig, lambda: self._look(work.plan)),
+                ask_operator=RunQuestions(asking, self._common.store, key, rig, lambda: self._look(work.plan)),
                 stages=work.stages,
             ),
             name=f"campaign {key}",
@@ -142,13 +142,13 @@ class Running:
 
     def _directory(self, plan: CampaignPlan) -> Path:
         if self.item.run is not None:
-            return self._place.settings.runs / self.item.run
+            return self._common.settings.runs / self.item.run
         return create_run(plan)
 
     def note_run(self, directory: Path) -> None:
         """Write down which folder the run has, before anything happens in it."""
         self.item = replace(self.item, run=directory.name)
-        self._place.store.change(self.item.id, run=directory.name)
+        self._common.store.change(self.item.id, run=directory.name)
 
     def _recording(self, plan: CampaignPlan, directory: Path) -> RerunMonitor | None:
         if self.item.run != directory.name:
@@ -161,10 +161,10 @@ class Running:
         from orchestrator.events import CampaignStateChanged
 
         if isinstance(event, CampaignStateChanged):
-            self._place.store.change(self.item.id, state=event.after, reason=event.reason)
+            self._common.store.change(self.item.id, state=event.after, reason=event.reason)
 
     def _announce(self, text: str, seconds: float) -> None:
-        self._place.feed.tell("Announced", {"rig": self._rig.name, "text": text, "seconds": seconds}, self.item.id)
+        self._common.feed.tell("Announced", {"rig": self._rig.name, "text": text, "seconds": seconds}, self.item.id)
 
     def _look(self, plan: CampaignPlan) -> dict[str, str]:
         from orchestrator.daemon.looking import found_at
@@ -212,7 +212,7 @@ class Running:
             except (LaboratoryError, TimeoutError) as error:
                 text = f"the arm of {self._rig.name} did not confirm that it was stopped ({error}): use its own button"
                 _log.error(text)
-                self._place.feed.tell("LogLine", {"level": "error", "text": text, "stage": ""}, self.item.id)
+                self._common.feed.tell("LogLine", {"level": "error", "text": text, "stage": ""}, self.item.id)
 
     async def give_up(self) -> None:
         """Told to pause already: now give up the pour as well. It is UNKNOWN if it had begun."""
@@ -231,9 +231,9 @@ class Running:
         """After a stop: what came of it so far is published as of a run that was finished."""
 
         def work() -> None:
-            made = job_of(self._place.settings, self.item, self._rig)
+            made = job_of(self._common.settings, self.item, self._rig)
             assert self.item.run is not None
-            directory = self._place.settings.runs / self.item.run
+            directory = self._common.settings.runs / self.item.run
             if (directory / JOURNAL_NAME).is_file():
                 with JournalReader(directory / JOURNAL_NAME) as journal:
                     result = read_result(journal, directory)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -17,6 +16,7 @@ from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Count, FilePath, Name, PositiveCount, Section, Switch, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
+from orchestrator.state_directory import state_directory
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 PORT = 8377
@@ -170,15 +170,6 @@ class Settings:
         return next(rig for rig in (*self.rigs, Rig(DESK)) if rig.name == name)
 
 
-def default_state() -> Path:
-    """The state directory where nobody names one: $DECANT_STATE, systemd's, or one in the home."""
-    for name in ("DECANT_STATE", "STATE_DIRECTORY"):
-        if found := os.environ.get(name):
-            return Path(found.split(":")[0])
-    base = os.environ.get("XDG_STATE_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "state") / "decant"
-
-
 def load_settings(path: Path | None, **given: Any) -> Settings:
     """Settings of a file, and of the command line, which has the last word.
 
@@ -191,7 +182,7 @@ def load_settings(path: Path | None, **given: Any) -> Settings:
     """
     given = {name: value for name, value in given.items() if value is not None}
     if path is None:
-        return replace(Settings(resolved(given.pop("state", default_state()))), **given)
+        return replace(Settings(resolved(given.pop("state", state_directory()))), **given)
     report = Report()
     place = Place(Document.read(resolved(path)))
     file = validate(DaemonFile, place, report)
@@ -250,7 +241,7 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> Settings:
             "'plain: true' where something in front of it encrypts",
         )
     return Settings(
-        state=path(file.state, place) or default_state(),
+        state=path(file.state, place) or state_directory(),
         host=file.listen.host,
         port=file.listen.port,
         certificate=files[0],

@@ -23,7 +23,7 @@ from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.daemon.feed import Feed
 from orchestrator.daemon.people import Asking
 from orchestrator.daemon.retention import prune_recordings
-from orchestrator.daemon.running import Place, Running
+from orchestrator.daemon.running import Common, Running
 from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
 from orchestrator.errors import RunError
@@ -63,8 +63,8 @@ class Supervisor:
         self.feed = Feed(settings.state / "events.sqlite", settings.events, self._feed_broken)
         self.asking = Asking(self.store, self.feed.tell)
         self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
-        self._place = Place(settings, self.store, self.feed, self.asking, self.warm, tuple(hooks))
-        self.lanes = {rig.name: Lane(self, rig, self._place) for rig in (*settings.rigs, Rig(DESK))}
+        self._common = Common(settings, self.store, self.feed, self.asking, self.warm, tuple(hooks))
+        self.lanes = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
         self.problems: dict[str, str] = {}
         self.stopping = False
         self.ended = asyncio.Event()
@@ -319,11 +319,11 @@ class Lane:
     Args:
         daemon: whose queue it serves.
         rig: that campaigns lease here.
-        place: what all of them share.
+        common: what all of them share.
     """
 
-    def __init__(self, daemon: Supervisor, rig: Rig, place: Place) -> None:
-        self._daemon, self.rig, self._place = daemon, rig, place
+    def __init__(self, daemon: Supervisor, rig: Rig, common: Common) -> None:
+        self._daemon, self.rig, self._common = daemon, rig, common
         self.running: Running | None = None
         self.wake = asyncio.Event()
         self.latched = daemon.emergency is not None
@@ -367,7 +367,7 @@ class Lane:
     def _next(self) -> Item | None:
         if self.latched or self._daemon.stopping:
             return None
-        store = self._place.store
+        store = self._common.store
         mine = [one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.wish == Wish.RUN]
         begun = sorted(
             (one for one in mine if one.run is not None and one.state not in ENDED), key=lambda one: one.begun or 0.0
@@ -379,7 +379,7 @@ class Lane:
         return found if found is not None and self._has_room() else None
 
     def _has_room(self) -> bool:
-        settings = self._place.settings
+        settings = self._common.settings
         free = free_space(settings.state)
         text = (
             f"{free / MB:.0f} MB are free on the disk of {settings.state}, and no campaign is begun below "
@@ -389,8 +389,8 @@ class Lane:
         return free >= settings.keep_free
 
     async def _run(self, item: Item) -> None:
-        store, feed = self._place.store, self._place.feed
-        self.running = running = Running(self._place, item, self.rig)
+        store, feed = self._common.store, self._common.feed
+        self.running = running = Running(self._common, item, self.rig)
         store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), armed=False)
         feed.tell("CampaignLeased", {"rig": self.rig.name}, item.id)
         state, reason, wish = "failed", "", Wish.PAUSE
@@ -426,18 +426,18 @@ class Lane:
 
     def _kept_wish(self, item: Item) -> Wish:
         """Somebody has to answer before it goes on: it goes on to ask, unless people want something else of it."""
-        found = self._place.store.item(item.id)
+        found = self._common.store.item(item.id)
         return Wish.RUN if found is None else Wish(found.wish)
 
     def _ended_by_people(self, item: Item) -> tuple[str, str, Wish]:
-        found = self._place.store.item(item.id)
+        found = self._common.store.item(item.id)
         wish = Wish.PAUSE if found is None else Wish(found.wish)
         state = "unknown" if found is not None and found.state == "unknown" else "paused"
         reason = found.reason if found is not None else ""
         return state, reason, wish
 
     async def _leave(self, running: Running, state: str, reason: str, wish: Wish) -> None:
-        store, key = self._place.store, running.item.id
+        store, key = self._common.store, running.item.id
         if wish is Wish.STOP and state != "finished":
             state = STOPPED
             try:
@@ -447,7 +447,7 @@ class Lane:
                 _log.exception("campaign %s: not published", key)
         ended = time.time() if state in ENDED else None
         store.change(key, state=state, reason=reason, wish=str(wish), ended=ended)
-        self._place.feed.tell("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
+        self._common.feed.tell("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
         with contextlib.suppress(OSError):
             busy = {one.running.item.run for one in self._daemon.lanes.values() if one.running is not None}
-            await asyncio.to_thread(prune_recordings, self._place.settings, {name for name in busy if name})
+            await asyncio.to_thread(prune_recordings, self._common.settings, {name for name in busy if name})
