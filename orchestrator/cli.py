@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs
+from orchestrator.commands import bench_verbs, report
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -327,6 +327,8 @@ app.command(
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
     )
 )(bench_verbs.pour)
+
+app.command(epilog=report.EXAMPLES)(report.report)
 
 
 @app.command(epilog=examples("decant plugins", "decant plugins --json"))
