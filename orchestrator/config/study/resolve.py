@@ -129,7 +129,8 @@ def calibration_arms(
         settled = settings.settled(base.parameters.names, train, PlacedComplaints(at, report, frozenset()))
         if settled is None:
             continue
-        plan = replace(base, settings=settled, prior=base.prior if kind.has_prior else ())
+        prior, known = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
+        plan = replace(base, settings=settled, prior=prior, parameter_prior=known)
         where = levels if written == "C4" else (compared,)
         arms.append(CalibrationArm(_label(written), plan, arm.repetitions or 1, where))
     return tuple(arms)

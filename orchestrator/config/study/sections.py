@@ -248,6 +248,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     plan = replace(
         calibration,
         parameters=searched,
+        parameter_prior=tuple(prior for prior in calibration.parameter_prior if prior.name in searched.names),
         pour_count=0,
         holdout=0,
         random_baseline=0,
@@ -311,6 +312,10 @@ def _with_parameters(base: CampaignPlan, changes: ParametersBase, place: Place, 
     calibration = replace(
         base.calibration,
         parameters=Space(tuple(axes.values())),
+        parameter_prior=(
+            *(prior for prior in base.calibration.parameter_prior if prior.name not in (*fixed, *searched)),
+            *changes.priors(),
+        ),
         fixed_parameters={name: value for name, value in known.items() if name not in axes},
     )
     return replace(base, calibration=calibration)
