@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.events import Event
-from orchestrator.monitor.worker import Worker
+from orchestrator.monitor.worker import QueueThread
 from orchestrator.monitor.writer import Closing, Opening
 from orchestrator.plan import CampaignPlan
 
@@ -53,7 +53,7 @@ class RerunMonitor:
         self.path.open("wb").close()
         self._process = _start_writer()
         self._report: dict[str, Any] = {"failed": 0}
-        self._worker: Worker[Event | Opening] = Worker(
+        self._worker: QueueThread[Event | Opening] = QueueThread(
             self._send, self._finish, capacity=capacity, name=f"recording {self.path.name}"
         )
         self._worker.put(Opening(self.path, plan, url))
