@@ -49,6 +49,7 @@ ARMS: dict[str, Callable[[int, int], Any]] = {
     "alarm": lambda pours, prior: D3Settings(
         pours=pours, prior_simulations=prior, model="scaled", trust=TrustSettings()
     ),
+    "adaptive": lambda pours, prior: D3Settings(pours=pours, prior_simulations=prior),
 }
 NAMES = {
     "D2": "D2",
