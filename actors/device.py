@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
-from actors.cluster.place import Place
+from actors.cluster.nodes import PinnedNode
 from actors.protocols import BenchLostError, LaboratoryError
 
 
@@ -95,12 +95,12 @@ class RayDevice:
         name: what people call it.
         cls: the object's class, importable by workers.
         args: arguments of its constructor.
-        place: the node of a cluster that it must run on.
+        node: the node of a cluster that it must run on.
     """
 
-    def __init__(self, name: str, cls: type[Any], *args: Any, place: Place | None = None) -> None:
+    def __init__(self, name: str, cls: type[Any], *args: Any, node: PinnedNode | None = None) -> None:
         self.name = name
-        self._class, self._args, self._place = cls, args, place
+        self._class, self._args, self._node = cls, args, node
         self._actor: Any = None
         self._lost = False
         self._start()
@@ -108,7 +108,7 @@ class RayDevice:
     def _start(self) -> None:
         import ray
 
-        placement = {} if self._place is None else self._place.options
+        placement = {} if self._node is None else self._node.options
         actor_class = ray.remote(
             num_cpus=0, max_restarts=0, max_task_retries=0, concurrency_groups={"work": 1, "control": 2}, **placement
         )(self._class)
@@ -145,8 +145,8 @@ class RayDevice:
             raise LaboratoryError(f"{self.name}: '{method}' failed: {error.cause!r}") from error
 
     async def _check_machine(self, method: str) -> None:
-        if self._place is not None and await self._place.is_gone():
-            raise MachineLostError(f"{self.name}: its machine {self._place.node.host} was lost during '{method}'")
+        if self._node is not None and await self._node.is_gone():
+            raise MachineLostError(f"{self.name}: its machine {self._node.node.host} was lost during '{method}'")
 
     async def revive(self) -> bool:
         """See `Device.revive`."""

@@ -20,13 +20,13 @@ from actors.protocols import (
     SimulatorPool,
 )
 from actors.simulation.in_process import InProcessSimulatorPool
+from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
-from actors.simulation.worker import Simulator, pour_simulator
 from actors.spec import LaboratorySpec
 from sim_engine.extras import installed
 
 if TYPE_CHECKING:
-    from actors.cluster.site import Site
+    from actors.cluster.joined import JoinedCluster
 
 
 def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
@@ -229,7 +229,7 @@ class RayLaboratory(_OpenLaboratory):
         super().__init__()
         self._spec, self._make, self._operator = spec, make, operator
         self._needs_bench = need_bench and spec.pours
-        self._site: Site | None = None
+        self._cluster: JoinedCluster | None = None
         self._liquid: RaySimulatorPool | None = None
 
     async def __aenter__(self) -> RayLaboratory:
@@ -247,10 +247,10 @@ class RayLaboratory(_OpenLaboratory):
         keep_signals()
         try:
             if self._spec.ray is not None:
-                from actors.cluster.site import Site
+                from actors.cluster.joined import JoinedCluster
 
-                self._site = Site(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
-                await self._site.open(need_bench=self._needs_bench)
+                self._cluster = JoinedCluster(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
+                await self._cluster.open(need_bench=self._needs_bench)
             await self._open_all()
         except BaseException:
             await self.__aexit__()
@@ -260,19 +260,19 @@ class RayLaboratory(_OpenLaboratory):
     async def _open_all(self) -> None:
         from actors.device import RayDevice
 
-        here = None if self._site is None else self._site.here
+        here = None if self._cluster is None else self._cluster.here
         self._pool = self._open_pool()
-        proposer = RayDevice("optimiser", Proposer, place=here)
+        proposer = RayDevice("optimiser", Proposer, node=here)
         self._devices.append(proposer)
         self._optimizer = DeviceOptimizer(proposer)
         if not self._needs_bench:
             return
-        place = None if self._site is None else self._site.bench
+        node = None if self._cluster is None else self._cluster.bench
         if self._spec.bench is not None:
             self._apart = self._liquid = self._open_liquid()
 
         def device(name: str, cls: type[Any], *args: Any) -> Device:
-            return RayDevice(name, cls, *args, place=place)
+            return RayDevice(name, cls, *args, node=node)
 
         self._opened = await open_bench(self._spec, device, self._liquid, self._operator, self._tell)
         self._devices += self._opened.devices
@@ -285,24 +285,24 @@ class RayLaboratory(_OpenLaboratory):
         def tell(text: str) -> None:
             self._tell(Notice("warning", text))
 
-        if self._site is None:
+        if self._cluster is None:
             return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=tell)
         pool = RaySimulatorPool(
-            self._spec.simulators or self._site.cpus,
+            self._spec.simulators or self._cluster.cpus,
             make=self._make,
             placement={"scheduling_strategy": "SPREAD"},
             expected=versions(),
             tell=tell,
         )
         if not self._spec.simulators:
-            self._site.grown = pool.grow
+            self._cluster.grown = pool.grow
         return pool
 
     def _open_liquid(self) -> RaySimulatorPool:
         """The hidden liquid's simulator, beside the arm. No core is counted for it: the pool's size is the campaign's
         choice, and a pour must never wait for it."""
-        place = None if self._site is None else self._site.bench
-        return RaySimulatorPool(1, make=self._make, cpus=0.0, placement=None if place is None else place.options)
+        node = None if self._cluster is None else self._cluster.bench
+        return RaySimulatorPool(1, make=self._make, cpus=0.0, placement=None if node is None else node.options)
 
     def _lose_bench(self, reason: str) -> None:
         """Its machine is gone: calls to arm and balance find out by themselves, the liquid's simulator would wait."""
@@ -318,8 +318,8 @@ class RayLaboratory(_OpenLaboratory):
 
     async def __aexit__(self, *exc: object) -> None:
         await self._close_all()
-        if self._site is not None:
-            await self._site.close()
+        if self._cluster is not None:
+            await self._cluster.close()
         await self._stop_ray()
 
     async def _stop_ray(self) -> None:

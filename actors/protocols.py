@@ -58,6 +58,11 @@ class SimulatorPool(Protocol):
         """Number of simulators."""
         ...
 
+    @property
+    def separate(self) -> bool:
+        """Whether simulators disturb nobody: they run in processes of their own, and what is cancelled ends at once."""
+        ...
+
     async def simulate(self, task: PourTask) -> SimulatedPour:
         """Run one pour on the next free simulator.
 

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from hybrid_models import SCATTER, WORLDS
 from machine import describe, pin, say, show
-from optimiser_problems import BY_NAME, Floats, Problem, World
+from optimiser_problems import BY_NAME, Floats, Instance, Problem
 from skipping_clock import SkippingLoop, run
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
@@ -70,7 +70,7 @@ SCENE = Scene(
     fixed={"height": 0.03},
 )
 AFTER = (1, 3, 5, 10, 15)
-SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
+SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
     **WORLDS,
     "shifted by 0.04": lambda world, u, sign: world.true(u + 0.04 * sign),
 }
@@ -97,11 +97,12 @@ class Bench:
     mode = "virtual"
 
     def __init__(self, problem: Problem, world: str, seed: int, space: Space, asked: argparse.Namespace) -> None:
-        self._world, self._space, self._asked = World(problem, seed), space, asked
+        self._world, self._space, self._asked = Instance(problem, seed), space, asked
         self._simulated = SIMULATORS[world]
         self._sign = np.random.default_rng([seed, 999]).choice([-1.0, 1.0], problem.dimension)
         self._free = asyncio.Semaphore(asked.slots)
         self.size = asked.slots
+        self.separate = False
         self.simulators = self.bench = self.optimizer = self
         self.occupancy = Occupancy(asked.slots)
         self.poured: list[float] = []

@@ -55,6 +55,7 @@ class Fluid(Bench):
         self._asked, self._simulator = asked, simulator
         self._free = asyncio.Semaphore(asked.slots)
         self.size = asked.slots
+        self.separate = False
         self.simulators = self.bench = self.optimizer = self
         self.occupancy = Occupancy(asked.slots)
         self.poured: list[float] = []
@@ -113,6 +114,7 @@ class _Apart:
     """The bench's simulator."""
 
     size = 1
+    separate = False
 
     def __init__(self, fluid: Fluid) -> None:
         self._fluid = fluid

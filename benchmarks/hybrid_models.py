@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from machine import describe, pin, say, show
-from optimiser_problems import BY_NAME, Floats, World
+from optimiser_problems import BY_NAME, Floats, Instance
 
 from actors.optimizer.core.problem import Data, Point, SuggestProblem
 from actors.optimizer.core.propose import propose
@@ -28,7 +28,7 @@ SPACE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 SCATTER = 0.02
 """Scatter of a simulation."""
 
-WORLDS: dict[str, Callable[[World, Floats, Floats], float]] = {
+WORLDS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
     "right": lambda world, u, _: world.true(u),
     "off by 0.3": lambda world, u, _: world.true(u) + 0.3,
     "half": lambda world, u, _: 0.5 * world.true(u),
@@ -39,7 +39,7 @@ WORLDS: dict[str, Callable[[World, Floats, Floats], float]] = {
 """Simulated cost at a point (2,), given a direction (2,) of −1 and 1."""
 
 
-def simulations(name: str, world: World, count: int) -> Data:
+def simulations(name: str, world: Instance, count: int) -> Data:
     """The first stage: five Sobol points, then as the optimiser chooses."""
     rng = np.random.default_rng([world.seed, 999])
     sign = rng.choice([-1.0, 1.0], 2)
@@ -57,7 +57,7 @@ def simulations(name: str, world: World, count: int) -> Data:
     return data
 
 
-def campaign(model: str, world: World, simulated: Data, pours: int) -> dict[str, float]:
+def campaign(model: str, world: Instance, simulated: Data, pours: int) -> dict[str, float]:
     """The pours, and what they come to without noise."""
     informed = model != "constant"
     question = SuggestProblem(SPACE, Data(), mean=model, simulated=simulated if informed else Data())  # type: ignore[arg-type]
@@ -91,7 +91,7 @@ def main() -> None:
     problem = replace(BY_NAME["spill2"], budget=max(asked.pours, BY_NAME["spill2"].budget))
     rows = []
     for name in asked.worlds:
-        worlds = [World(problem, seed) for seed in range(asked.seeds)]
+        worlds = [Instance(problem, seed) for seed in range(asked.seeds)]
         known = [simulations(name, world, asked.simulations) for world in worlds]
         for model in asked.models:
             runs = [campaign(model, w, s, asked.pours) for w, s in zip(worlds, known, strict=True)]

@@ -95,7 +95,7 @@ _P = 1e-4 * np.array(
 )
 
 
-class World:
+class Instance:
     """One instance of a problem: of a seed come the valley's place and shape, the first points and the noise.
 
     Spillage-like costs are 0 in an ellipsoid, rise steeply around it and level off at 1: 1 − exp(−(8 w (r − 1))^1.5),

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from optimiser_problems import BY_NAME, Floats, World
+from optimiser_problems import BY_NAME, Floats, Instance
 
 Points = list[Floats]
 Costs = list[float]
@@ -28,7 +28,7 @@ def luckiest(points: Points, costs: Costs) -> Floats:
     return points[int(np.argmin(costs))]
 
 
-def scikit_optimize(world: World) -> tuple[Ask, Report]:
+def scikit_optimize(world: Instance) -> tuple[Ask, Report]:
     """`Optimizer` with its defaults: GP, gp_hedge; integer and log axes as its own."""
     from skopt import Optimizer
     from skopt.space import Integer, Real
@@ -55,7 +55,7 @@ def scikit_optimize(world: World) -> tuple[Ask, Report]:
     return ask, luckiest
 
 
-def bayesian_optimization(world: World) -> tuple[Ask, Report]:
+def bayesian_optimization(world: Instance) -> tuple[Ask, Report]:
     """`BayesianOptimization` with its defaults: GP, UCB; integers as its own, log axes by their logarithm."""
     from bayes_opt import BayesianOptimization
 
@@ -90,7 +90,7 @@ def bayesian_optimization(world: World) -> tuple[Ask, Report]:
     return ask, luckiest
 
 
-def botorch(world: World, acquisition: str) -> tuple[Ask, Report]:
+def botorch(world: Instance, acquisition: str) -> tuple[Ask, Report]:
     """`SingleTaskGP` with standardised outcomes and its default priors; integer axes rounded by the problem."""
     import torch
     from botorch.acquisition import UpperConfidenceBound, qLogNoisyExpectedImprovement
@@ -128,7 +128,7 @@ def botorch(world: World, acquisition: str) -> tuple[Ask, Report]:
     return ask, report
 
 
-RIVALS: dict[str, Callable[[World], tuple[Ask, Report]]] = {
+RIVALS: dict[str, Callable[[Instance], tuple[Ask, Report]]] = {
     "scikit-optimize": scikit_optimize,
     "bayesian-optimization": bayesian_optimization,
     "BoTorch UCB": lambda world: botorch(world, "ucb"),
@@ -136,7 +136,7 @@ RIVALS: dict[str, Callable[[World], tuple[Ask, Report]]] = {
 }
 
 
-def play(world: World, ask: Ask, report: Report) -> dict[str, Any]:
+def play(world: Instance, ask: Ask, report: Report) -> dict[str, Any]:
     """One whole optimisation: the first points, then as proposed until the budget is spent."""
     points: Points = list(world.initial)
     costs: Costs = [world.observe(point, i) for i, point in enumerate(points)]
@@ -162,7 +162,7 @@ def main() -> None:
     name = sys.argv[1]
     for line in sys.stdin:
         job = json.loads(line)
-        world = World(BY_NAME[job["problem"]], job["seed"])
+        world = Instance(BY_NAME[job["problem"]], job["seed"])
         started = time.process_time()
         result = play(world, *RIVALS[name](world))
         print(json.dumps({**result, "total_s": time.process_time() - started}), flush=True)

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 from machine import describe, pin, say, show, single_threaded
-from optimiser_problems import BY_NAME, PROBLEMS, World
+from optimiser_problems import BY_NAME, PROBLEMS, Instance
 from optimiser_rivals import RIVALS, luckiest, play
 
 from actors.optimizer.core.problem import Data, MeanName, NoiseName, SuggestProblem
@@ -93,7 +93,7 @@ class Kept:
         beside.replace(self._path)
 
 
-def ours(name: str, world: World) -> dict[str, Any]:
+def ours(name: str, world: Instance) -> dict[str, Any]:
     """One run of Decant's optimiser as a campaign uses it, or of blind search."""
     axes = [
         Axis(f"x{i}", c.lower, c.upper, "log" if c.log else "linear", c.integer)
@@ -157,7 +157,7 @@ def run(optimisers: Sequence[str], problems: Sequence[str], seeds: int, seconds:
             continue
         started = time.process_time()
         for problem, seed in jobs:
-            kept.add(name, ours(name, World(BY_NAME[problem], seed)))
+            kept.add(name, ours(name, Instance(BY_NAME[problem], seed)))
             if time.process_time() - started > seconds:
                 break
 

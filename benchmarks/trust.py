@@ -20,7 +20,7 @@ import numpy as np
 from dyna import AXES, SCENE
 from hybrid_models import SCATTER, WORLDS
 from machine import describe, pin, say, show
-from optimiser_problems import BY_NAME, Floats, World
+from optimiser_problems import BY_NAME, Floats, Instance
 
 from actors.optimizer.core.propose import propose
 from orchestrator.plan import DeploymentPlan
@@ -35,7 +35,7 @@ from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.space import Space
 
 SPACE = Space(AXES[:2])
-SIMULATORS: dict[str, Callable[[World, Floats, Floats], float]] = {
+SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
     **WORLDS,
     "twice": lambda world, u, _: min(2.0 * world.true(u), 1.0),
     "promises everything": lambda world, u, _: 0.0,
@@ -46,7 +46,7 @@ ARMS: dict[str, TrustSettings | str] = {"D3": TrustSettings(), "D3, no alarm": "
 class Numbers:
     """Answers a strategy until it has finished."""
 
-    def __init__(self, world: World, simulator: str) -> None:
+    def __init__(self, world: Instance, simulator: str) -> None:
         self._world, self._simulator = world, SIMULATORS[simulator]
         self._sign = np.random.default_rng([world.seed, 999]).choice([-1.0, 1.0], SPACE.dimension)
         self.poured: list[float] = []
@@ -78,7 +78,7 @@ class Numbers:
 
 def campaign(arm: str, simulator: str, seed: int, asked: argparse.Namespace) -> dict[str, float]:
     """One campaign; losses without noise."""
-    world = World(BY_NAME[asked.problem], seed)
+    world = Instance(BY_NAME[asked.problem], seed)
     kind = RealOnly if arm == "D2" else Hybrid
     settings = D2Settings(pours=asked.pours) if arm == "D2" else D3Settings(
         pours=asked.pours, prior_simulations=asked.simulations, model=asked.model, trust=ARMS[arm]

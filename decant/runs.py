@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orchestrator.campaign import CampaignResult, read_result
-from orchestrator.codec import decode_outcome, decode_request
 from orchestrator.config.load import load_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import CampaignPlan
+from orchestrator.pour_rows import Answer, Row, answers, pour_row
 from orchestrator.publish import Published
 from orchestrator.publish import publish as write
 from orchestrator.report.results import deployments_of, predictions_of, theta_of
 from orchestrator.report.units import loss_of_pour
-from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated
+from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
 from orchestrator.results import Results
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.deployment.learnt import Recommended
@@ -28,8 +28,6 @@ from sim_engine.spread import Spread
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -126,45 +124,30 @@ class Run:
 
     # -- rows --------------------------------------------------------------------------------------------------------
 
-    def _finished(self) -> Iterator[tuple[str, int, Request, Outcome, float]]:
-        """Stage, id, request, outcome and seconds of everything that was answered, in that order."""
-        requests: dict[int, Request] = {}
-        kinds = (Kind.REQUESTED, Kind.FINISHED, Kind.POUR_FINISHED)
+    def _answers(self, kind: type[Request]) -> Iterator[Answer]:
         with JournalReader(self.directory / JOURNAL_NAME) as journal:
-            for entry in journal.entries(kinds=kinds):
-                key = entry.body["id"]
-                if entry.kind == Kind.REQUESTED:
-                    requests[key] = decode_request(entry.body["request"])
-                else:
-                    outcome = decode_outcome(entry.body["outcome"])
-                    yield entry.stage, key, requests[key], outcome, entry.body["seconds"]
+            yield from answers(journal, kind)
 
     def _pours(self) -> Iterator[Row]:
         names = _receivers(self.campaign)
-        for stage, key, request, outcome, seconds in self._finished():
-            if not isinstance(request, Pour):
-                continue
-            row: Row = {"stage": stage, "id": key, "receiver": names.get(request.scene, request.scene)}
-            row |= {"number": request.number, **displayed_action(request.action.values())}
-            row["predicted"] = None if request.predicted is None else request.predicted.mean
-            match outcome:
-                case Poured(weighed):
-                    row |= {"loaded_g": 1e3 * weighed.loaded, "spilled_g": 1e3 * weighed.spilled}
-                    row |= {"retained_g": 1e3 * weighed.retained, "spillage": normalised_spillage(weighed.fractions)}
-                    row["loss"] = loss_of_pour(self.campaign, request, weighed)
-                case Failed(kind, reason):
-                    row["failed"] = f"{kind}: {reason}"
-            yield {**row, "seconds": seconds}
+        for one in self._answers(Pour):
+            request, outcome = one.request, one.outcome
+            assert isinstance(request, Pour)
+            row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
+            row |= pour_row(request, outcome)
+            if isinstance(outcome, Poured):
+                row["loss"] = loss_of_pour(self.campaign, request, outcome.measurement)
+            yield {**row, "seconds": one.seconds}
 
     def _simulations(self) -> Iterator[Row]:
         names = _receivers(self.campaign)
-        for stage, key, request, outcome, _ in self._finished():
-            if not isinstance(request, Simulate):
-                continue
-            row: Row = {"stage": stage, "id": key, "receiver": names.get(request.scene, request.scene)}
+        for one in self._answers(Simulate):
+            request = one.request
+            assert isinstance(request, Simulate)
+            row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
             row |= {"purpose": request.purpose, "seed": request.seed, **displayed_action(request.action.values())}
             row |= {f"theta_{name}": value for name, value in request.parameters.model_dump().items()}
-            match outcome:
+            match one.outcome:
                 case Simulated(found):
                     fractions = found.fractions
                     row |= {"poured": fractions.poured, "spilled": fractions.spilled, "retained": fractions.retained}
@@ -206,13 +189,13 @@ class Run:
                 yield {**row, "predicted": pour.predicted, "predicted_deviation": pour.predicted_deviation}
 
     def _outflows(self) -> Iterator[Row]:
-        for stage, key, _, outcome, _ in self._finished():
-            if isinstance(outcome, Simulated):
-                found = outcome.outcome
+        for one in self._answers(Simulate):
+            if isinstance(one.outcome, Simulated):
+                found = one.outcome.outcome
                 for time, poured, spilled in zip(
                     found.curve_times, found.curve_poured, found.curve_spilled, strict=True
                 ):
-                    yield {"stage": stage, "id": key, "time_s": time, "poured": poured, "spilled": spilled}
+                    yield {"stage": one.stage, "id": one.id, "time_s": time, "poured": poured, "spilled": spilled}
 
 
 def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from orchestrator.fingerprint import fingerprint
 from orchestrator.journal import JOURNAL_NAME, Header, Journal, JournalError, JournalReader, Kind
 from orchestrator.lanes import Deadlines, LaneError, Lanes
 from orchestrator.plan import CampaignPlan
+from orchestrator.rehearsal import Rehearsal
 from orchestrator.replay import StageHistory, read_history, replayed_events
 from orchestrator.reserve import NoSpaceError
 from orchestrator.results import Results, decode_results
@@ -194,8 +196,11 @@ class _Run:
             self._tell_of_idle(laboratory.simulators.size)
             self._enter(State.RUNNING)
             results: dict[str, Learnt] = {}
-            for index, stage in enumerate(self._stages, start=1):
-                results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, lanes)
+            try:
+                for index, stage in enumerate(self._stages, start=1):
+                    results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, lanes)
+            finally:
+                await lanes.ahead.close()
             self._enter(State.FINISHED)
 
     async def _run_stage(
@@ -236,12 +241,34 @@ class _Run:
             on_stopping=lambda reason: self._enter(State.STOPPING, reason),
         )
         scheduler.restore(history)
+        used = lanes.ahead.used
         try:
-            result = await scheduler.run()
+            with self._foreseeing(stage, index, results, lanes):
+                result = await scheduler.run()
         finally:
             self._unknown_pours = bool(scheduler.unknown_pours)
+        if lanes.ahead.used > used:
+            text = f"{lanes.ahead.used - used} simulation(s) of {stage.name} were made while the arm was pouring before"
+            self._journal.append(Kind.NOTE, {"text": text}, stage=stage.name)
         self._watchers.emit(StageClosed(stage=stage.name, result=result))
         return result
+
+    @contextmanager
+    def _foreseeing(self, stage: StageDefinition, index: int, results: Results, lanes: Lanes) -> Iterator[None]:
+        """While the arm pours, simulate what later stages will ask for, where that disturbs nobody."""
+        later = self._stages[index - 1 :]
+        if not stage.pours or len(later) < 2 or not lanes.simulators.separate:
+            yield
+            return
+        rehearsal = Rehearsal(later, results, self._plan.seed, self._plan.parallel_simulations, lanes)
+        task = asyncio.create_task(rehearsal.run(), name=f"rehearsal beside {stage.name}")
+        try:
+            yield
+        finally:
+            task.cancel()
+            lanes.ahead.pause()
+            # Awaited nowhere: whatever goes wrong in a rehearsal shows when its stage's turn comes.
+            task.add_done_callback(lambda task: task.cancelled() or task.exception())
 
     async def _settle(self, stage: StageDefinition, history: StageHistory) -> StageHistory:
         await settle_unknown_pours(

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs
+from orchestrator.commands import bench_verbs, simulate_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
-    Assignments,
     Campaign,
     InProcess,
     Json,
@@ -22,7 +20,6 @@ from orchestrator.commands.options import (
     Receiver,
     Resume,
     RunId,
-    SceneName,
     Seed,
     call,
     examples,
@@ -60,13 +57,6 @@ def decant(
     ] = False,
 ) -> None:
     """What stands before the verbs."""
-
-
-class BackendChoice(StrEnum):
-    """Where the solver runs."""
-
-    CPU = "cpu"
-    CUDA = "cuda"
 
 
 @app.command(
@@ -225,50 +215,13 @@ def study(
     call(verb.study, file, jobs=jobs, dry_run=dry_run, report_only=report_only, as_json=as_json)
 
 
-@app.command(
+app.command(
     epilog=examples(
         "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
         "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
+        "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
     )
-)
-def simulate(
-    campaign: Campaign,
-    assignments: Assignments = None,
-    parameters: Parameters = None,
-    receiver: Receiver = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the initial positions; the first of several.")] = 0,
-    seeds: Annotated[
-        int, typer.Option(min=1, max=1000, help="How many seeds: SEED, SEED + 1, … Their spread is told.")
-    ] = 3,
-    scene: SceneName = None,
-    as_json: Json = False,
-    rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
-    png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
-    backend: Annotated[BackendChoice, typer.Option(help="Where the solver runs.")] = BackendChoice.CPU,
-    quiet: Quiet = False,
-) -> None:
-    """Simulate one pour of a campaign's scene, with several seeds, and say where the liquid went.
-
-    Actions without a unit are in deg, deg/s, deg/s^2, mm and s; what the campaign fixes needs no `--set`. With `--json`
-    fractions are of the load: received + spilled + retained + in_flight + escaped = 1; they, the recording and the
-    picture are the first seed's, means and standard deviations of all seeds stand under 'prediction'.
-    """
-    from orchestrator.commands import single
-
-    call(
-        single.simulate,
-        campaign,
-        assignments=assignments or [],
-        parameters=parameters,
-        receiver=receiver,
-        seed=seed,
-        seeds=seeds,
-        scene_name=scene,
-        as_json=as_json,
-        rrd=rrd,
-        png=png,
-        backend=backend.value,
-    )
+)(simulate_verb.simulate)
 
 
 @app.command(

@@ -21,7 +21,7 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.requests import Failed, Pour, Simulate
+from orchestrator.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.strategies.progress import Progress
 
 PRICE = 1.2e-3
@@ -137,8 +137,9 @@ class Forecast:
                     self._pours.append(event.seconds)
                     stage.cycle_from = event.time
             case Simulate() as request if stage is not None and stage.cycle_from is None:
-                stage.waits.append(event.time - stage.answered)
-                stage.particles.append(request.parameters.particles)
+                if not _made_before(event):
+                    stage.waits.append(event.time - stage.answered)
+                    stage.particles.append(request.parameters.particles)
                 stage.answered = event.time
 
     def _close(self, event: StageClosed) -> None:
@@ -192,6 +193,11 @@ class Forecast:
         # the plan's own time counts as a pour that was seen: the first one may have started the simulator of a bench
         pour = median_low([stage.work.pour_time, *self._pours[-RECENT:]])
         return max(pour, stage.work.beside * self._price(stage)) + THOUGHT
+
+
+def _made_before(event: RequestFinished) -> bool:
+    """Whether a simulation was made while the arm poured, and says nothing about the next one's price."""
+    return isinstance(event.outcome, Simulated) and event.seconds < 0.1 * event.outcome.outcome.cpu_s
 
 
 def _all_of(work: Work) -> Progress:

@@ -19,8 +19,10 @@ from actors.protocols import (
     NotPouredError,
     ProgressCallback,
     SimulationError,
+    SimulatorPool,
     UnknownPourError,
 )
+from orchestrator.ahead import Ahead
 from orchestrator.errors import RunError
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
 from sim_engine.simulated import RecordedFrames
@@ -89,6 +91,10 @@ class Lanes:
         self._record_rate = record_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
+        self.ahead = Ahead(self._foreseen, laboratory.simulators.size)
+
+    async def _foreseen(self, request: Simulate) -> Outcome:
+        return (await self._simulated(request))[0]
 
     async def simulate(
         self, request: Simulate, *, record: bool, started: Callable[[], None]
@@ -96,9 +102,19 @@ class Lanes:
         """Run a simulation.
 
         Args:
-            record: whether frames are kept; changes nothing about the outcome.
+            record: whether frames are kept; changes nothing about the outcome. Those made ahead have none.
             started: called when it is handed to the pool.
         """
+        if not record and self.ahead.knows(request):
+            started()
+            if (foreseen := await self.ahead.take(request)) is not None:
+                return foreseen, None
+        else:
+            started()
+        with self.ahead.asked_for():
+            return await self._simulated(request, record=record)
+
+    async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
         rate = self._record_rate if record else 0.0
         task = PourTask(
             self._scene(request.scene),
@@ -108,7 +124,6 @@ class Lanes:
             record_rate=rate,
             pose_error=request.pose_error,
         )
-        started()
         try:
             async with asyncio.timeout(self.deadlines.simulate):
                 result = await self._laboratory.simulators.simulate(task)
@@ -201,6 +216,11 @@ class Lanes:
                         ) from error
                     retrying(f"the optimiser failed ({reason}); it is asked again, for the {_ORDINAL[attempt]} time")
         raise AssertionError("unreachable")
+
+    @property
+    def simulators(self) -> SimulatorPool:
+        """The pool that simulations run on."""
+        return self._laboratory.simulators
 
     @property
     def bench(self) -> Bench:

@@ -15,9 +15,11 @@ from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import regimes
 from orchestrator.report.campaign import draw_figures
-from orchestrator.report.results import theta_of
+from orchestrator.report.results import evaluation_of, theta_of
 from orchestrator.report.summary import PoolUse, RunSummary, Totals, summarise, write_summary
 from orchestrator.strategies.calibration.base import CalibratedTheta
+from orchestrator.strategies.calibration.evaluation import Scores
+from orchestrator.strategies.calibration.scorecard import shift_left_over
 
 W = TypeVar("W")
 
@@ -93,18 +95,28 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
     found = theta_of(result.results)
     theta = None if found is None else directory / THETA_FILE
     if theta is not None and found is not None:
-        theta.write_text(json.dumps(theta_file(found), indent=2) + "\n", encoding="utf-8")
+        written = theta_file(found, evaluation_of(result.results))
+        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
     return Published(summary, figures, None if recording is None else recording.path, theta)
 
 
-def theta_file(found: CalibratedTheta) -> dict[str, Any]:
-    """What `theta.json` holds: θ*, and where it is known the posterior as weighted θ, each complete."""
+def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str, Any]:
+    """What `theta.json` holds: θ*, what it left over, and where it is known the posterior as weighted θ, each complete.
+
+    Args:
+        found: by the calibration.
+        scored: θ* on the weighed pours; None: nobody knows what it left over.
+    """
     theta = found.theta.model_dump()
-    if found.posterior is None:
-        return {"theta": theta}
-    draws = found.posterior.thetas
-    kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
-    return {"theta": theta, "posterior": [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]}
+    data: dict[str, Any] = {"theta": theta}
+    left = None if scored is None else shift_left_over(scored, len(found.searched))
+    if left is not None:
+        data["remaining_discrepancy"] = {"shift": left}
+    if found.posterior is not None:
+        draws = found.posterior.thetas
+        kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
+        data["posterior"] = [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]
+    return data
 
 
 def _totals(plan: CampaignPlan, result: CampaignResult) -> Totals:

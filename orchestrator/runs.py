@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from orchestrator.catalogue.registry import register
 from orchestrator.codec import digest
 from orchestrator.fingerprint import fingerprint
 from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader
@@ -25,6 +26,8 @@ class RunNotFoundError(JournalError):
 
 def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
     """Make the directory of a new run: ROOT/NAME-DATE-N (NAME-hardware-DATE-N), N counting the day's.
+
+    It is entered into the catalogue of runs.
 
     Args:
         root: where runs are kept; the plan's output directory if not given.
@@ -45,9 +48,11 @@ def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
         directory = parent / f"{stem}-{number}"
         try:
             directory.mkdir()  # two runs begun at the same moment get two directories
-            return directory
+            break
         except FileExistsError:
             number += 1
+    register(directory)
+    return directory
 
 
 def write_provenance(directory: Path, plan: CampaignPlan) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -41,12 +42,14 @@ class StageDefinition:
         build: makes the strategy from the former stages' results and the stage's seed.
         order: in which outcomes are told.
         pours: whether it needs a bench.
+        stand_in: what takes its result's place where later stages are acted out beforehand (`orchestrator.rehearsal`).
     """
 
     name: str
     build: Callable[[Results, int], Strategy]
     order: Order = "logical"
     pours: bool = False
+    stand_in: Calibrated | None = None
 
 
 def stage_seed(seed: int, stage: str) -> int:
@@ -108,7 +111,24 @@ def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
         plain = SimulationParameters.from_values(plan.fixed_parameters) if rivals else None
         return Scorecard(theta, rivals, pours, plan.actions, seed, uncalibrated=plain)
 
-    return [*stages, StageDefinition(CALIBRATION, calibration), StageDefinition(EVALUATION, evaluation)]
+    found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
+    return [*stages, found, StageDefinition(EVALUATION, evaluation)]
+
+
+def _stand_in(plan: CalibrationPlan) -> Calibrated:
+    """A θ* that has not been found: one of the box that no campaign would name."""
+    values = plan.parameters.decode([math.sqrt(0.3)] * plan.parameters.dimension)
+    theta = CalibratedTheta(
+        theta=SimulationParameters.from_values({**plan.fixed_parameters, **values}),
+        searched=plan.parameters.names,
+        predicted_discrepancy=0.0,
+        predicted_deviation=0.0,
+        hyperparameters=None,
+        map=None,
+    )
+    return Calibrated(
+        strategy=plan.strategy, simulations=0, lost=0, undefined=0, training_pours=0, trials=(), found=theta
+    )
 
 
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
 import signal
+import tempfile
 
 import pytest
+
+from orchestrator.state_directory import VARIABLE
 
 # A shell that starts something in the background has it ignore Ctrl-C, and its children with it: those that are
 # interrupted here would go on.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tests' runs don't belong into the catalogue of the person who runs them. Workers of xdist inherit the place.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ[VARIABLE] = tempfile.mkdtemp(prefix="decant-state-")
+    atexit.register(shutil.rmtree, os.environ[VARIABLE], ignore_errors=True)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.errors import LineSettingsError, UnknownDialectError
-from actors.balance.reading import FrameError, Reading
+from actors.balance.reading import LineError, Reading
 from actors.balance.wire import Wire
 
 LISTENING = 0.3
@@ -212,7 +212,7 @@ def _identity(wire: Wire, question: str, patience: float) -> str:
 def _is_weight(dialect: Dialect, line: bytes) -> bool:
     try:
         return isinstance(dialect.decode(line), Reading)
-    except FrameError:
+    except LineError:
         return False
 
 

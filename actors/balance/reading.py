@@ -9,7 +9,7 @@ from enum import StrEnum
 from actors.balance.units import kilograms
 
 
-class FrameError(ValueError):
+class LineError(ValueError):
     """Bytes that are not a line of the dialect: damaged, half a line, or another dialect's."""
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from actors.balance.complaints import LOST_REFERENCE, WITHOUT_EFFECT, unsettled
+from actors.balance.conversation import Conversation
 from actors.balance.display import Display
 from actors.balance.errors import (
     BalanceError,
@@ -22,7 +23,6 @@ from actors.balance.errors import (
     ReferenceLostError,
     UnitError,
 )
-from actors.balance.link import Link
 from actors.balance.protocol import Weight
 from actors.balance.reading import Acknowledgement, Answer, Reading, Status
 from actors.balance.settling import Settled, Settling
@@ -64,7 +64,7 @@ class SerialBalance:
         self._rule = spec.settling.scaled(spec.time_scale)
         self._interrupted = threading.Event()
         self._lock = threading.RLock()
-        self._link = Link(spec, self._interrupted, tap)
+        self._conversation = Conversation(spec, self._interrupted, tap)
         self._display = Display(spec.step)
         self._tared = self._reference_lost = False
         self._losses = self._strange_units = 0
@@ -91,7 +91,7 @@ class SerialBalance:
             BalanceError: not at rest in time, refused, without effect, or lost.
         """
         self._open()
-        self._set_reference("tare", self._link.dialect.tare)
+        self._set_reference("tare", self._conversation.dialect.tare)
 
     def zero(self) -> None:
         """Set the zero of the empty balance, and see it do so.
@@ -100,7 +100,7 @@ class SerialBalance:
             BalanceError: as `tare`; or something is on the balance, or the dialect has no such command.
         """
         self._open()
-        dialect = self._link.dialect
+        dialect = self._conversation.dialect
         if dialect.zero is None:
             raise self._error(CommandError, f"{dialect.title} has no command for zero; use its key, or tare instead")
         self._set_reference("zero", dialect.zero)
@@ -123,7 +123,7 @@ class SerialBalance:
         if not self._lock.acquire(timeout=self._spec.answer_time / 4.0):
             return self._display.last
         try:
-            if time.monotonic() - self._display.last.time >= 0.9 * self._link.interval:
+            if time.monotonic() - self._display.last.time >= 0.9 * self._conversation.interval:
                 self._glance()
             return self._display.last
         finally:
@@ -150,15 +150,15 @@ class SerialBalance:
         """
         with self._exclusive():
             self._open()
-            self._link.listen(seconds)
+            self._conversation.listen(seconds)
 
     def statistics(self) -> dict[str, int]:
         """Lines understood, damaged and stale, unanswered questions, lost connections."""
-        return asdict(self._link.counters)
+        return asdict(self._conversation.counters)
 
     def describe(self) -> str:
         """'Kern KCP on /dev/…, 9600 baud 8N1', as far as it is known."""
-        found = self._link.found
+        found = self._conversation.found
         if found is None:
             return f"{self._name} on {self._spec.port}, not yet connected"
         said = f" ({found.identity})" if found.identity else ""
@@ -182,7 +182,7 @@ class SerialBalance:
     def close(self) -> None:
         """Close the port; the next call opens it again."""
         with self._lock:
-            self._link.close()
+            self._conversation.close()
 
     # How.
 
@@ -208,7 +208,7 @@ class SerialBalance:
         """Send a command; '' if it was taken (or nobody says), else why it may be sent again."""
         try:
             with self._exclusive():
-                answer = self._link.command(data, 2.0 * COMMAND_TIME / self._spec.time_scale)
+                answer = self._conversation.command(data, 2.0 * COMMAND_TIME / self._spec.time_scale)
         except NoConnectionError as error:
             self._wait_for_return(error)
             return "the connection was lost"
@@ -265,15 +265,15 @@ class SerialBalance:
                 self._losses = 0
                 return settled
         self._check_interrupted()
-        damaged = self._link.counters.damaged
+        damaged = self._conversation.counters.damaged
         raise self._error(*unsettled(seen, self._display.last.shown, self._spec.settling.deadline, damaged))
 
     def _exchange(self) -> tuple[Reading, float] | None:
         """One question and its answer; None after the connection was lost and made again."""
         try:
             with self._exclusive():
-                self._link.open()
-                reading, moment = self._link.ask()
+                self._conversation.open()
+                reading, moment = self._conversation.ask()
                 self._display.note(reading, moment)
                 return reading, moment
         except NoConnectionError as error:
@@ -282,10 +282,10 @@ class SerialBalance:
 
     def _glance(self) -> None:
         """Take one reading if that is quickly done."""
-        if self._link.found is None:
+        if self._conversation.found is None:
             return
         try:
-            reading, moment = self._link.ask()
+            reading, moment = self._conversation.ask()
         except NoConnectionError:
             self._note_loss()
         else:
@@ -297,17 +297,17 @@ class SerialBalance:
 
     def _open(self) -> None:
         """Open for the first time; a port that isn't there then won't come by waiting."""
-        if self._link.found is not None:
+        if self._conversation.found is not None:
             return
         try:
             with self._exclusive():
-                self._link.open()
+                self._conversation.open()
         except NoConnectionError as error:
             self._check_interrupted()
             raise self._said(error) from error
 
     def _wait_for_return(self, error: NoConnectionError) -> None:
-        if self._link.found is None:
+        if self._conversation.found is None:
             raise self._said(error) from error
         self._note_loss()
         self._losses += 1
@@ -316,7 +316,7 @@ class SerialBalance:
             raise self._error(NoConnectionError, f"its connection comes and goes ({error}); look at cable and plug")
         try:
             with self._exclusive():
-                self._link.reopen(time.monotonic() + self._spec.reconnect_time)
+                self._conversation.reopen(time.monotonic() + self._spec.reconnect_time)
         except NoConnectionError as gone:
             self._check_interrupted()
             raise self._said(gone) from gone

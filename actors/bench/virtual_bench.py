@@ -263,7 +263,7 @@ class FollowedBench(VirtualBench):
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
         """What the pourer truly did, from the pour's first pose on; None if it never left it."""
-        from actors.arm.path.frames import pourer_motion
+        from actors.arm.path.transforms import pourer_motion
 
         if self._gap:
             raise LaboratoryError(

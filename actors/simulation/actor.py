@@ -1,4 +1,4 @@
-"""The Ray actor around a `SimulationWorker`: one process, one Taichi, one job at a time."""
+"""The Ray actor around a `JobRunner`: one process, one Taichi, one job at a time."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.cluster.versions import Versions, versions
+from actors.simulation.job_runner import JobRunner, Simulator
 from actors.simulation.parcel import MeshParcel, unpack
-from actors.simulation.worker import SimulationWorker, Simulator
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
@@ -51,7 +51,7 @@ class SimulatorProcess:
 
     def __init__(self, make: Callable[[], Simulator]) -> None:
         os.nice(NICENESS)
-        self._worker = SimulationWorker(make)
+        self._runner = JobRunner(make)
         self._recalled: set[int] = set()
 
     def greet(self) -> Greeting:
@@ -61,7 +61,7 @@ class SimulatorProcess:
         return Greeting(os.getpid(), f"{socket.gethostname()} ({ray.util.get_node_ip_address()})", versions())
 
     def simulate(self, number: int, task: PourTask, *parcels: MeshParcel) -> Answer:
-        """See `SimulationWorker.simulate`.
+        """See `JobRunner.simulate`.
 
         Args:
             number: by which the job is recalled; no two have the same.
@@ -70,7 +70,7 @@ class SimulatorProcess:
         """
         begin = time.monotonic()
         try:
-            result = self._worker.simulate(unpack(task, parcels), lambda: number in self._recalled)
+            result = self._runner.simulate(unpack(task, parcels), lambda: number in self._recalled)
         finally:
             self._recalled.discard(number)
         return Answer(result, time.monotonic() - begin)
@@ -85,7 +85,7 @@ class SimulatorProcess:
 
     def close(self) -> None:
         """Write the compiled kernels; a killed process would lose them, and the next one compile again."""
-        self._worker.close()
+        self._runner.close()
 
 
 def simulator_actor(make: Callable[[], Simulator], *, cpus: float, placement: Mapping[str, Any]) -> Any:

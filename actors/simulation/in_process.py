@@ -8,8 +8,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 from actors.protocols import SimulationError
+from actors.simulation.job_runner import JobRunner, Simulator, pour_simulator
 from actors.simulation.statistics import Account, PoolStatistics
-from actors.simulation.worker import SimulationWorker, Simulator, pour_simulator
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
@@ -25,7 +25,7 @@ class InProcessSimulatorPool:
     """
 
     def __init__(self, *, make: Callable[[], Simulator] = pour_simulator) -> None:
-        self._worker = SimulationWorker(make)
+        self._runner = JobRunner(make)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="simulator")
         self._account = Account(1)
         self._closed = False
@@ -34,6 +34,11 @@ class InProcessSimulatorPool:
     def size(self) -> int:
         """One."""
         return 1
+
+    @property
+    def separate(self) -> bool:
+        """They share this process with the bench."""
+        return False
 
     def statistics(self) -> PoolStatistics:
         """What the pool has done so far."""
@@ -60,7 +65,7 @@ class InProcessSimulatorPool:
     def _run(self, task: PourTask, given_up: threading.Event) -> SimulatedPour:
         self._account.begin(0)
         try:
-            return self._worker.simulate(task, given_up.is_set)
+            return self._runner.simulate(task, given_up.is_set)
         finally:
             self._account.end(0)
 
@@ -69,5 +74,5 @@ class InProcessSimulatorPool:
         if self._closed:
             return
         self._closed = True
-        await asyncio.wrap_future(self._thread.submit(self._worker.close))
+        await asyncio.wrap_future(self._thread.submit(self._runner.close))
         self._thread.shutdown(wait=True)

@@ -14,10 +14,10 @@ from actors.cluster.versions import Versions
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.actor import CONTROL, Answer, simulator_actor
 from actors.simulation.crew import Crew
+from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.member import Job, Member, Sent
 from actors.simulation.parcel import Packer
 from actors.simulation.statistics import Account, PoolStatistics
-from actors.simulation.worker import Simulator, pour_simulator
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
@@ -87,6 +87,11 @@ class RaySimulatorPool:
     def size(self) -> int:
         """Number of members, those included that are waited for."""
         return self._crew.size
+
+    @property
+    def separate(self) -> bool:
+        """In processes of their own."""
+        return True
 
     def statistics(self) -> PoolStatistics:
         """What the pool has done so far."""

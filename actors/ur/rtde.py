@@ -1,6 +1,6 @@
-"""Real-time data exchange (port 30004): frames and field types.
+"""Real-time data exchange (port 30004): packages and field types.
 
-A frame is `uint16 size, uint8 type, payload`, big-endian, the size including these three bytes.
+A package is `uint16 size, uint8 type, payload`, big-endian, the size including these three bytes.
 
 Source: the manufacturer's RTDE guide; what real clients send was measured.
 """
@@ -36,33 +36,33 @@ FORMATS: dict[str, tuple[str, int]] = {
 """Struct format and number of values by RTDE type."""
 
 
-class FramingError(Exception):
-    """Bytes that can't be a frame: the stream can't be followed any more."""
+class PackageError(Exception):
+    """Bytes that can't be a package: the stream can't be followed any more."""
 
 
-def frame(kind: int, payload: bytes) -> bytes:
-    """One frame."""
+def package(kind: int, payload: bytes) -> bytes:
+    """One package."""
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
-class Frames:
-    """Cuts a stream into frames."""
+class PackageReader:
+    """Cuts a stream into packages."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Take bytes; give each complete frame's type and payload.
+        """Take bytes; give each complete package's type and payload.
 
         Raises:
-            FramingError: a size that no frame has.
+            PackageError: a size that no package has.
         """
         rest = self._rest
         rest += data
         while len(rest) >= HEADER.size:
             size, kind = HEADER.unpack_from(rest)
             if size < HEADER.size:
-                raise FramingError(f"a frame of {size} bytes")
+                raise PackageError(f"a package of {size} bytes")
             if len(rest) < size:
                 return
             payload = bytes(rest[HEADER.size : size])

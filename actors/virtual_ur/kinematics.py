@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from math import acos, asin, atan2, cos, hypot, pi, sin
 
 from actors.ur.models import Joints, RobotModel
-from actors.virtual_ur.poses import IDENTITY, Frame, Vector, compose, multiply, rotation_matrix
+from actors.virtual_ur.poses import IDENTITY, Transform, Vector, compose, multiply, rotation_matrix
 
 _SINGULAR_WRIST = 1e-6
 """Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 is taken as it was."""
@@ -27,7 +27,7 @@ class Kinematics:
     def __init__(self, model: RobotModel) -> None:
         self.model = model
 
-    def flange(self, q: Sequence[float]) -> Frame:
+    def flange(self, q: Sequence[float]) -> Transform:
         """Where the flange is in the base's frame [m]."""
         m = self.model
         q1, q2, q3, q4, q5, q6 = q
@@ -75,11 +75,11 @@ class Kinematics:
         w3 = (w2[0] + m.d5 * wrist[0], w2[1] + m.d5 * wrist[1], w2[2] + m.d5 * wrist[2])
         return [(0.0, 0.0, 1.0), across, across, across, wrist, tool], [(0.0, 0.0, 0.0), shoulder, elbow, w1, w2, w3]
 
-    def links(self, q: Sequence[float]) -> list[Frame]:
+    def links(self, q: Sequence[float]) -> list[Transform]:
         """Denavit–Hartenberg frames of the six links, each at its link's far end, base frame."""
         m = self.model
         lengths = ((0.0, m.d1, 0.5), (m.a2, 0.0, 0.0), (m.a3, 0.0, 0.0), (0.0, m.d4, 0.5), (0.0, m.d5, -0.5))
-        frame: Frame = (IDENTITY, (0.0, 0.0, 0.0))
+        frame: Transform = (IDENTITY, (0.0, 0.0, 0.0))
         frames = []
         for angle, (a, d, twist) in zip(q, (*lengths, (0.0, m.d6, 0.0)), strict=True):
             turned = multiply(rotation_matrix((0.0, 0.0, angle)), rotation_matrix((pi * twist, 0.0, 0.0)))
@@ -105,7 +105,7 @@ class Kinematics:
                 wz += rate * az
         return vx, vy, vz, wx, wy, wz
 
-    def inverse(self, flange: Frame, q6: float = 0.0) -> Iterator[Joints]:
+    def inverse(self, flange: Transform, q6: float = 0.0) -> Iterator[Joints]:
         """All joint positions, each in (−π, π], that put the flange there. None if it is out of reach.
 
         Args:
@@ -141,7 +141,7 @@ class Kinematics:
                     q2 = atan2(w, u) - atan2(m.a3 * sin(q3), m.a2 + m.a3 * cos(q3))
                     yield _turn(q1), _turn(q2), q3, _turn(q234 - q2 - q3), q5, sixth
 
-    def nearest(self, flange: Frame, near: Sequence[float]) -> Joints | None:
+    def nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
         """The solution whose joints are nearest to `near`, within the joints' ranges. None if there is none.
 
         Args:

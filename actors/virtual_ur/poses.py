@@ -10,7 +10,7 @@ from math import atan2, cos, pi, sin, sqrt
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
-Frame = tuple[Matrix, Vector]
+Transform = tuple[Matrix, Vector]
 """A rotation and a position: what a pose means."""
 
 IDENTITY: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -91,26 +91,26 @@ def rotate(m: Matrix, v: Sequence[float]) -> Vector:
     return (m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z, m[6] * x + m[7] * y + m[8] * z)
 
 
-def compose(a: Frame, b: Frame) -> Frame:
+def compose(a: Transform, b: Transform) -> Transform:
     """b, given in a, seen from where a is given."""
     m, p = a
     x, y, z = rotate(m, b[1])
     return multiply(m, b[0]), (p[0] + x, p[1] + y, p[2] + z)
 
 
-def invert(a: Frame) -> Frame:
+def invert(a: Transform) -> Transform:
     """The frame that undoes `a`."""
     back = transpose(a[0])
     x, y, z = rotate(back, a[1])
     return back, (-x, -y, -z)
 
 
-def frame_of(pose: Sequence[float]) -> Frame:
-    """Frame of a pose x, y, z, rx, ry, rz."""
+def transform_of(pose: Sequence[float]) -> Transform:
+    """Transform of a pose x, y, z, rx, ry, rz."""
     return rotation_matrix(pose[3:6]), (pose[0], pose[1], pose[2])
 
 
-def pose_of(frame: Frame) -> tuple[float, float, float, float, float, float]:
+def pose_of(frame: Transform) -> tuple[float, float, float, float, float, float]:
     """Pose of a frame."""
     return (*frame[1], *rotation_vector(frame[0]))
 

@@ -10,7 +10,7 @@ from actors.ur.models import Joints, RobotModel
 from actors.virtual_ur.kinematics import Kinematics
 from actors.virtual_ur.motion.lines import Arm
 from actors.virtual_ur.motion.mover import Mover, ViolationError
-from actors.virtual_ur.poses import IDENTITY, Frame, Vector, compose, distance, frame_of, pose_of
+from actors.virtual_ur.poses import IDENTITY, Transform, Vector, compose, distance, pose_of, transform_of
 from actors.virtual_ur.safety import SafetyConfiguration
 
 TRACKING_LAG = 0.004
@@ -52,7 +52,7 @@ class Robot:
         self.model = model
         self.kinematics = Kinematics(model)
         self.mover = Mover(model, q)
-        self.arm = Arm(self.kinematics, frame_of((0.0,) * 6))
+        self.arm = Arm(self.kinematics, transform_of((0.0,) * 6))
         self.tcp: Pose = (0.0,) * 6
         self.payload = 0.0
         self.cog: Vector = (0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ class Robot:
     def set_tcp(self, pose: Pose) -> None:
         """Mount a tool: its centre point in the flange's frame."""
         self.tcp = pose
-        self.arm = Arm(self.kinematics, frame_of(pose))
+        self.arm = Arm(self.kinematics, transform_of(pose))
         self._point = self.arm.frame(self.mover.q)[1]
         self._cache.clear()
 
@@ -160,8 +160,8 @@ class Robot:
         return self._steady_for >= SETTLING
 
     @property
-    def frame(self) -> Frame:
-        """Frame of the tool centre point, as measured."""
+    def frame(self) -> Transform:
+        """Transform of the tool centre point, as measured."""
         cached = self._cache.get("frame")
         if cached is None:
             cached = self._cache["frame"] = self.arm.frame(self.q)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
     from sim_engine.liquid import SimulationParameters
+    from sim_engine.vessel.spec import VesselSpec
 
 
 _TOLD = {"prediction", "predicted_delivered_g", "predicted_delivered_ml", "risk", "window", "not_covered"}
@@ -222,14 +223,23 @@ def _drawn(plan: CampaignPlan, parameters: Path | None, thetas: int) -> tuple[Si
 
 
 def planning_plan(
-    plan: CampaignPlan, parameters: Path | None, receiver: Path | None, iterations: int | None
+    plan: CampaignPlan,
+    parameters: Path | SimulationParameters | None,
+    receiver: Path | VesselSpec | None,
+    iterations: int | None,
 ) -> CampaignPlan:
-    """A campaign turned into D1 without pours.
+    """A campaign turned into D1 without pours, and its record.
+
+    Args:
+        parameters: θ to plan with, or a file with it; the campaign's unless given.
+        receiver: another vessel than the campaign's, or its file.
+        iterations: as the campaign says unless given.
 
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
     from orchestrator.config.load import load_parameters, load_posterior, load_vessel
+    from orchestrator.config.record import record_of
     from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.stages import POSTERIOR_DRAWS
     from orchestrator.strategies.deployment.d1 import D1Settings
@@ -237,18 +247,20 @@ def planning_plan(
     deployment, theta = plan.deployment, plan.parameters
     posterior = deployment is not None and deployment.settings.needs_posterior
     thetas: tuple[SimulationParameters, ...] = ()
-    if posterior and parameters is None:
+    if posterior and not isinstance(parameters, Path):
         raise RefusalError(
             f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration "
             "by C4",
             BAD_INPUT,
         )
     try:
-        if parameters is not None:
+        if isinstance(parameters, Path):
             theta = load_parameters(parameters, plan.parameters)
             if posterior:
                 thetas = load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters)
-        vessel = load_vessel(receiver) if receiver is not None else None
+        elif parameters is not None:
+            theta = parameters
+        vessel = load_vessel(receiver) if isinstance(receiver, Path) else receiver
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
     if deployment is None:
@@ -262,13 +274,10 @@ def planning_plan(
     changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
     settings = D1Settings.like(deployment.settings, **changes)
     deployment = dataclasses.replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0)
-    return dataclasses.replace(
-        plan,
-        name=f"{plan.name}-plan",
-        parameters=theta,
-        calibration=None,
-        deployment=deployment,
+    planned = dataclasses.replace(
+        plan, name=f"{plan.name}-plan", parameters=theta, calibration=None, deployment=deployment
     )
+    return dataclasses.replace(planned, resolved=record_of(plan.resolved, planned))
 
 
 def _run(

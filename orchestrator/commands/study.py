@@ -137,7 +137,7 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> Status:
 
 @contextlib.contextmanager
 def _ending_like_ctrl_c() -> Iterator[None]:
-    """While workers run, SIGTERM and SIGHUP end them as Ctrl-C does."""
+    """While cells run, SIGTERM and SIGHUP end them as Ctrl-C does."""
 
     def interrupt(number: int, frame: Any) -> None:
         raise KeyboardInterrupt

@@ -21,7 +21,7 @@ from orchestrator.events import (
     StrategyProgressed,
 )
 from orchestrator.monitor.streams import Streams
-from orchestrator.monitor.worker import Worker
+from orchestrator.monitor.worker import QueueThread
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_names
@@ -72,7 +72,7 @@ class RerunMonitor:
         receivers = {scene.name: names[scene.name] for scene in scenes}
         streams = Streams(self.path, name=plan.name, receivers=receivers, loss_label=unit.label)
         self._translator = _Translator(streams, plan)
-        self._worker: Worker[Event] = Worker(
+        self._worker: QueueThread[Event] = QueueThread(
             self._translator.handle, self._finish, capacity=capacity, name=f"recording {self.path.name}"
         )
 

@@ -13,7 +13,7 @@ _log = logging.getLogger(__name__)
 Item = TypeVar("Item")
 
 
-class Worker(Generic[Item]):
+class QueueThread(Generic[Item]):
     """Runs `handle` on every item in a thread of its own.
 
     Items that find the queue full are dropped and counted; a handler that raises is counted, and reported once.

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from actors.arm.joint_path import PourPath
-    from actors.arm.path.frames import Frames
     from actors.arm.path.stretch import Stretch
+    from actors.arm.path.transforms import Transforms
     from actors.arm.spec import UrArmSpec
     from sim_engine.vessel.vessel import Vessel
 
@@ -58,11 +58,11 @@ def draw_path(
     path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
 ) -> Figure:
     """The figure of `path_png`."""
-    from actors.arm.path.frames import cell_frames
     from actors.arm.path.stretch import Stretch
+    from actors.arm.path.transforms import cell_transforms
 
     stretches = [Stretch.of(name, getattr(path, name), spec) for name, _, _ in _WAYS]
-    world = cell_frames(spec).world.inverse
+    world = cell_transforms(spec).world.inverse
     base, table = 1e3 * world.position, float(1e3 * world.apply(np.array([[0.0, 0.0, spec.cell.table]]))[0, 2])
     # Seen along the way to the robot its base would stand under the receiver: the arm is drawn from where it is long.
     across = 0 if abs(base[0]) > abs(base[1]) else 1
@@ -85,7 +85,9 @@ def draw_path(
     return figure
 
 
-def _near(axes: Axes, stretches: list[Stretch], world: Frames, table: float, pourer: Vessel, receiver: Vessel) -> None:
+def _near(
+    axes: Axes, stretches: list[Stretch], world: Transforms, table: float, pourer: Vessel, receiver: Vessel
+) -> None:
     """The pour: both vessels cut open, and the ways of tool and pourer near them."""
     shown = [_vessels_from_the_side(axes, stretches[1], pourer, receiver)]
     for stretch, (name, way, colour) in zip(stretches, _WAYS, strict=True):
@@ -105,7 +107,7 @@ def _near(axes: Axes, stretches: list[Stretch], world: Frames, table: float, pou
     style.dress(axes, title="the pour from the side", x=_AXES[0], y=_AXES[2], grid="both")
 
 
-def _cell(axes: Axes, pour: Stretch, spec: UrArmSpec, world: Frames, seen: tuple[int, int]) -> None:
+def _cell(axes: Axes, pour: Stretch, spec: UrArmSpec, world: Transforms, seen: tuple[int, int]) -> None:
     """The box that the arm has to stay in, and the arm at the pour's beginning and at its largest tilt."""
     corners = np.array(list(itertools.product(*zip(spec.limits.box_low, spec.limits.box_high, strict=True))))
     _outline(axes, world.apply(corners)[:, list(seen)], label="box of the laboratory's file")

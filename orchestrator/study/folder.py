@@ -19,7 +19,7 @@ from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.study.cells import Cell
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 
-CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "worker-{}.log", "study.json"
+CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "process-{}.log", "study.json"
 
 
 class StudyError(RunError):

@@ -17,10 +17,10 @@ from orchestrator.study.folder import LOG, is_finished
 from orchestrator.study.plan import StudyPlan
 
 WAKE = 0.1
-"""Seconds between two looks at the workers."""
+"""Seconds between two looks at the cells' processes."""
 
 GRACE = 10.0
-"""Seconds that workers have to end after they were told to."""
+"""Time that a cell's process has to end after it was asked to [s]."""
 
 
 @dataclass
@@ -52,16 +52,16 @@ class Status:
 Watch = Callable[[Status], None]
 
 
-def worker_command(study: StudyPlan) -> list[str]:
+def cell_command(study: StudyPlan) -> list[str]:
     """What runs cells in a process of its own."""
-    return [sys.executable, "-m", "orchestrator.study.worker", str(study.source)]
+    return [sys.executable, "-m", "orchestrator.study.cell_process", str(study.source)]
 
 
-class Worker:
+class CellProcess:
     """A process that runs cells, one at a time.
 
     Args:
-        command: that starts it; see `orchestrator.study.worker` for what it reads and writes.
+        command: that starts it; see `orchestrator.study.cell_process` for what it reads and writes.
         log: file that takes what else it says.
 
     Attributes:
@@ -71,30 +71,30 @@ class Worker:
     def __init__(self, command: Sequence[str], log: Path) -> None:
         self._log = log
         with log.open("wb") as errors:
-            # A session of its own: Ctrl-C reaches this process alone, which then ends its workers.
-            self.process = subprocess.Popen(
+            # A session of its own: Ctrl-C reaches this process alone, which then ends its cells' processes.
+            self.popen = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, start_new_session=True
             )
-        assert self.process.stdout is not None
-        os.set_blocking(self.process.stdout.fileno(), False)
+        assert self.popen.stdout is not None
+        os.set_blocking(self.popen.stdout.fileno(), False)
         self._heard = b""
         self.cell: Cell | None = None
 
     def begin(self, cell: Cell) -> None:
         """Give it a cell."""
-        assert self.process.stdin is not None
+        assert self.popen.stdin is not None
         self.cell = cell
         try:
-            self.process.stdin.write(f"{cell.id}\n".encode())
-            self.process.stdin.flush()
+            self.popen.stdin.write(f"{cell.id}\n".encode())
+            self.popen.stdin.flush()
         except BrokenPipeError:
             pass  # it has died; `ended` says so
 
     def ended(self) -> tuple[Cell, str | None] | None:
         """The cell that has just ended, if one has, and what went wrong with it."""
-        assert self.process.stdout is not None
+        assert self.popen.stdout is not None
         dead = self.dead  # before the last look at what it wrote
-        self._heard += self.process.stdout.read() or b""
+        self._heard += self.popen.stdout.read() or b""
         line, newline, rest = self._heard.partition(b"\n")
         if self.cell is None or not (newline or dead):
             return None
@@ -107,11 +107,11 @@ class Worker:
     @property
     def dead(self) -> bool:
         """Its process has ended."""
-        return self.process.poll() is not None
+        return self.popen.poll() is not None
 
     def close(self) -> None:
         """Let go of its pipes."""
-        for pipe in (self.process.stdin, self.process.stdout):
+        for pipe in (self.popen.stdin, self.popen.stdout):
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
@@ -123,22 +123,22 @@ def run_cells(
     *,
     jobs: int,
     watch: Watch = lambda status: None,
-    command: Callable[[StudyPlan], list[str]] = worker_command,
+    command: Callable[[StudyPlan], list[str]] = cell_command,
 ) -> Status:
     """Run all cells that are not finished. What fails is noted, and the others go on.
 
-    Interrupted (KeyboardInterrupt), the workers are ended first: their journals say how far they came.
+    Interrupted (KeyboardInterrupt), the cells' processes are ended first: their journals say how far they came.
 
     Args:
         folder: of the study, held by this process.
-        jobs: workers at a time.
+        jobs: cells at a time.
     """
     cells = cells_of(study)
     cost = {cell.id: estimated_seconds(study, cell) for cell in cells}
     status = Status(len(cells), {cell.id for cell in cells if is_finished(folder, cell.id)})
     waiting = [cell for cell in cells if cell.id not in status.finished]
     status.cost_left = sum(cost[cell.id] for cell in waiting)
-    workers: list[Worker] = []
+    processes: list[CellProcess] = []
     started = 0
     begun = time.monotonic()
     watch(status)
@@ -146,27 +146,27 @@ def run_cells(
         while waiting or status.running:
             _skip(waiting, status)
             ready = [cell for cell in waiting if status.finished.issuperset(cell.needs)]
-            idle = [worker for worker in workers if worker.cell is None]
+            idle = [process for process in processes if process.cell is None]
             for cell in ready[: max(jobs, 1) - len(status.running)]:
                 if not idle:
                     started += 1
-                    workers.append(Worker(command(study), folder / LOG.format(started)))
-                    idle = workers[-1:]
+                    processes.append(CellProcess(command(study), folder / LOG.format(started)))
+                    idle = processes[-1:]
                 waiting.remove(cell)
                 idle.pop().begin(cell)
                 status.running.add(cell.id)
-            for worker in list(workers):
-                if (end := worker.ended()) is not None:
+            for process in list(processes):
+                if (end := process.ended()) is not None:
                     _note(*end, folder, cost, status)
-                if worker.dead:
-                    worker.close()
-                    workers.remove(worker)
+                if process.dead:
+                    process.close()
+                    processes.remove(process)
             status.seconds = time.monotonic() - begun
             watch(status)
             if status.running:
                 time.sleep(WAKE)
     finally:
-        _end(workers)
+        _end(processes)
     return status
 
 
@@ -181,7 +181,7 @@ def _note(cell: Cell, problem: str | None, folder: Path, cost: dict[str, float],
 
 
 def last_words(log: Path) -> str:
-    """The last line that a worker wrote."""
+    """The last line that a cell's process wrote."""
     try:
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     except OSError:
@@ -197,18 +197,18 @@ def _skip(waiting: list[Cell], status: Status) -> None:
             status.skipped.add(cell.id)
 
 
-def _end(workers: Iterable[Worker]) -> None:
-    mine = list(workers)
-    for worker in mine:
-        if worker.cell is None:
-            worker.close()  # it keeps what it has compiled
+def _end(processes: Iterable[CellProcess]) -> None:
+    mine = list(processes)
+    for process in mine:
+        if process.cell is None:
+            process.close()  # it keeps what it has compiled
         else:
-            worker.process.terminate()
+            process.popen.terminate()
     deadline = time.monotonic() + GRACE
-    for worker in mine:
+    for process in mine:
         try:
-            worker.process.wait(max(deadline - time.monotonic(), 0.1))
+            process.popen.wait(max(deadline - time.monotonic(), 0.1))
         except subprocess.TimeoutExpired:
-            worker.process.kill()
-            worker.process.wait()
-        worker.close()
+            process.popen.kill()
+            process.popen.wait()
+        process.close()

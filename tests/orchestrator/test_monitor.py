@@ -15,7 +15,7 @@ import pytest
 from orchestrator.events import LogLine
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.monitor.simulation import simulation_rrd
-from orchestrator.monitor.worker import Worker
+from orchestrator.monitor.worker import QueueThread
 from sim_engine.simulated import RecordedFrames, SimulatedPour
 from tests.orchestrator import watched
 from tests.patience import PATIENCE
@@ -198,7 +198,7 @@ def test_slow_disk_drops_and_counts_events_and_never_holds_up_the_campaign() -> 
         release.wait(10.0)
         seen.append(item)
 
-    worker: Worker[int] = Worker(slow, lambda: None, capacity=5, name="slow disk")
+    worker: QueueThread[int] = QueueThread(slow, lambda: None, capacity=5, name="slow disk")
     begin = time.monotonic()
     taken = [worker.put(i) for i in range(1000)]
     assert time.monotonic() - begin < 1.0
@@ -211,7 +211,9 @@ def test_slow_disk_drops_and_counts_events_and_never_holds_up_the_campaign() -> 
 
 def test_hanging_disk_does_not_keep_the_run_from_ending() -> None:
     release = threading.Event()
-    worker: Worker[int] = Worker(lambda _: release.wait(30.0) and None, lambda: None, capacity=5, name="hanging disk")
+    worker: QueueThread[int] = QueueThread(
+        lambda _: release.wait(30.0) and None, lambda: None, capacity=5, name="hanging disk"
+    )
     worker.put(1)
     begin = time.monotonic()
     assert not worker.close(0.2)

@@ -115,6 +115,7 @@ class ToyBench:
 class ToySimulators:
     pauses: Callable[[], float] = lambda: 0.0
     size: int = 2
+    separate: bool = False
     tasks: list[PourTask] = field(default_factory=list)
     cancelled: int = 0
     running: int = 0

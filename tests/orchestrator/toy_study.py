@@ -1,4 +1,7 @@
-"""A study in a toy laboratory: its worker, and a command that tests kill. `python toy_study.py STUDY.yaml [CELL]`."""
+"""A study in a toy laboratory: a process for its cells, and a command that tests kill.
+
+`python toy_study.py STUDY.yaml [cells]`.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,10 @@ import numpy as np
 from actors.optimizer.core.propose import propose
 from actors.spec import LaboratorySpec
 from orchestrator.config.study.sections import load_study
+from orchestrator.study.cell_process import work
 from orchestrator.study.folder import opened
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.runner import Status, run_cells
-from orchestrator.study.worker import work
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
@@ -38,6 +41,7 @@ def spilled(action: Action, theta: SimulationParameters, seed: int) -> float:
 
 class _Simulators:
     size = 1
+    separate = False
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
         await asyncio.sleep(float(os.environ.get(PAUSE, "0")))
@@ -78,8 +82,8 @@ class ToyLaboratory:
 
 
 def toy_command(study: StudyPlan) -> list[str]:
-    """A worker with a toy laboratory."""
-    return [sys.executable, str(Path(__file__)), str(study.source), "worker"]
+    """A process for cells with a toy laboratory."""
+    return [sys.executable, str(Path(__file__)), str(study.source), "cells"]
 
 
 def run_toy_study(study: StudyPlan, **arguments: Any) -> Status:

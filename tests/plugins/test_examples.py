@@ -8,7 +8,7 @@ from decimal import Decimal
 
 import pytest
 
-from actors.balance.reading import FrameError, Reading, Status
+from actors.balance.reading import LineError, Reading, Status
 from actors.balance.virtual_balance import Load
 from actors.contracts.balance import BalanceBench, BalanceContract
 from sim_engine.vessel.build import build_vessel
@@ -42,7 +42,7 @@ def test_lines_of_the_dialect_are_read_and_written(line: bytes, status: Status, 
 
 @pytest.mark.parametrize("line", [b"", b"12.3", b"12,3 g", b"12.3 g?", b"x12.3 g"])
 def test_half_a_line_is_no_weight(line: bytes) -> None:
-    with pytest.raises(FrameError):
+    with pytest.raises(LineError):
         PLAIN.decode(line)
     with pytest.raises(ValueError, match="no words"):
         PLAIN.encode(Reading(Status.OVER, None))

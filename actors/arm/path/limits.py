@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from actors.arm.path.frames import cell_frames, flange_frames, flange_poses, pourer_frames
 from actors.arm.path.kinematics import MODELS, beyond_reach, inverse, singularities
+from actors.arm.path.transforms import cell_transforms, flange_poses, flange_transforms, pourer_transforms
 from actors.arm.spec import UrArmSpec
 from sim_engine.vessel.sdf import MARGIN
 
@@ -92,14 +92,14 @@ def _home(spec: UrArmSpec) -> list[str]:
             problems.append(
                 f"home: {name} at {math.degrees(angle):.1f} deg is outside its range of ±{math.degrees(most):.0f} deg"
             )
-    pourer = pourer_frames(q, spec)
+    pourer = pourer_transforms(q, spec)
     lean = math.acos(float(np.clip(pourer.rotation[0, 2, 2], -1.0, 1.0)))
     if lean > UPRIGHT:
         problems.append(
             f"home: the pourer leans {math.degrees(lean):.1f} deg there; it waits full, at most "
             f"{math.degrees(UPRIGHT):.0f} deg are allowed. Are 'tool', 'grip' and 'mount' right?"
         )
-    tool = flange_frames(q, spec).apply(cell_frames(spec).tool.position)
+    tool = flange_transforms(q, spec).apply(cell_transforms(spec).tool.position)
     for name, point in (("the tool", tool[0]), ("the pourer", pourer.position[0])):
         problems += [f"home: {name} is {text}" for text in outside(point, spec)]
     margins = singularities(q, model)[0]

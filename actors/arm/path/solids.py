@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from actors.arm.path.frames import cell_frames
 from actors.arm.path.stretch import Stretch
+from actors.arm.path.transforms import cell_transforms
 from sim_engine.contact import clearance, thinned, way_of
 from sim_engine.vessel.sdf import MARGIN
 from sim_engine.vessel.vessel import Vessel
@@ -82,7 +82,7 @@ def nearest_to_receiver(stretch: Stretch, until: float, pourer: Vessel, receiver
 def nearest_links(stretch: Stretch, receiver: Vessel) -> tuple[Nearest, Nearest]:
     """Where a link of the arm comes nearest to the table, and to the receiver as a cylinder."""
     points = stretch.links
-    world = cell_frames(stretch.spec).world.inverse
+    world = cell_transforms(stretch.spec).world.inverse
     table, cup = [], []
     along = np.linspace(0.0, 1.0, 13)[:, None]
     for name, first, second, radius in LINKS:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.joint_path import JointPath
-from actors.arm.path.frames import Frames, cell_frames, flange_frames, flange_poses, quaternions
 from actors.arm.path.kinematics import MODELS, RobotModel, link_points, singularities
+from actors.arm.path.transforms import Transforms, cell_transforms, flange_poses, flange_transforms, quaternions
 from actors.arm.spec import UrArmSpec
 
 FloatArray = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Stretch:
     joints: FloatArray
     spec: UrArmSpec
     phases: Phases = ()
-    unreached: Frames | None = None
+    unreached: Transforms | None = None
 
     @classmethod
     def of(cls, name: str, path: JointPath, spec: UrArmSpec, phases: Phases = ()) -> Stretch:
@@ -52,7 +52,7 @@ class Stretch:
     def links(self) -> FloatArray:
         """Points along the arm, see `link_points`, and its TCP; room frame, shape (N, 9, 3) [m]."""
         points = link_points(self.joints, self.model)
-        room = cell_frames(self.spec).base.apply(points.reshape(-1, 3)).reshape(points.shape)
+        room = cell_transforms(self.spec).base.apply(points.reshape(-1, 3)).reshape(points.shape)
         return np.concatenate([room, self.tool[:, None]], axis=1)
 
     @property
@@ -61,25 +61,25 @@ class Stretch:
         return MODELS[self.spec.model]
 
     @cached_property
-    def flange(self) -> Frames:
+    def flange(self) -> Transforms:
         """Room frame."""
-        base = cell_frames(self.spec).base
-        return flange_frames(self.joints, self.spec) if self.unreached is None else base @ self.unreached
+        base = cell_transforms(self.spec).base
+        return flange_transforms(self.joints, self.spec) if self.unreached is None else base @ self.unreached
 
     @cached_property
     def tool(self) -> FloatArray:
         """TCP, room frame, shape (N, 3) [m]."""
-        return self.flange.apply(cell_frames(self.spec).tool.position)
+        return self.flange.apply(cell_transforms(self.spec).tool.position)
 
     @cached_property
-    def pourer(self) -> Frames:
+    def pourer(self) -> Transforms:
         """Room frame."""
-        return self.flange @ cell_frames(self.spec).pourer
+        return self.flange @ cell_transforms(self.spec).pourer
 
     @cached_property
     def poses(self) -> FloatArray:
         """Poses of the pourer in the world, shape (N, 7)."""
-        world = cell_frames(self.spec).world.inverse @ self.pourer
+        world = cell_transforms(self.spec).world.inverse @ self.pourer
         return np.concatenate([world.position, quaternions(world.rotation)], axis=-1)
 
     @cached_property

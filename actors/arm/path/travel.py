@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from actors.arm.joint_path import JointPath
-from actors.arm.path.frames import cell_frames, flange_poses, pourer_frames, quaternions
 from actors.arm.path.kinematics import MODELS, inverse, posture
 from actors.arm.path.pace import trapezoid
+from actors.arm.path.transforms import cell_transforms, flange_poses, pourer_transforms, quaternions
 from actors.arm.spec import UrArmSpec
 
 FloatArray = NDArray[np.float64]
@@ -85,7 +85,7 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
 
 def home_pose(spec: UrArmSpec) -> FloatArray:
     """Pose of the pourer in the world while the arm waits, shape (7,)."""
-    frame = cell_frames(spec).world.inverse @ pourer_frames(np.array([spec.home]), spec)
+    frame = cell_transforms(spec).world.inverse @ pourer_transforms(np.array([spec.home]), spec)
     return np.concatenate([frame.position[0], quaternions(frame.rotation)[0]])
 
 
@@ -139,7 +139,7 @@ def _line(
     rates = np.abs(np.diff(joints, axis=0)).max(axis=0) * (len(s) - 1)
     first = rates.max()
     second = np.abs(np.diff(joints, n=2, axis=0)).max() * (len(s) - 1) ** 2
-    reach = float(np.linalg.norm(cell_frames(spec).pourer.position)) + 0.1
+    reach = float(np.linalg.norm(cell_transforms(spec).pourer.position)) + 0.1
     way = distance + angle * reach
     # half of the joints' acceleration is kept for what a bent way asks for at full speed
     half = 0.5 * spec.approach_acceleration

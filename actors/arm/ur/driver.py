@@ -25,15 +25,15 @@ from actors.arm.errors import (
 from actors.arm.geometry import Joints, Pose
 from actors.arm.joint_path import ExecutedPath, PourPath
 from actors.arm.path.checks import recheck
-from actors.arm.path.frames import cell_frames
 from actors.arm.path.kinematics import MODELS, forward
+from actors.arm.path.transforms import cell_transforms
 from actors.arm.protocol import ArmState, Whereabouts
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.facts import UrFacts
 from actors.arm.ur.jogging import jog_path
 from actors.arm.ur.legs import Leg
-from actors.arm.ur.messages import MotionOrder, Outcome, Reading, Settings
+from actors.arm.ur.messages import DataPackage, MotionOrder, Outcome, Settings
 from actors.arm.ur.script import path_program
 from actors.arm.ur.session import ANSWER_TIME, Session
 from actors.arm.ur.stopping import Stops, StopTimes
@@ -106,7 +106,7 @@ class UrArm:
             return self._joints()
 
     def _joints(self) -> Joints:
-        reading: Reading = self._session.ask("read")
+        reading: DataPackage = self._session.ask("read")
         a, b, c, d, e, f = reading.joints
         return a, b, c, d, e, f
 
@@ -114,7 +114,7 @@ class UrArm:
         """See `Arm.where`."""
         joints = self.joints()
         rotation, position = forward(np.array([joints]), MODELS[self._spec.model])
-        tool = cell_frames(self._spec).tool
+        tool = cell_transforms(self._spec).tool
         x, y, z = map(float, position[0] + rotation[0] @ tool.position)
         rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
         return Whereabouts(Pose(x, y, z, rx, ry, rz), joints, self._spec.home)

@@ -9,9 +9,9 @@ import numpy as np
 from actors.arm.errors import ArmRefusedError
 from actors.arm.geometry import Joints
 from actors.arm.joint_path import FloatArray, JointPath
-from actors.arm.path.frames import cell_frames, flange_frames
 from actors.arm.path.kinematics import MODELS, forward, inverse
 from actors.arm.path.limits import outside
+from actors.arm.path.transforms import cell_transforms, flange_transforms
 from actors.arm.spec import UrArmSpec
 
 FARTHEST_TURN, FARTHEST_WAY = math.radians(10.0), 0.05
@@ -60,7 +60,7 @@ def jog_path(spec: UrArmSpec, joints: Joints, axis: str, amount: float, speed: f
 
 
 def _tool_steps(spec: UrArmSpec, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
-    model, tool = MODELS[spec.model], cell_frames(spec).tool
+    model, tool = MODELS[spec.model], cell_transforms(spec).tool
     rotation, position = forward(start[None], model)
     rotations, positions = np.repeat(rotation, _POINTS, axis=0), np.repeat(position, _POINTS, axis=0)
     along = np.eye(3)[AXES.index(axis) % 3]
@@ -93,8 +93,8 @@ def _check(spec: UrArmSpec, points: FloatArray) -> None:
     for number, (positions, most) in enumerate(zip(points.T, model.joint_range, strict=True), 1):
         if np.abs(positions).max() > most:
             raise ArmRefusedError(f"joint {number} would leave its range")
-    flange = flange_frames(points[[0, -1]], spec)
-    frames = {"tool": cell_frames(spec).tool.position, "pourer": cell_frames(spec).pourer.position}
+    flange = flange_transforms(points[[0, -1]], spec)
+    frames = {"tool": cell_transforms(spec).tool.position, "pourer": cell_transforms(spec).pourer.position}
     for thing, place in frames.items():
         begin, end = flange.apply(place)
         # Who stands outside may come back in: only what a step makes worse is refused.

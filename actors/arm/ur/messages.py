@@ -76,7 +76,7 @@ class MotionOrder:
 
 
 @dataclass(frozen=True)
-class Reading:
+class DataPackage:
     """One package of the controller.
 
     Attributes:
@@ -167,7 +167,7 @@ class Facts:
     version: tuple[int, ...]
     remote: bool | None
     program: str
-    reading: Reading
+    reading: DataPackage
     checksum: str
     tool: tuple[float, ...]
     ranges: tuple[tuple[float, float], ...] = field(default=())

@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError
-from actors.arm.ur.link import Link
 from actors.arm.ur.messages import TroubleError
+from actors.arm.ur.rtde_client import RtdeClient
 from actors.arm.ur.watch import NORMAL, RUNNING_MODE, STOPPED_PROGRAM
 
 UNLOCK_DELAY = 5.5
@@ -20,11 +20,11 @@ _PROTECTIVE, _SAFEGUARD, _EMERGENCIES, _FAULTS = 3, 5, (6, 7), (8, 9)
 _IDLE = 5
 
 
-def recover(link: Link, address: str, scale: float) -> str:
+def recover(client: RtdeClient, address: str, scale: float) -> str:
     """Unlock, switch on, release the brakes: whatever is needed.
 
     Args:
-        link: to the controller.
+        client: to the controller.
         address: of its dashboard.
         scale: controller seconds per second of the clock.
 
@@ -36,7 +36,7 @@ def recover(link: Link, address: str, scale: float) -> str:
     """
     done = []
     try:
-        mode = link.fresh().safety_mode
+        mode = client.fresh().safety_mode
         if mode in _EMERGENCIES:
             raise TroubleError("refused", "the emergency stop is still pressed; release its button first")
         if mode == _SAFEGUARD:
@@ -53,18 +53,18 @@ def recover(link: Link, address: str, scale: float) -> str:
             if mode == _PROTECTIVE:
                 _unlock(dashboard, scale)
                 done.append("protective stop unlocked")
-                _until(lambda: link.fresh().safety_mode == NORMAL, POWER_TIME / scale, "the safety mode stays")
-            if link.fresh().robot_mode < _IDLE:
+                _until(lambda: client.fresh().safety_mode == NORMAL, POWER_TIME / scale, "the safety mode stays")
+            if client.fresh().robot_mode < _IDLE:
                 dashboard.demand("power on", "Powering on")
                 done.append("switched on")
-                _until(lambda: link.fresh().robot_mode >= _IDLE, POWER_TIME / scale, "the robot does not switch on")
-            if link.fresh().robot_mode != RUNNING_MODE:
+                _until(lambda: client.fresh().robot_mode >= _IDLE, POWER_TIME / scale, "the robot does not switch on")
+            if client.fresh().robot_mode != RUNNING_MODE:
                 dashboard.demand("brake release", "Brake releasing")
                 done.append("brakes released")
                 _until(
-                    lambda: link.fresh().robot_mode == RUNNING_MODE, POWER_TIME / scale, "the brakes are not released"
+                    lambda: client.fresh().robot_mode == RUNNING_MODE, POWER_TIME / scale, "the brakes are not released"
                 )
-        _until(lambda: link.fresh().runtime == STOPPED_PROGRAM, 3.0, "a program still runs on the controller")
+        _until(lambda: client.fresh().runtime == STOPPED_PROGRAM, 3.0, "a program still runs on the controller")
     except DashboardError as error:
         raise TroubleError("lost", str(error)) from None
     return ", ".join(done)

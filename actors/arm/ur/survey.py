@@ -151,7 +151,7 @@ def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patie
     try:
         with socket.create_connection((address, RTDE), timeout=patience) as connection:
             return _exchange(_Rtde(connection), rate, seconds)
-    except (OSError, struct.error, rtde.FramingError) as error:
+    except (OSError, struct.error, rtde.PackageError) as error:
         raise SurveyError(f"RTDE at {address} doesn't answer as it should: {error}") from error
 
 
@@ -160,11 +160,11 @@ class _Rtde:
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
-        self._frames = rtde.Frames()
+        self._packages = rtde.PackageReader()
         self._waiting: list[tuple[int, bytes]] = []
 
     def ask(self, kind: int, payload: bytes = b"") -> bytes:
-        self._connection.sendall(rtde.frame(kind, payload))
+        self._connection.sendall(rtde.package(kind, payload))
         while True:
             got, answer = self.next()
             if got == kind:
@@ -175,7 +175,7 @@ class _Rtde:
             data = self._connection.recv(65536)
             if not data:
                 raise OSError("it hung up")
-            self._waiting.extend(self._frames.feed(data))
+            self._waiting.extend(self._packages.feed(data))
         return self._waiting.pop(0)
 
 

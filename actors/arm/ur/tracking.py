@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from actors.arm.joint_path import ExecutedPath, FloatArray, JointPath
-from actors.arm.path.frames import cell_frames, pourer_motion
 from actors.arm.path.kinematics import MODELS, forward
+from actors.arm.path.transforms import cell_transforms, pourer_motion
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.messages import Sample
 
@@ -64,7 +64,7 @@ def _tracking(times: FloatArray, joints: FloatArray, path: JointPath, spec: UrAr
     lag = best_lag(times, joints, path)
     planned = path.at(times - lag)
     angles = np.abs(joints - planned).max(axis=1)
-    model, tool = MODELS[spec.model], cell_frames(spec).tool.position
+    model, tool = MODELS[spec.model], cell_transforms(spec).tool.position
     points = []
     for q in (joints, planned):
         rotation, position = forward(q, model)

@@ -8,20 +8,20 @@ import time
 from collections.abc import Callable
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
-from actors.arm.ur.link import AT_REST, Link
 from actors.arm.ur.messages import (
     DONE,
     READY,
     SLOWEST_HEARTBEAT,
     STOPPED,
+    DataPackage,
     MotionOrder,
     Outcome,
     Progress,
-    Reading,
     Sample,
     TroubleError,
 )
 from actors.arm.ur.primary import Primary, PrimaryError
+from actors.arm.ur.rtde_client import AT_REST, RtdeClient
 
 AT_START = 0.01
 """Joints may be so far from a path's first point [rad]: that is aligned slowly before the path begins."""
@@ -58,7 +58,7 @@ _ROBOT = {-1: "no controller", 0: "disconnected", 1: "safety to be confirmed", 2
 _ROBOT |= {5: "idle, brakes closed", 6: "being moved by hand", 7: "running", 8: "updating"}
 
 
-def why_not_ready(reading: Reading) -> str:
+def why_not_ready(reading: DataPackage) -> str:
     """Why an arm can't move; '' if it can."""
     if reading.safety_mode != NORMAL:
         return f"{_SAFETY.get(reading.safety_mode, ('', f'safety mode {reading.safety_mode}'))[1]} is in force"
@@ -75,7 +75,7 @@ class Watch:
     """One motion.
 
     Args:
-        link: to the controller.
+        client: to the controller.
         address: of the controller, for its other ports.
         motion: which.
         tell: told some twenty times a second where it is.
@@ -84,13 +84,13 @@ class Watch:
 
     def __init__(
         self,
-        link: Link,
+        client: RtdeClient,
         address: str,
         motion: MotionOrder,
         tell: Callable[[Progress], None],
         owner_seen: Callable[[], float],
     ) -> None:
-        self._link, self._address, self._motion = link, address, motion
+        self._client, self._address, self._motion = client, address, motion
         self._tell, self._owner_seen = tell, owner_seen
         self._ordered = threading.Event()
         self._samples: list[Sample] = []
@@ -106,7 +106,7 @@ class Watch:
     def order_stop(self) -> None:
         """Stop; from any thread."""
         self._ordered.set()
-        self._link.order_stop(self._motion.number)
+        self._client.order_stop(self._motion.number)
 
     def run(self) -> Outcome:
         """The whole motion.
@@ -114,7 +114,7 @@ class Watch:
         Raises:
             TroubleError: refused before anything moved.
         """
-        reading = self._link.fresh()
+        reading = self._client.fresh()
         self._refuse_if(why_not_ready(reading))
         self._refuse_if(_elsewhere(reading.joints, self._motion.start))
         self._refuse_if(_not_remote(self._address))
@@ -144,9 +144,9 @@ class Watch:
                 raise TroubleError("refused", refusal + (f" (the controller says: {said})" if said else ""))
             if self._ordered.is_set():
                 return self._broken_off("operator", "stopped by the operator")
-            self._began = self._link.fresh().time
+            self._began = self._client.fresh().time
             self._went = True
-            self._link.go(self._motion.number)
+            self._client.go(self._motion.number)
             return self._until_end(primary)
         except TroubleError as trouble:
             if trouble.kind == "refused":
@@ -214,7 +214,7 @@ class Watch:
                 self.order_stop()
             time.sleep(LOOK_INTERVAL)
 
-    def _stopped_by_safety(self, reading: Reading) -> Outcome:
+    def _stopped_by_safety(self, reading: DataPackage) -> Outcome:
         # A safeguard stop would go on by itself once it is released, a protective stop at somebody's 'play'.
         kind, text = _SAFETY.get(
             reading.safety_mode, ("safety", f"the robot is {_ROBOT.get(reading.robot_mode, 'not running')}")
@@ -240,7 +240,7 @@ class Watch:
 
     def _broken_off(self, kind: str, text: str) -> Outcome:
         """End the program, whatever it is doing, and see the arm stand."""
-        self._link.order_stop(self._motion.number)
+        self._client.order_stop(self._motion.number)
         end = time.monotonic() + STANDING_TIME
         asked = False
         while time.monotonic() < end:
@@ -257,7 +257,7 @@ class Watch:
         return self._outcome(kind, text + "; it could not be seen to stand and its program to end")
 
     def _end_program(self) -> None:
-        self._link.order_stop(self._motion.number)
+        self._client.order_stop(self._motion.number)
         with contextlib.suppress(DashboardError):
             stop_program(self._address, 0.5)
 
@@ -276,9 +276,9 @@ class Watch:
 
     # ---- each turn
 
-    def _look(self) -> Reading:
+    def _look(self) -> DataPackage:
         self._beat()
-        reading = self._link.look(1.0 if self._went else AT_REST)
+        reading = self._client.look(1.0 if self._went else AT_REST)
         self._joints = reading.joints
         if self._went:
             self._slider = min(self._slider, reading.slider)
@@ -300,7 +300,7 @@ class Watch:
             self._longest_pause = max(self._longest_pause, now - self._last_beat)
         self._last_beat, self._next_beat = now, now + BEAT_INTERVAL
         self._beats += 1
-        self._link.beat(self._beats)
+        self._client.beat(self._beats)
 
 
 def _near(a: tuple[float, ...], b: tuple[float, ...], tolerance: float) -> bool:

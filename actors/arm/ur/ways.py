@@ -6,7 +6,7 @@ import numpy as np
 
 from actors.arm.errors import ArmRefusedError
 from actors.arm.joint_path import FloatArray, JointPath, PourPath
-from actors.arm.path.frames import pourer_frames
+from actors.arm.path.transforms import pourer_transforms
 from actors.arm.spec import UrArmSpec
 
 OFF_PATH = 0.1
@@ -23,7 +23,7 @@ _GRID = 0.02
 
 def leans(joints: FloatArray, spec: UrArmSpec) -> FloatArray:
     """Tilt of the pourer for joints (T, 6) [rad], shape (T,) [rad]."""
-    tilts: FloatArray = np.arccos(np.clip(pourer_frames(joints, spec).rotation[..., 2, 2], -1.0, 1.0))
+    tilts: FloatArray = np.arccos(np.clip(pourer_transforms(joints, spec).rotation[..., 2, 2], -1.0, 1.0))
     return tilts
 
 

@@ -17,10 +17,10 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
-from actors.arm.ur.link import Link
-from actors.arm.ur.messages import Facts, MotionOrder, Outcome, Progress, Reading, TroubleError
+from actors.arm.ur.messages import DataPackage, Facts, MotionOrder, Outcome, Progress, TroubleError
 from actors.arm.ur.primary import Primary, PrimaryError
 from actors.arm.ur.recovery import recover
+from actors.arm.ur.rtde_client import RtdeClient
 from actors.arm.ur.watch import STOPPED_PROGRAM, Watch
 
 HANDS_IN_TIME = 3.0
@@ -37,7 +37,7 @@ class Worker:
         self._connection = connection
         self._sending = threading.Lock()
         self._requests: queue.SimpleQueue[tuple[int, str, tuple[Any, ...]]] = queue.SimpleQueue()
-        self._link: Link | None = None
+        self._client: RtdeClient | None = None
         self._address = ""
         self._watch: Watch | None = None
         self._stops = 0
@@ -89,22 +89,22 @@ class Worker:
 
     # ---- requests
 
-    def open(self, address: str, rate: float, silence: float) -> Reading:
+    def open(self, address: str, rate: float, silence: float) -> DataPackage:
         """Connect; nothing moves."""
         self._address = address
-        self._link = Link(address, rate, silence)
-        return self._link.fresh()
+        self._client = RtdeClient(address, rate, silence)
+        return self._client.fresh()
 
     @property
-    def link(self) -> Link:
+    def client(self) -> RtdeClient:
         """To the controller."""
-        if self._link is None:
+        if self._client is None:
             raise TroubleError("lost", "not connected")
-        return self._link
+        return self._client
 
     def facts(self) -> Facts:
         """Who is there, and how it is; nothing moves."""
-        reading = self.link.fresh()
+        reading = self.client.fresh()
         try:
             with Dashboard(self._address) as dashboard:
                 version = _version(dashboard.ask("PolyscopeVersion"))
@@ -121,13 +121,13 @@ class Worker:
             *(primary.state.checksum, primary.state.tool, primary.state.joint_ranges, primary.state.joint_speeds),
         )
 
-    def read(self) -> Reading:
+    def read(self) -> DataPackage:
         """A fresh package."""
-        return self.link.fresh()
+        return self.client.fresh()
 
     def run(self, motion: MotionOrder) -> Outcome:
         """Make a motion."""
-        watch = Watch(self.link, self._address, motion, self._tell, lambda: self._owner_seen)
+        watch = Watch(self.client, self._address, motion, self._tell, lambda: self._owner_seen)
         self._watch = watch
         try:
             if self._stops > motion.stops:
@@ -140,12 +140,12 @@ class Worker:
         """End any program, and see that none runs."""
         end = time.monotonic() + HANDS_IN_TIME
         refusal = ""
-        if self.link.fresh().runtime != STOPPED_PROGRAM:
+        if self.client.fresh().runtime != STOPPED_PROGRAM:
             try:
                 stop_program(self._address)
             except DashboardError as error:
                 refusal = f" ({error})"
-        while self.link.fresh().runtime != STOPPED_PROGRAM:
+        while self.client.fresh().runtime != STOPPED_PROGRAM:
             if time.monotonic() > end:
                 raise TroubleError("refused", f"a program still runs on the controller{refusal}: keep hands out")
         try:
@@ -155,12 +155,12 @@ class Worker:
             raise TroubleError("lost", str(error)) from None
         if not answer.upper().startswith("STOPPED"):
             raise TroubleError("refused", f"the controller says that its program is '{answer}': keep hands out")
-        if not self.link.fresh().stands:
+        if not self.client.fresh().stands:
             raise TroubleError("refused", "the arm still moves: keep hands out")
 
     def recover(self, scale: float) -> str:
         """Make the robot ready after a stop; nothing moves but the brakes."""
-        return recover(self.link, self._address, scale)
+        return recover(self.client, self._address, scale)
 
 
 def _version(text: str) -> tuple[int, ...]:

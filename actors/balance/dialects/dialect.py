@@ -85,7 +85,7 @@ class Dialect(ABC):
             line: without its CR LF.
 
         Raises:
-            FrameError: it is none of this dialect's.
+            LineError: it is none of this dialect's.
         """
 
     @abstractmethod

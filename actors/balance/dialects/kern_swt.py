@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
-from actors.balance.reading import FrameError, Reading, Reply, Status
+from actors.balance.reading import LineError, Reading, Reply, Status
 from actors.balance.virtual_serial.voice import END, Display, Said, Voice, Waiting, silently, weight_line
 
 STABLE_WIDTHS = (16, 17)
@@ -55,7 +55,7 @@ class KernSwt(Dialect):
         """See `Dialect.decode`."""
         text = text_of(line)
         if text is None:
-            raise FrameError("not printable ASCII")
+            raise LineError("not printable ASCII")
         if text.strip() == "Error" and len(text) in FAULT_WIDTHS:
             return Reading(Status.ERROR)
         if text.strip() == "=Overload=":
@@ -63,10 +63,10 @@ class KernSwt(Dialect):
         match = _LINE.fullmatch(text)
         value = number_in(match["sign"].strip() + match["value"]) if match is not None else None
         if match is None or value is None:
-            raise FrameError("not a weight")
+            raise LineError("not a weight")
         widths = STABLE_WIDTHS if match["unit"] else UNSTABLE_WIDTHS
         if len(text) not in widths:
-            raise FrameError(f"{len(text)} characters; a weight has {' or '.join(map(str, widths))}")
+            raise LineError(f"{len(text)} characters; a weight has {' or '.join(map(str, widths))}")
         return Reading(Status.STABLE if match["unit"] else Status.UNSTABLE, value, match["unit"])
 
     def encode(self, reading: Reading) -> bytes:

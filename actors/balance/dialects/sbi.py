@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
-from actors.balance.reading import FrameError, Reading, Reply, Status
+from actors.balance.reading import LineError, Reading, Reply, Status
 from actors.balance.virtual_serial.voice import END, Display, Said, Voice, Waiting, line_of, silently, weight_line
 
 SHORT, LONG = 14, 20
@@ -60,11 +60,11 @@ class Sbi(Dialect):
         """See `Dialect.decode`."""
         text = text_of(line)
         if text is None:
-            raise FrameError("not printable ASCII")
+            raise LineError("not printable ASCII")
         if len(text) == LONG:
             text = text[LONG - SHORT :]
         if len(text) != SHORT:
-            raise FrameError(f"{len(text)} characters; this dialect's lines have {SHORT} or {LONG}")
+            raise LineError(f"{len(text)} characters; this dialect's lines have {SHORT} or {LONG}")
         word = text.strip()
         if word in _WORDS:
             return Reading(_WORDS[word], detail=word if word.startswith("C") else "")
@@ -103,13 +103,13 @@ def _weight(text: str) -> Reading:
     """From the 14 characters of a weight."""
     sign, digits, unit = text[0], _BRACKETS.sub(r"\1", text[1:11]).strip(), text[11:]
     if sign not in "+- " or not unit.isascii():
-        raise FrameError("not a weight")
+        raise LineError("not a weight")
     if "[" in text:  # brackets take the blank's place before the unit
         digits = digits.strip()
     number = number_in(digits)
     name = unit.strip()
     if number is None or (name and re.fullmatch(r"[A-Za-z%/]{1,3}", name) is None):
-        raise FrameError("not a weight")
+        raise LineError("not a weight")
     if sign == "-":
         number = -number
     return Reading(Status.STABLE if name else Status.UNSTABLE, number, name)

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 
 from actors.balance.dialects.dialect import number_in, text_of
-from actors.balance.reading import Acknowledgement, Answer, FrameError, Reading, Reply, Status
+from actors.balance.reading import Acknowledgement, Answer, LineError, Reading, Reply, Status
 from actors.balance.virtual_serial.voice import END, Display, Lines, Repeat, Said, Waiting, line_of, weight_line
 
 WEIGHTS = {"S": Status.STABLE, "D": Status.UNSTABLE}
@@ -37,22 +37,22 @@ def decode(line: bytes) -> Reply:
         line: without its CR LF.
 
     Raises:
-        FrameError: it is no such line.
+        LineError: it is no such line.
     """
     text = text_of(line)
     if text is None:
-        raise FrameError("not printable ASCII")
+        raise LineError("not printable ASCII")
     words = text.split()
     if not words:
-        raise FrameError("empty")
+        raise LineError("empty")
     if words[0] in REFUSALS and len(words) == 1:
         return Acknowledgement("", Answer.REFUSED, REFUSALS[words[0]])
     if words[0] == "S":
         return _weight(words)
     if not COMMAND.fullmatch(words[0]) or len(words) < 2 or (words[1] not in ANSWERS and words[1] != "B"):
-        raise FrameError("neither a weight nor an answer to a command")
+        raise LineError("neither a weight nor an answer to a command")
     if words[1] in WEIGHTS and len(words) > 2 and (len(words) != 4 or number_in(words[2]) is None):
-        raise FrameError("the weight is damaged")
+        raise LineError("the weight is damaged")
     return Acknowledgement(words[0], ANSWERS.get(words[1], Answer.BUSY), " ".join(words[2:]))
 
 
@@ -66,7 +66,7 @@ def _weight(words: list[str]) -> Reading:
             weight = number_in(value)
             if weight is not None and UNIT.fullmatch(unit):
                 return Reading(WEIGHTS[state], weight, unit)
-    raise FrameError("not a weight")
+    raise LineError("not a weight")
 
 
 def encode(reading: Reading) -> bytes:

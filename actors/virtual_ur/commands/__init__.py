@@ -10,7 +10,7 @@ from actors.virtual_ur.urscript.program import Command
 def commands_of(controller: Machine) -> dict[str, Command]:
     """All commands, bound to one controller, by the names that programs use."""
     found: dict[str, Command] = {}
-    for part in (maths.COMMANDS, motion.Motion(controller).commands(), queries.Queries(controller).commands()):
+    for part in (maths.COMMANDS, motion.MoveCommands(controller).commands(), queries.Queries(controller).commands()):
         found.update(part)
     found.update(settings.Settings(controller).commands())
     found.update(signals.Signalling(controller).commands())

@@ -12,13 +12,13 @@ from actors.virtual_ur.poses import (
     Matrix,
     compose,
     distance,
-    frame_of,
     invert,
     multiply,
     pose_of,
     rotation_between,
     rotation_matrix,
     rotation_vector,
+    transform_of,
     transpose,
 )
 from actors.virtual_ur.urscript.errors import ScriptError
@@ -28,31 +28,31 @@ from actors.virtual_ur.urscript.values import LONGEST_STRING, Pose, number, numb
 
 def pose_trans(p_from: Any, p_from_to: Any) -> Pose:
     """A pose given in another, in the frame of that other."""
-    return Pose(pose_of(compose(frame_of(six(p_from)), frame_of(six(p_from_to)))))
+    return Pose(pose_of(compose(transform_of(six(p_from)), transform_of(six(p_from_to)))))
 
 
 def pose_inv(p_from: Any) -> Pose:
     """The pose that undoes one."""
-    return Pose(pose_of(invert(frame_of(six(p_from)))))
+    return Pose(pose_of(invert(transform_of(six(p_from)))))
 
 
 def pose_add(p_1: Any, p_2: Any) -> Pose:
     """Positions added, rotations one after the other."""
-    a, b = frame_of(six(p_1)), frame_of(six(p_2))
+    a, b = transform_of(six(p_1)), transform_of(six(p_2))
     shift = [x + y for x, y in zip(a[1], b[1], strict=True)]
     return Pose([*shift, *rotation_vector(multiply(a[0], b[0]))])
 
 
 def pose_sub(p_to: Any, p_from: Any) -> Pose:
     """Positions subtracted, and the rotation from one to the other."""
-    a, b = frame_of(six(p_to)), frame_of(six(p_from))
+    a, b = transform_of(six(p_to)), transform_of(six(p_from))
     shift = [x - y for x, y in zip(a[1], b[1], strict=True)]
     return Pose([*shift, *rotation_vector(multiply(a[0], transpose(b[0])))])
 
 
 def interpolate_pose(p_from: Any, p_to: Any, alpha: Any) -> Pose:
     """Between two poses, 0 … 1, or beyond them."""
-    a, b, k = frame_of(six(p_from)), frame_of(six(p_to)), number(alpha)
+    a, b, k = transform_of(six(p_from)), transform_of(six(p_to)), number(alpha)
     shift = [x + k * (y - x) for x, y in zip(a[1], b[1], strict=True)]
     turn = [k * r for r in rotation_between(a[0], b[0])]
     return Pose([*shift, *rotation_vector(multiply(a[0], rotation_matrix(turn)))])

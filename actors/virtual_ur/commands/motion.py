@@ -11,7 +11,7 @@ from actors.virtual_ur.commands.machine import Machine
 from actors.virtual_ur.motion.actions import Action
 from actors.virtual_ur.motion.lines import JointLine, Line, ToolLine, UnreachableError
 from actors.virtual_ur.motion.mover import ControlledElsewhereError
-from actors.virtual_ur.poses import Frame, compose, distance, frame_of, norm3, rotation_between
+from actors.virtual_ur.poses import Transform, compose, distance, norm3, rotation_between, transform_of
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.program import Command, Steps
 from actors.virtual_ur.urscript.values import number
@@ -29,7 +29,7 @@ UNSUPPORTED = (
 """Real controllers know these; a program that calls one here ends with an error."""
 
 
-class Motion:
+class MoveCommands:
     """Bound to one controller.
 
     Args:
@@ -68,7 +68,7 @@ class Motion:
 
     def movej(self, q: Any, a: Any = 1.4, v: Any = 1.05, t: Any = 0, r: Any = 0) -> Steps:
         """To joint positions or a pose, straight in joint space."""
-        target = self._inverse(frame_of(six(q))) if is_pose(q) else six(q)
+        target = self._inverse(transform_of(six(q))) if is_pose(q) else six(q)
         while beyond := self._controller.safety.configuration.joints_violation(target):
             self._controller.protective_stop(f"the target is not allowed: {beyond}")
             yield  # until somebody lets the program go on, which won't help
@@ -76,7 +76,7 @@ class Motion:
 
     def movel(self, pose: Any, a: Any = 1.2, v: Any = 0.25, t: Any = 0, r: Any = 0) -> Steps:
         """To a pose or joint positions, the tool straight in space."""
-        target = frame_of(six(pose)) if is_pose(pose) else self._robot.arm.frame(six(pose))
+        target = transform_of(six(pose)) if is_pose(pose) else self._robot.arm.frame(six(pose))
         self._inverse(target)
         arm = self._robot.arm
         return self._follow(lambda start: ToolLine(arm, arm.frame(start), target), a, v, t, r)
@@ -111,7 +111,7 @@ class Motion:
 
     def servoc(self, pose: Any, a: Any = 1.2, v: Any = 0.25, r: Any = 0) -> Steps:
         """Towards a pose at the tool's speed, braking in time; to be called again and again."""
-        target, speed, acceleration = frame_of(six(pose)), rate(v, "speed"), rate(a, "acceleration")
+        target, speed, acceleration = transform_of(six(pose)), rate(v, "speed"), rate(a, "acceleration")
 
         def aim() -> None:
             here = self._robot.arm.frame(self._mover.q)
@@ -214,7 +214,7 @@ class Motion:
         if not done:
             self._mover.abandon()
 
-    def _inverse(self, frame: Frame) -> Joints:
+    def _inverse(self, frame: Transform) -> Joints:
         try:
             return self._robot.arm.joints(frame, self._mover.q)
         except UnreachableError as error:

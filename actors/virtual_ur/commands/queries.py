@@ -10,7 +10,7 @@ from actors.virtual_ur.commands.arguments import is_pose, six, whole
 from actors.virtual_ur.commands.machine import Machine
 from actors.virtual_ur.motion.actions import Path
 from actors.virtual_ur.motion.lines import Arm, ToolLine, UnreachableError
-from actors.virtual_ur.poses import frame_of, pose_of
+from actors.virtual_ur.poses import pose_of, transform_of
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.program import Command
 from actors.virtual_ur.urscript.values import Pose
@@ -85,7 +85,7 @@ class Queries:
     def _arm(self, tcp: Any) -> Arm:
         if tcp is None or tcp == "active_tcp":
             return self._robot.arm
-        return Arm(self._robot.kinematics, frame_of(six(tcp)))
+        return Arm(self._robot.kinematics, transform_of(six(tcp)))
 
     def forward(self, q: Any = None, tcp: Any = None) -> Pose:
         """Pose of the tool at joint positions; measured ones by default."""
@@ -93,7 +93,7 @@ class Queries:
 
     def _solve(self, x: Any, qnear: Any, tcp: Any) -> Joints:
         near = self._robot.q if qnear is None else six(qnear)
-        return self._arm(tcp).joints(frame_of(six(x)), near)
+        return self._arm(tcp).joints(transform_of(six(x)), near)
 
     def inverse(
         self, x: Any, qnear: Any = None, maxPositionError: Any = 0, maxOrientationError: Any = 0, tcp: Any = None
@@ -118,7 +118,7 @@ class Queries:
         """Whether a pose or joint positions are reachable and allowed by the safety configuration."""
         configuration, arm = self._robot.configuration, self._robot.arm
         if is_pose(x):
-            frame = frame_of(six(x))
+            frame = transform_of(six(x))
             try:
                 q = arm.joints(frame, self._robot.q)
             except UnreachableError:

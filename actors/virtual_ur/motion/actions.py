@@ -9,7 +9,7 @@ from typing import Protocol
 from actors.ur.models import Joints
 from actors.virtual_ur.motion.lines import Arm, Corner, Line, UnreachableError
 from actors.virtual_ur.motion.profile import Profile
-from actors.virtual_ur.poses import Frame, multiply, norm3, rotation_matrix
+from actors.virtual_ur.poses import Transform, multiply, norm3, rotation_matrix
 
 STILL = 1e-9
 """Joint speed that counts as none [rad/s]."""
@@ -220,7 +220,7 @@ class ToolSpeed:
     def __init__(self, arm: Arm, target: Sequence[float], acceleration: float, turning: float) -> None:
         self.finished = False
         self._arm = arm
-        self._frame: Frame | None = None
+        self._frame: Transform | None = None
         self._velocity: list[float] = [0.0] * 6
         self.aim(target, acceleration, turning)
 

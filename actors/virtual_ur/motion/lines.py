@@ -7,7 +7,7 @@ from typing import Protocol
 from actors.ur.models import Joints
 from actors.virtual_ur.kinematics import Kinematics
 from actors.virtual_ur.poses import (
-    Frame,
+    Transform,
     Vector,
     compose,
     distance,
@@ -53,16 +53,16 @@ class Arm:
         tool: tool centre point in the flange's frame.
     """
 
-    def __init__(self, kinematics: Kinematics, tool: Frame) -> None:
+    def __init__(self, kinematics: Kinematics, tool: Transform) -> None:
         self.kinematics = kinematics
         self.tool = tool
         self._back = invert(tool)
 
-    def frame(self, q: Joints) -> Frame:
+    def frame(self, q: Joints) -> Transform:
         """Where the tool centre point is."""
         return compose(self.kinematics.flange(q), self.tool)
 
-    def joints(self, frame: Frame, near: Joints) -> Joints:
+    def joints(self, frame: Transform, near: Joints) -> Joints:
         """Joint positions for the tool centre point, nearest to others.
 
         Raises:
@@ -120,15 +120,15 @@ class ToolLine:
         start, end: of the tool centre point.
     """
 
-    def __init__(self, arm: Arm, start: Frame, end: Frame) -> None:
+    def __init__(self, arm: Arm, start: Transform, end: Transform) -> None:
         self.arm = arm
         self.start, self.end = start, end
         self.shift: Vector = (end[1][0] - start[1][0], end[1][1] - start[1][1], end[1][2] - start[1][2])
         self.turn = rotation_between(start[0], end[0])
         self.length = max(norm3(self.shift), norm3(self.turn))
 
-    def frame(self, s: float) -> Frame:
-        """Frame of the tool centre point at s."""
+    def frame(self, s: float) -> Transform:
+        """Transform of the tool centre point at s."""
         k = s / self.length if self.length else 1.0
         (x, y, z), (dx, dy, dz), (rx, ry, rz) = self.start[1], self.shift, self.turn
         turned = multiply(self.start[0], rotation_matrix((k * rx, k * ry, k * rz)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from actors.ur import rtde
-from actors.ur.rtde import Frames, FramingError
+from actors.ur.rtde import PackageError, PackageReader
 from actors.virtual_ur.controller import Controller
 from actors.virtual_ur.fields import INPUT_KINDS, output_fields, write
 from actors.virtual_ur.servers.connections import Connection, Connections
@@ -57,7 +57,7 @@ class RtdeConnection(Connection):
     def __init__(self, server: RtdeServer) -> None:
         super().__init__(server.connections)
         self._server = server
-        self._frames = Frames()
+        self._packages = PackageReader()
         self._protocol = 1
         self._outputs: OutputRecipe | None = None
         self._recipes = 0
@@ -75,15 +75,15 @@ class RtdeConnection(Connection):
     def data_received(self, data: bytes) -> None:
         """See `asyncio.Protocol`."""
         try:
-            for kind, payload in self._frames.feed(data):
+            for kind, payload in self._packages.feed(data):
                 self._handle(kind, payload)
-        except FramingError:
+        except PackageError:
             self.drop()
 
     # ---- the protocol's side
 
     def _send(self, kind: int, payload: bytes) -> None:
-        self.send(rtde.frame(kind, payload))
+        self.send(rtde.package(kind, payload))
 
     def _handle(self, kind: int, payload: bytes) -> None:
         match kind:

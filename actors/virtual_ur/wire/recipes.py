@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from actors.ur.rtde import DATA_PACKAGE, FORMATS, TEXT_MESSAGE, frame
+from actors.ur.rtde import DATA_PACKAGE, FORMATS, TEXT_MESSAGE, package
 
 
 def text_message(protocol: int, message: str, source: str, level: int) -> bytes:
@@ -23,8 +23,8 @@ def text_message(protocol: int, message: str, source: str, level: int) -> bytes:
     """
     body, origin = message.encode()[:255], source.encode()[:255]
     if protocol < 2:
-        return frame(TEXT_MESSAGE, bytes([level]) + body)
-    return frame(TEXT_MESSAGE, bytes([len(body)]) + body + bytes([len(origin)]) + origin + bytes([level]))
+        return package(TEXT_MESSAGE, bytes([level]) + body)
+    return package(TEXT_MESSAGE, bytes([len(body)]) + body + bytes([len(origin)]) + origin + bytes([level]))
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class OutputRecipe:
         self._read = [field.read for field in fields]
 
     def package(self) -> bytes:
-        """The values now, as a frame."""
+        """The values now, as a package."""
         values = list(self._head)
         for read, single in zip(self._read, self._single, strict=True):
             if single:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from actors.arm.geometry import Cell, Mount
-from actors.arm.path.frames import cell_frames, flange_poses, pourer_frames, pourer_motion
 from actors.arm.path.kinematics import MODELS, inverse, singularities
 from actors.arm.path.limits import check_limits
 from actors.arm.path.plan import plan_path
+from actors.arm.path.transforms import cell_transforms, flange_poses, pourer_motion, pourer_transforms
 from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
 from sim_engine.action import DEG
@@ -49,7 +49,7 @@ def test_wherever_the_robot_hangs_the_pourer_does_in_the_room_what_was_asked_for
     path = plan_path(motion(), spec, vessel("beaker"), vessel("tumbler"))
     done = pourer_motion(path.pour.joints, path.pour.times, spec)
     np.testing.assert_allclose(done.tilt(path.pour.times), path.tilts, atol=0.2 * DEG)
-    upright = pourer_frames(np.array([spec.home]), spec).rotation[0, :, 2]
+    upright = pourer_transforms(np.array([spec.home]), spec).rotation[0, :, 2]
     np.testing.assert_allclose(upright, [0.0, 0.0, 1.0], atol=1e-6)
     forgotten = check_limits(replace(spec, mount=Mount()))
     assert any("the pourer leans" in problem for problem in forgotten)
@@ -67,4 +67,4 @@ def test_up_in_the_base_s_frame_is_what_controllers_call_gravity():
     np.testing.assert_allclose(Mount(tilt=180 * DEG).up, (0.0, 0.0, -1.0), atol=1e-12)
     for mount in MOUNTS.values():
         base = replace(SPEC, mount=mount)
-        np.testing.assert_allclose(cell_frames(base).base.rotation.T @ [0.0, 0.0, 1.0], mount.up, atol=1e-12)
+        np.testing.assert_allclose(cell_transforms(base).base.rotation.T @ [0.0, 0.0, 1.0], mount.up, atol=1e-12)

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from actors.arm.geometry import Plane
 from actors.arm.joint_path import JointPath, PourPath
 from actors.arm.path.checks import recheck
-from actors.arm.path.frames import cell_frames, pourer_frames, pourer_motion
 from actors.arm.path.kinematics import MODELS, forward
 from actors.arm.path.pace import STEEPEST
 from actors.arm.path.plan import plan_path
+from actors.arm.path.transforms import cell_transforms, pourer_motion, pourer_transforms
 from actors.arm.path.travel import TOOL_ACCELERATION
 from actors.arm.spec import UrArmSpec
 from actors.protocols import InvalidActionError
@@ -85,10 +85,10 @@ def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):
         times, joints = dense(part)
         step = times[1]
         assert np.abs(np.diff(joints, axis=0)).max() / step <= limits.joint_speed * (1 + 1e-6)
-        pourer = pourer_frames(joints, spec)
+        pourer = pourer_transforms(joints, spec)
         points = pourer.position[:, None] + np.einsum("tij,vj->tvi", pourer.rotation, corners)
         flange = forward(joints, MODELS["ur10e"])
-        tool = flange[1] + flange[0] @ cell_frames(spec).tool.position
+        tool = flange[1] + flange[0] @ cell_transforms(spec).tool.position
         everything = np.concatenate([points, tool[:, None]], axis=1)
         tolerance = 1e-4
         assert (everything >= np.array(limits.box_low) - tolerance).all()
@@ -126,7 +126,7 @@ def test_the_three_parts_join_from_home_to_home(action):
 def test_a_full_pourer_travels_upright_and_gently(action):
     path = planned(action)
     for part in (path.approach, path.retreat):
-        frames = pourer_frames(part.joints, SPEC)
+        frames = pourer_transforms(part.joints, SPEC)
         assert np.arccos(np.clip(frames.rotation[:, 2, 2], -1, 1)).max() < 3 * DEG
         rates = np.diff(frames.position, axis=0) / np.diff(part.times)[:, None]
         middles = 0.5 * (part.times[1:] + part.times[:-1])
@@ -209,7 +209,7 @@ def test_where_the_straight_way_would_sweep_through_the_receiver_the_pourer_is_l
     far = waiting_at(0.2, 0.0, 0.05)
     path = planned(ACTION.with_values(height=0.02), far)
     assert path.report.clearance >= LIMITS.clearance
-    heights = pourer_frames(path.approach.joints, far).position[:, 2]
+    heights = pourer_transforms(path.approach.joints, far).position[:, 2]
     assert heights.max() > 0.06 + vessel("tumbler").rim_height
 
 

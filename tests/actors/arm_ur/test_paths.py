@@ -150,11 +150,11 @@ def test_missed_packages_show_as_a_gap() -> None:
 
 
 def test_a_step_of_the_tool_is_straight_and_keeps_its_orientation() -> None:
-    from actors.arm.path.frames import pourer_frames
+    from actors.arm.path.transforms import pourer_transforms
 
     spec = settings()
     path = jog_path(spec, HOME, "y", 0.04, 0.08)  # type: ignore[arg-type]
-    frames = pourer_frames(path.joints, spec)
+    frames = pourer_transforms(path.joints, spec)
     moved = frames.position - frames.position[0]
     assert moved[-1] == pytest.approx([0.0, 0.04, 0.0], abs=1e-6)
     assert np.abs(moved[:, [0, 2]]).max() < 1e-6

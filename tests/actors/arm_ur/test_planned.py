@@ -11,8 +11,8 @@ import pytest
 
 from actors.arm.errors import ArmStoppedError
 from actors.arm.geometry import ArmLimits, Cell, Pose
-from actors.arm.path.frames import pourer_motion
 from actors.arm.path.plan import plan_path
+from actors.arm.path.transforms import pourer_motion
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.driver import UrArm
 from actors.arm.ur.ways import leans

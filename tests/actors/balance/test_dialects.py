@@ -14,7 +14,7 @@ from actors.balance.dialects.kern_swt import KERN_SWT, KernSwt
 from actors.balance.dialects.mt_sics import MT_SICS
 from actors.balance.dialects.sbi import SBI, Sbi
 from actors.balance.doors import dialects
-from actors.balance.reading import Acknowledgement, Answer, FrameError, Reading, Status
+from actors.balance.reading import Acknowledgement, Answer, LineError, Reading, Status
 from tests.depth import examples
 
 SPEAKERS: tuple[Dialect, ...] = (*dialects().values(), KernSwt(short=True), Sbi(identified=True))
@@ -84,7 +84,7 @@ def test_answers_to_commands_are_told_from_weights(line, command, answer):
 def test_any_bytes_are_understood_or_refused_in_the_stated_way(dialect, line):
     try:
         reply = dialect.decode(line)
-    except FrameError:
+    except LineError:
         return
     if isinstance(reply, Reading) and reply.value is not None:
         assert reply.value.is_finite()
@@ -122,7 +122,7 @@ def test_a_line_that_lost_its_beginning_is_never_a_smaller_weight(dialect, value
     line = dialect.encode(Reading(Status.STABLE, value, "g"))[:-2]
     try:
         reply = dialect.decode(line[cut:])
-    except FrameError:
+    except LineError:
         return
     assert reply == dialect.decode(line)  # only what carries nothing may be lost: the identification before a weight
 
@@ -133,6 +133,6 @@ def test_a_line_of_fixed_width_that_lost_a_digit_is_no_stable_weight(dialect, va
     line = dialect.encode(Reading(Status.STABLE, value, "g"))[:-2]
     try:
         reply = dialect.decode(line[:lost] + line[lost + 1 :])
-    except FrameError:
+    except LineError:
         return
     assert reply.status is not Status.STABLE

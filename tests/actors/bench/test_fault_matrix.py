@@ -19,7 +19,7 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.path.frames import pourer_motion
+from actors.arm.path.transforms import pourer_motion
 from actors.bench.virtual_operator import VirtualOperator
 from actors.operator import OperatorSpec
 from actors.protocols import LaboratoryError, NotPouredError, UnknownPourError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from actors.arm.joint_path import unpack
-from actors.arm.path.frames import pourer_motion
+from actors.arm.path.transforms import pourer_motion
 from actors.balance.placement import Placement
 from actors.operator import OperatorSpec
 from actors.protocols import InvalidActionError, NotPouredError

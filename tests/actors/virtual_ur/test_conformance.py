@@ -17,7 +17,7 @@ import pytest
 from actors.virtual_ur import VirtualController
 from actors.virtual_ur.kinematics import Kinematics
 from actors.virtual_ur.models import MODELS
-from actors.virtual_ur.poses import compose, frame_of, pose_of
+from actors.virtual_ur.poses import compose, pose_of, transform_of
 
 from .conftest import next_address, observe
 
@@ -187,7 +187,7 @@ def test_kinematics_agree_with_the_lengths_of_the_model(robot: Robot, seen: Seen
     flange = Kinematics(MODELS[robot.model]).flange(asked["q"])
     assert asked["pose"] == near(pose_of(flange), 1e-9)
     assert asked["forward"] == near(asked["pose"], 1e-9)
-    assert asked["forward of q"] == near(pose_of(compose(flange, frame_of([0, 0, 0.1, 0, 0, 0]))), 1e-9)
+    assert asked["forward of q"] == near(pose_of(compose(flange, transform_of([0, 0, 0.1, 0, 0, 0]))), 1e-9)
     assert asked["flange"] == near(asked["pose"], 1e-9)
 
 
@@ -211,7 +211,7 @@ def test_tool_and_payload_are_read_back_as_set(seen: Seen) -> None:
     asked = seen("questions")
     assert asked["tcp before"] == near([0.0] * 6)
     assert asked["tcp"] == near([0.0, 0.02, 0.15, 0.0, 0.0, 0.4])
-    expected = compose(frame_of(asked["pose"]), frame_of(asked["tcp"]))
+    expected = compose(transform_of(asked["pose"]), transform_of(asked["tcp"]))
     assert asked["pose with tcp"] == near(pose_of(expected), 1e-6)
     assert asked["payload"] == near([0.75, 0.0, 0.0, 0.06])
 

@@ -17,12 +17,12 @@ from actors.virtual_ur.poses import (
     angle_between,
     compose,
     distance,
-    frame_of,
     invert,
     multiply,
     pose_of,
     rotation_matrix,
     rotation_vector,
+    transform_of,
     transpose,
 )
 from actors.virtual_ur.robot import Robot
@@ -166,5 +166,5 @@ def test_a_half_turn_survives_too(axis: tuple[float, float, float], off: float) 
 
 @given(pose=st.tuples(small, small, small, small, small, small))
 def test_a_frame_undone_is_no_frame_at_all(pose: tuple[float, ...]) -> None:
-    frame = frame_of(pose)
+    frame = transform_of(pose)
     assert pose_of(compose(frame, invert(frame))) == pytest.approx((0.0,) * 6, abs=1e-9)

@@ -79,8 +79,8 @@ class Rtde(Wire):
     def ask(self, kind: str, payload: bytes = b"") -> bytes:
         """Send a frame; returns the payload of the one answer."""
         self.take()
-        self.say(rtde.frame(ord(kind), payload))
-        answers = list(rtde.Frames().feed(self.take()))
+        self.say(rtde.package(ord(kind), payload))
+        answers = list(rtde.PackageReader().feed(self.take()))
         assert [k for k, _ in answers] == [ord(kind)]
         return answers[0][1]
 
@@ -114,7 +114,7 @@ def test_outputs_come_at_the_rate_asked_for_with_the_types_promised(server: Rtde
     for _ in range(500):
         server.controller.tick()
         server.publish(server.controller.now)
-    frames = list(rtde.Frames().feed(one.take()))
+    frames = list(rtde.PackageReader().feed(one.take()))
     assert len(frames) in (100, 101)
     kind, payload = frames[-1]
     assert (kind, payload[0]) == (rtde.DATA_PACKAGE, 1)
@@ -148,9 +148,9 @@ def test_inputs_reach_registers_signals_and_the_slider(server: RtdeServer) -> No
     one.ask("I", b"input_int_register_3,input_double_register_47,speed_slider_mask,speed_slider_fraction")
     one.ask("I", b"configurable_digital_output_mask,configurable_digital_output")
     one.ask("I", b"standard_analog_output_mask,standard_analog_output_type,standard_analog_output_1")
-    one.say(rtde.frame(rtde.DATA_PACKAGE, b"\1" + struct.pack(">idId", -5, 2.5, 1, 0.25)))
-    one.say(rtde.frame(rtde.DATA_PACKAGE, b"\2\x06\x02"))
-    one.say(rtde.frame(rtde.DATA_PACKAGE, b"\3\x02\x02" + struct.pack(">d", 0.5)))
+    one.say(rtde.package(rtde.DATA_PACKAGE, b"\1" + struct.pack(">idId", -5, 2.5, 1, 0.25)))
+    one.say(rtde.package(rtde.DATA_PACKAGE, b"\2\x06\x02"))
+    one.say(rtde.package(rtde.DATA_PACKAGE, b"\3\x02\x02" + struct.pack(">d", 0.5)))
     assert (controller.registers.input_int[3], controller.registers.input_double[47]) == (-5, 2.5)
     assert controller.robot.mover.slider == 0.25
     assert controller.signals.digital_out == 2 << 8
@@ -162,7 +162,7 @@ def test_a_package_that_fits_no_recipe_changes_nothing(server: RtdeServer, paylo
     one = client(server)
     one.ask("I", b"input_int_register_0,input_double_register_0")
     server.controller.registers.input_int[0] = 77
-    one.say(rtde.frame(rtde.DATA_PACKAGE, payload))
+    one.say(rtde.package(rtde.DATA_PACKAGE, payload))
     assert server.controller.registers.input_int[0] == 77
     assert one.take() == b""  # a client in its setup takes whatever comes for its answer
 
@@ -171,7 +171,7 @@ def test_a_package_that_fits_no_recipe_changes_nothing(server: RtdeServer, paylo
 def test_a_speed_slider_beyond_its_ends_stays_where_it_is(server: RtdeServer, fraction: float) -> None:
     one = client(server)
     one.ask("I", b"speed_slider_mask,speed_slider_fraction")
-    one.say(rtde.frame(rtde.DATA_PACKAGE, b"\1" + struct.pack(">Id", 1, fraction)))
+    one.say(rtde.package(rtde.DATA_PACKAGE, b"\1" + struct.pack(">Id", 1, fraction)))
     assert server.controller.robot.mover.slider == 1.0
 
 
@@ -183,7 +183,7 @@ def test_every_field_can_be_sent_in_its_type(server: RtdeServer) -> None:
         assert b"NOT_FOUND" not in types
         one.ask("S")
         server.publish(1000.0 + start)
-        ((kind, payload),) = rtde.Frames().feed(one.take())
+        ((kind, payload),) = rtde.PackageReader().feed(one.take())
         assert kind == rtde.DATA_PACKAGE
         formats = "".join(rtde.FORMATS[t][0] for t in types[1:].decode().split(","))
         assert len(payload) == 1 + struct.calcsize(">" + formats)
@@ -207,8 +207,8 @@ def test_a_client_that_never_reads_is_cut_off_before_packages_fill_memory(
 @given(cuts=st.lists(st.integers(0, 60), max_size=8))
 def test_frames_arrive_whole_however_the_stream_is_cut(cuts: list[int]) -> None:
     sent = [(ord("V"), b"\0\2"), (ord("O"), b"x" * 20), (ord("S"), b""), (ord("U"), b"\1" + bytes(12))]
-    stream = b"".join(rtde.frame(k, p) for k, p in sent)
-    frames, got, place = rtde.Frames(), [], 0
+    stream = b"".join(rtde.package(k, p) for k, p in sent)
+    frames, got, place = rtde.PackageReader(), [], 0
     for cut in [*sorted(cuts), len(stream)]:
         got += frames.feed(stream[place:cut])
         place = max(place, cut)
@@ -247,14 +247,14 @@ KINDS: dict[str, Callable[[Controller], Connection]] = {
 
 known = st.sampled_from(
     [
-        rtde.frame(ord("V"), b"\0\2"),
-        rtde.frame(ord("v"), b""),
-        rtde.frame(ord("O"), struct.pack(">d", 500.0) + b"timestamp,actual_q"),
-        rtde.frame(ord("O"), struct.pack(">d", float("nan")) + b"timestamp"),
-        rtde.frame(ord("I"), b"input_int_register_0,speed_slider_mask,speed_slider_fraction"),
-        rtde.frame(ord("U"), b"\1" + bytes(16)),
-        rtde.frame(ord("S"), b""),
-        rtde.frame(ord("P"), b""),
+        rtde.package(ord("V"), b"\0\2"),
+        rtde.package(ord("v"), b""),
+        rtde.package(ord("O"), struct.pack(">d", 500.0) + b"timestamp,actual_q"),
+        rtde.package(ord("O"), struct.pack(">d", float("nan")) + b"timestamp"),
+        rtde.package(ord("I"), b"input_int_register_0,speed_slider_mask,speed_slider_fraction"),
+        rtde.package(ord("U"), b"\1" + bytes(16)),
+        rtde.package(ord("S"), b""),
+        rtde.package(ord("P"), b""),
         b"robotmode\n",
         b"play\n",
         b"stop\n",

@@ -21,6 +21,7 @@ from orchestrator.requests import Suggest
 from orchestrator.stages import calibration_stages
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
+from orchestrator.study.cell_process import run_cell
 from orchestrator.study.cells import cells_of
 from orchestrator.study.folder import finished_results, read_result
 from orchestrator.study.plan import StudyPlan
@@ -29,7 +30,6 @@ from orchestrator.study.report.deployments import draw_deployments
 from orchestrator.study.report.drawing import colour
 from orchestrator.study.report.gather import gather
 from orchestrator.study.report.tables import tables
-from orchestrator.study.worker import run_cell
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
 from tests.orchestrator.play import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, Play
 from tests.orchestrator.study_files import read, written

@@ -23,6 +23,7 @@ from orchestrator.config.load import load_campaign
 from orchestrator.config.study.sections import load_study
 from orchestrator.requests import Failed, Poured, Slots
 from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.study.cell_process import in_this_process, run_cell
 from orchestrator.study.cells import cells_of
 from orchestrator.study.code import code_now, warning
 from orchestrator.study.folder import (
@@ -36,7 +37,6 @@ from orchestrator.study.folder import (
 )
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 from orchestrator.study.strategies import FinalPour
-from orchestrator.study.worker import in_this_process, run_cell
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from tests.actors.conftest import make_fake

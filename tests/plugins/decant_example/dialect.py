@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 from actors.balance.dialects.dialect import Dialect
-from actors.balance.reading import FrameError, Reading, Reply, Status
+from actors.balance.reading import LineError, Reading, Reply, Status
 
 _LINE = re.compile(rb"(?P<value>-?[0-9]+\.[0-9]+) (?P<unit>k?g)(?P<moving>!?)")
 
@@ -25,7 +25,7 @@ class Plain(Dialect):
         """See `Dialect.decode`."""
         match = _LINE.fullmatch(line)
         if match is None:
-            raise FrameError("not a weight")
+            raise LineError("not a weight")
         status = Status.UNSTABLE if match["moving"] else Status.STABLE
         return Reading(status, Decimal(match["value"].decode()), match["unit"].decode())
 

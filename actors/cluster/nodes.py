@@ -48,7 +48,7 @@ def living_nodes() -> dict[str, Node]:
 
 
 @dataclass(frozen=True)
-class Place:
+class PinnedNode:
     """One node, for actors that may run there only.
 
     Attributes:
@@ -77,11 +77,11 @@ class Place:
             return False
 
 
-def this_node() -> Place:
+def this_node() -> PinnedNode:
     """The node that this program is connected to; without it the program can't go on anyway."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     id_ = ray.get_runtime_context().get_node_id()
     strategy = NodeAffinitySchedulingStrategy(id_, soft=False)
-    return Place(living_nodes()[id_], {"scheduling_strategy": strategy})
+    return PinnedNode(living_nodes()[id_], {"scheduling_strategy": strategy})

@@ -21,7 +21,7 @@ class JobCancelledError(Exception):
 
 
 class Simulator(Protocol):
-    """What a worker needs of the engine; `sim_engine.pour.PourSimulator` is one."""
+    """What a job runner needs of the engine; `sim_engine.pour.PourSimulator` is one."""
 
     def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """Run one pour."""
@@ -39,7 +39,7 @@ def pour_simulator() -> Simulator:
     return PourSimulator()
 
 
-class SimulationWorker:
+class JobRunner:
     """Runs jobs one after the other on one simulator.
 
     Kernels reach the cache when a simulator is closed. A process may be killed before that, and the next one on its
@@ -84,6 +84,8 @@ class SimulationWorker:
             raise JobCancelledError from None
         except Exception as error:
             raise SimulationError(f"the simulator failed: {type(error).__name__}: {error}") from error
+        if not isinstance(run, SimulatedPour):
+            raise SimulationError(f"the simulator answered with a {type(run).__name__}, not with a simulated pour")
         if self._is_first and time.process_time() - begun > self._long_first_job:
             self.close()
         self._is_first = False

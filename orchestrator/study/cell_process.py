@@ -1,8 +1,8 @@
-"""Cells in a process of their own, one after the other: `python -m orchestrator.study.worker STUDY.yaml`.
+"""Cells in a process of their own, one after the other: `python -m orchestrator.study.cell_process STUDY.yaml`.
 
 Each line of its stdin names a cell, each line of its stdout is the JSON list [cell, what went wrong or null]. Starting
-Python, Taichi and its kernels takes longer than a small cell, so a worker and its simulator are kept. It ends when its
-stdin does, amid a cell too: the cell's journal says how far it came, and the next worker goes on from there.
+Python, Taichi and its kernels takes longer than a small cell, so process and simulator are kept. It ends when its
+stdin does, amid a cell too: the cell's journal says how far it came, and the next process goes on from there.
 """
 
 from __future__ import annotations

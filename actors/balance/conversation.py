@@ -12,7 +12,7 @@ from actors.balance.complaints import REFUSED
 from actors.balance.detect import Detected, detect
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.errors import CommandError, NoConnectionError
-from actors.balance.reading import Acknowledgement, FrameError, Reading, Reply, Status
+from actors.balance.reading import Acknowledgement, LineError, Reading, Reply, Status
 from actors.balance.spec import SerialBalanceSpec
 from actors.balance.wire import Counters, PortLostError, Tap, Wire
 
@@ -20,7 +20,7 @@ _REOPEN_INTERVAL = 0.2
 _GLANCE = 0.1
 
 
-class Link:
+class Conversation:
     """The way to one balance.
 
     Args:
@@ -192,7 +192,7 @@ class Link:
     def _understood(self, line: bytes) -> Reply | None:
         try:
             reply = self.dialect.decode(line)
-        except FrameError:
+        except LineError:
             self.counters.damaged += 1
             return None
         self.counters.lines += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from actors.simulation.worker import JobCancelledError, SimulationWorker
+from actors.simulation.job_runner import JobCancelledError, JobRunner
 
 
 def never() -> bool:
@@ -17,7 +17,7 @@ def notes(log) -> list[str]:
 
 def test_kernels_are_written_after_a_first_job_that_may_have_compiled_them(fake, task, tmp_path):
     log = tmp_path / "log"
-    worker = SimulationWorker(fake(0.0, log), long_first_job=-1.0)
+    worker = JobRunner(fake(0.0, log), long_first_job=-1.0)
     for seed in range(3):
         assert worker.simulate(task(seed=seed), never).outcome.seed == seed
     assert notes(log) == ["made", "begin", "end", "closed", "made", "begin", "end", "begin", "end"]
@@ -25,7 +25,7 @@ def test_kernels_are_written_after_a_first_job_that_may_have_compiled_them(fake,
 
 def test_a_warm_process_keeps_its_simulator(fake, task, tmp_path):
     log = tmp_path / "log"
-    worker = SimulationWorker(fake(0.0, log))
+    worker = JobRunner(fake(0.0, log))
     for seed in range(2):
         worker.simulate(task(seed=seed), never)
     assert notes(log) == ["made", "begin", "end", "begin", "end"]
@@ -34,5 +34,5 @@ def test_a_warm_process_keeps_its_simulator(fake, task, tmp_path):
 def test_a_job_given_up_before_it_began_costs_nothing(fake, task, tmp_path):
     log = tmp_path / "log"
     with pytest.raises(JobCancelledError):
-        SimulationWorker(fake(0.0, log)).simulate(task(), lambda: True)
+        JobRunner(fake(0.0, log)).simulate(task(), lambda: True)
     assert not log.exists()

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.arm.geometry import Pose
-from actors.arm.path.frames import flange_poses, pourer_frames, pourer_motion, quaternions
 from actors.arm.path.kinematics import MODELS, inverse
 from actors.arm.path.plan import plan_path
+from actors.arm.path.transforms import flange_poses, pourer_motion, pourer_transforms, quaternions
 from sim_engine.action import DEG
 from sim_engine.contact import rotations
 from tests.depth import examples
@@ -73,6 +73,6 @@ def test_a_pourer_that_slipped_in_the_fingers_is_tilted_more_about_the_tool_cent
 
 
 def test_at_home_the_pourer_stands_behind_the_receiver_and_upright():
-    frame = pourer_frames(np.array([SPEC.home]), SPEC)
+    frame = pourer_transforms(np.array([SPEC.home]), SPEC)
     assert frame.rotation[0, 2, 2] == pytest.approx(1.0, abs=1e-9)
     assert frame.position[0, 1] < -0.2

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from actors.cluster.place import Node, Place, living_nodes, this_node
+from actors.cluster.nodes import Node, PinnedNode, living_nodes, this_node
 from actors.protocols import LaboratoryError, Notice
 from actors.spec import RaySpec
 
@@ -23,7 +23,7 @@ CLOSE_DEADLINE = 10.0
 
 
 @dataclass
-class Site:
+class JoinedCluster:
     """The cluster that this program has joined, while it is in it.
 
     Args:
@@ -40,8 +40,8 @@ class Site:
     bench_lost: Callable[[str], None]
     here_lost: Callable[[str], None]
     grown: Callable[[int], None] = lambda cpus: None
-    bench: Place | None = None
-    here: Place = field(init=False)
+    bench: PinnedNode | None = None
+    here: PinnedNode = field(init=False)
     _nodes: dict[str, Node] = field(default_factory=dict)
     _dead: set[str] = field(default_factory=set)
     _bundle: Any = None
@@ -64,7 +64,7 @@ class Site:
         if bench_node is not None:
             if bench_node not in self._nodes:
                 raise LaboratoryError(f"Ray cluster at {self.spec.address}: the bench's machine was lost; try again")
-            self.bench = Place(self._nodes[bench_node], options)
+            self.bench = PinnedNode(self._nodes[bench_node], options)
         self._watching = asyncio.create_task(self._watch())
         bench = "" if self.bench is None else f"; the bench is on {self.bench.node.host}"
         nodes = f"{len(self._nodes)} node(s), {self.cpus} core(s)"
@@ -107,9 +107,9 @@ class Site:
             await asyncio.sleep(LOOK_INTERVAL)
             try:
                 now = await asyncio.to_thread(living_nodes)
-                for place in [place for place in (self.here, self.bench) if place is not None]:
-                    if place.node.id in self._nodes and await place.is_gone():
-                        self._dead.add(place.node.id)  # Ray will list it for a while yet
+                for pinned in [pinned for pinned in (self.here, self.bench) if pinned is not None]:
+                    if pinned.node.id in self._nodes and await pinned.is_gone():
+                        self._dead.add(pinned.node.id)  # Ray will list it for a while yet
             except Exception:
                 continue  # the head may be busy; if it is dead, Ray ends this program
             self._compare({id_: node for id_, node in now.items() if id_ not in self._dead})

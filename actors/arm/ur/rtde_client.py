@@ -24,7 +24,7 @@ from actors.arm.ur.messages import (
     STATUS,
     STOP_ORDER,
     TOOL,
-    Reading,
+    DataPackage,
     TroubleError,
 )
 
@@ -50,7 +50,7 @@ _VARIABLES = [
 ]
 
 
-class Link:
+class RtdeClient:
     """Reads the controller and writes what its program listens to.
 
     Args:
@@ -82,12 +82,12 @@ class Link:
                 time.sleep(BETWEEN_ATTEMPTS)
         self._silence = silence
         self._writing = threading.Lock()
-        self._last: Reading | None = None
+        self._last: DataPackage | None = None
         self._looks = 0
 
     # ---- reading
 
-    def look(self, patience: float = 1.0) -> Reading:
+    def look(self, patience: float = 1.0) -> DataPackage:
         """The latest package.
 
         Args:
@@ -109,7 +109,7 @@ class Link:
                         "lost", f"the controller has said nothing new for {patience * self._silence:g} s"
                     )
                 return last
-            reading = Reading(
+            reading = DataPackage(
                 time=time_before,
                 seen=time.monotonic(),
                 joints=tuple(r.getActualQ()),
@@ -130,7 +130,7 @@ class Link:
                 return reading
         raise TroubleError("lost", "packages come faster than they can be read")
 
-    def fresh(self) -> Reading:
+    def fresh(self) -> DataPackage:
         """A package that is newer than this call.
 
         Raises:

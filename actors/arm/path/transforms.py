@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class Transforms:
     """Rotations and positions of one or many frames in another.
 
     Attributes:
@@ -30,9 +30,9 @@ class Frames:
     rotation: FloatArray
     position: FloatArray
 
-    def __matmul__(self, inner: Frames) -> Frames:
+    def __matmul__(self, inner: Transforms) -> Transforms:
         """`inner`, given in this frame, seen from where this one is given."""
-        return Frames(self.rotation @ inner.rotation, self.apply(inner.position))
+        return Transforms(self.rotation @ inner.rotation, self.apply(inner.position))
 
     def apply(self, points: FloatArray) -> FloatArray:
         """Points of this frame, shape (..., 3), seen from where it is given [m]."""
@@ -40,20 +40,20 @@ class Frames:
         return moved
 
     @property
-    def inverse(self) -> Frames:
+    def inverse(self) -> Transforms:
         """What undoes it."""
         back = np.swapaxes(self.rotation, -1, -2)
-        return Frames(back, -(back @ self.position[..., None])[..., 0])
+        return Transforms(back, -(back @ self.position[..., None])[..., 0])
 
 
-def frame_of(pose: Pose) -> Frames:
+def transform_of(pose: Pose) -> Transforms:
     """A pose with a rotation vector as a frame."""
     turn = Rotation.from_rotvec([pose.rx, pose.ry, pose.rz]).as_matrix()
-    return Frames(np.asarray(turn, dtype=float), np.array([pose.x, pose.y, pose.z]))
+    return Transforms(np.asarray(turn, dtype=float), np.array([pose.x, pose.y, pose.z]))
 
 
 @dataclass(frozen=True, eq=False)
-class CellFrames:
+class CellTransforms:
     """What stays where it is during a pour.
 
     Attributes:
@@ -63,45 +63,45 @@ class CellFrames:
         pourer: in the flange's frame.
     """
 
-    base: Frames
-    world: Frames
-    tool: Frames
-    pourer: Frames
+    base: Transforms
+    world: Transforms
+    tool: Transforms
+    pourer: Transforms
 
 
 @lru_cache(maxsize=32)
-def cell_frames(spec: UrArmSpec) -> CellFrames:
+def cell_transforms(spec: UrArmSpec) -> CellTransforms:
     """The fixed frames of a cell."""
     turn = Rotation.from_euler("z", spec.cell.direction).as_matrix()
-    tool = frame_of(spec.tool)
+    tool = transform_of(spec.tool)
     mount = Rotation.from_euler("zx", [spec.mount.turn, spec.mount.tilt]).as_matrix()
-    return CellFrames(
-        Frames(np.asarray(mount, dtype=float), np.zeros(3)),
-        Frames(np.asarray(turn, dtype=float), np.array(spec.cell.receiver)),
+    return CellTransforms(
+        Transforms(np.asarray(mount, dtype=float), np.zeros(3)),
+        Transforms(np.asarray(turn, dtype=float), np.array(spec.cell.receiver)),
         tool,
-        tool @ frame_of(spec.grip),
+        tool @ transform_of(spec.grip),
     )
 
 
-def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Frames:
+def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Transforms:
     """Where the flange has to be in the base's frame.
 
     Args:
         poses: of the pourer in the world, shape (T, 7): x y z [m], qw qx qy qz.
         spec: of the arm and its cell.
     """
-    cell = cell_frames(spec)
-    return cell.base.inverse @ cell.world @ Frames(rotations(poses), poses[:, :3]) @ cell.pourer.inverse
+    cell = cell_transforms(spec)
+    return cell.base.inverse @ cell.world @ Transforms(rotations(poses), poses[:, :3]) @ cell.pourer.inverse
 
 
-def pourer_frames(joints: FloatArray, spec: UrArmSpec) -> Frames:
+def pourer_transforms(joints: FloatArray, spec: UrArmSpec) -> Transforms:
     """Where the pourer is in the room's frame for joints (T, 6) [rad]."""
-    return flange_frames(joints, spec) @ cell_frames(spec).pourer
+    return flange_transforms(joints, spec) @ cell_transforms(spec).pourer
 
 
-def flange_frames(joints: FloatArray, spec: UrArmSpec) -> Frames:
+def flange_transforms(joints: FloatArray, spec: UrArmSpec) -> Transforms:
     """Where the flange is in the room's frame for joints (T, 6) [rad]."""
-    return cell_frames(spec).base @ Frames(*forward(joints, MODELS[spec.model]))
+    return cell_transforms(spec).base @ Transforms(*forward(joints, MODELS[spec.model]))
 
 
 def quaternions(rotation: FloatArray) -> FloatArray:
@@ -127,9 +127,9 @@ def pourer_motion(joints: FloatArray, times: FloatArray, spec: UrArmSpec, *, gri
     Returns:
         The pourer in the world.
     """
-    cell = cell_frames(spec)
+    cell = cell_transforms(spec)
     grip = cell.tool.inverse @ cell.pourer
     slipped = grip.rotation @ Rotation.from_euler("y", grip_tilt).as_matrix() @ grip.rotation.T
-    held = cell.tool @ Frames(slipped, np.zeros(3)) @ grip
-    frames = cell.world.inverse @ flange_frames(joints, spec) @ held
+    held = cell.tool @ Transforms(slipped, np.zeros(3)) @ grip
+    frames = cell.world.inverse @ flange_transforms(joints, spec) @ held
     return SampledMotion(times, np.concatenate([frames.position, quaternions(frames.rotation)], axis=-1))

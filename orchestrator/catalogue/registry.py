@@ -1,0 +1,73 @@
+"""Which folders hold runs: a plain list to which every new run is appended. What is in them is read from the runs.
+
+One line is written without a lock and without a database, so that a run is never kept waiting by whoever searches.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from orchestrator.journal import JOURNAL_NAME
+from orchestrator.state_directory import state_directory
+
+LIST_NAME = "runs.txt"
+
+_log = logging.getLogger(__name__)
+_said = False
+
+
+def register(directory: Path) -> None:
+    """Enter a run's folder. A state directory that can't be written is said once, and never stops a run."""
+    global _said
+    try:
+        enter([directory])
+    except (OSError, UnicodeError) as error:
+        if not _said:
+            _log.warning(
+                "note: this run is not in the catalogue of runs (%s); `decant runs add %s` enters it later",
+                error,
+                directory,
+            )
+        _said = True
+
+
+def enter(directories: Iterable[Path], state: Path | None = None) -> None:
+    """Append folders to the list.
+
+    Raises:
+        OSError: it can't be written.
+    """
+    path = (state or state_directory()) / LIST_NAME
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = "".join(f"{directory.absolute()}\n" for directory in directories)
+    # One write to a file opened for appending: two runs that begin at the same moment don't mix their lines.
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        os.write(descriptor, lines.encode())
+    finally:
+        os.close(descriptor)
+
+
+def known(state: Path) -> list[Path]:
+    """The folders of the list, each once, in the order in which they were entered.
+
+    Raises:
+        OSError: it is there and can't be read.
+    """
+    path = state / LIST_NAME
+    if not path.is_file():
+        return []
+    lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    return [Path(line) for line in dict.fromkeys(lines) if line.startswith("/")]
+
+
+def runs_below(directory: Path) -> Iterator[Path]:
+    """Folders of runs in a folder, at any depth, itself included; links are not followed."""
+    for folder, folders, files in os.walk(directory):
+        folders.sort()
+        if JOURNAL_NAME in files:
+            folders.clear()  # a run holds no other
+            yield Path(folder)

@@ -1,0 +1,31 @@
+"""Where Decant keeps what belongs to a machine rather than to one run: the catalogue of runs, the daemon's queue."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+VARIABLE = "DECANT_STATE"
+
+
+def state_directory() -> Path:
+    """`$DECANT_STATE`, else `decant` in the XDG state directory (`$XDG_STATE_HOME`, else `~/.local/state`).
+
+    It need not exist yet.
+
+    Raises:
+        OSError: nothing says where: none of these is set, and this user has no home.
+    """
+    if named := os.environ.get(VARIABLE):
+        return Path(named).absolute()
+    if shared := os.environ.get("XDG_STATE_HOME"):
+        return Path(shared).absolute() / "decant"
+    try:
+        return Path.home() / ".local" / "state" / "decant"
+    except RuntimeError:
+        raise OSError(f"this user has no home directory; set {VARIABLE} to a folder for Decant's state") from None
+
+
+def use_state_directory(path: Path) -> None:
+    """Have this process and those that it starts keep their state there: what `--state` does."""
+    os.environ[VARIABLE] = str(path.absolute())
