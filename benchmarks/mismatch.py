@@ -135,7 +135,8 @@ def interval(values: list[float]) -> tuple[float, float, float]:
 def table(runs: list[dict[str, Any]]) -> str:
     """Markdown: a row for each level and arm."""
     lines = [
-        "| simulator | | mean of 15 pours | pours above 10 % after the first below 1 % | best of 3 | pours 4 to 15 | action in the end |",
+        "| simulator | | mean of 15 pours | pours above 10 % after the first below 1 % | best of 3 | pours 4 to 15 "
+        "| action in the end |",
         "|---|---|---|---|---|---|---|",
     ]
     for level in LEVELS:

@@ -25,7 +25,7 @@ from sim_engine.task import Scene
 if TYPE_CHECKING:
     from orchestrator.flights import Order
 
-MEANS: dict[str, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled", "adaptive": "adaptive"}
+MEANS: dict[str, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
 """How the optimiser calls the models."""
 
 WIDENING = 3.0
@@ -261,9 +261,13 @@ class Hybrid(Deployment[D3Settings]):
                 return self._problem(poured, **changes)
             case "widen":
                 return self._problem(poured, mean="pooled", widening=WIDENING, simulated=simulated, **changes)
+            case _ if not self._settings.adaptive:
+                return self._problem(poured, mean=MEANS[self._settings.model], simulated=simulated, **changes)
+            case _ if changes.get("acquisition") == "knowledge":  # what one more simulation is worth beside a pour
+                return self._problem(poured, mean="scaled", simulated=simulated, **changes)
             case _:
-                mean, mismatch = MEANS[self._settings.model], self._mismatch if self._settings.adaptive else None
-                return self._problem(poured, mean=mean, simulated=simulated, mismatch=mismatch, **changes)
+                changes |= {"mean": "adaptive", "mismatch": self._mismatch}
+                return self._problem(poured, simulated=simulated, **changes)
 
     @property
     def _mismatch(self) -> Mismatch:
