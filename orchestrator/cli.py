@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, runs_verbs, simulate_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -280,6 +280,8 @@ app.command(
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
     )
 )(bench_verbs.pour)
+
+app.add_typer(runs_verbs.runs)
 
 
 @app.command(epilog=examples("decant plugins", "decant plugins --json"))

@@ -51,7 +51,7 @@ def _laboratory(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
     if bench is None:
         return dict(base)
     changed = {
-        "liquid": written(HiddenLiquid(**bench.liquid.model_dump())),
+        "liquid": written(HiddenLiquid(**bench.liquid.of_the_solver())),
         "pose_error": written(PoseErrorSection(**asdict(bench.pose_error))),
         "pose_noise": written(PoseNoiseSection(**asdict(bench.pose_noise))),
         "time_scale": bench.time_scale,
@@ -63,6 +63,8 @@ def _parameters(plan: CampaignPlan) -> dict[str, Any]:
     values: dict[str, Any] = plan.parameters.model_dump()
     for axis in () if plan.calibration is None else plan.calibration.parameters.axes:
         values[axis.name] = {"range": [axis.lower, axis.upper], "scale": axis.scale}
+    for prior in () if plan.calibration is None else plan.calibration.parameter_prior:
+        values[prior.name] |= {"measured": prior.mean, "tolerance": prior.deviation}
     return written(Parameters.model_validate(values))
 
 

@@ -57,12 +57,15 @@ def display_unit(name: str) -> str:
     if name in ACTION_DIMENSIONS:
         return ACTION_DIMENSIONS[name].display_unit.replace("^2", "²")
     info = SimulationParameters.info().get(name)
-    return "" if info is None or info.unit == "1" else info.unit
+    return "" if info is None or info.unit == "1" else info.shown
 
 
 def display_factor(name: str) -> float:
-    """SI value of one display unit; 1 for simulation parameters, which are shown in SI."""
-    return ACTION_DIMENSIONS[name].factor if name in ACTION_DIMENSIONS else 1.0
+    """SI value of one display unit; 1 for names that are neither action nor parameter."""
+    if name in ACTION_DIMENSIONS:
+        return ACTION_DIMENSIONS[name].factor
+    info = SimulationParameters.info().get(name)
+    return 1.0 if info is None else info.factor
 
 
 def display_value(name: str, value: float | None) -> str:

@@ -81,6 +81,7 @@ def posterior_of(
         count=question.count,
         snap=region.snap,
         rng=rng,
+        prior=array(question.prior, 2),
     )
     return Posterior(tuples(sampled.points), tuple(map(float, sampled.discrepancies)), sampled.effective)
 

@@ -62,12 +62,15 @@ class PosteriorQuestion:
         offsets: weighed minus regressed spillage at each; the regressed one is in the differences that were observed.
         noise: standard deviation of a weighed pour.
         count: of draws wanted.
+        prior: centre and standard deviation along every axis of the unit cube, of normals that its faces cut off; where
+            a deviation is 0, all values are alike. Empty: they are along all axes.
     """
 
     contexts: tuple[Point, ...]
     offsets: tuple[float, ...]
     noise: float
     count: int = 200
+    prior: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -134,12 +134,14 @@ def _settings(study: StudyPlan) -> list[str]:
 
 
 def _level(level: Level) -> str:
-    liquid = ", ".join(f"{name} {value:g}" for name, value in level.bench.liquid.model_dump().items())
+    liquid = ", ".join(f"{name} {value:g}" for name, value in level.bench.liquid.of_the_solver().items())
     error, noise = level.bench.pose_error, level.bench.pose_noise
+    off = ", ".join(f"{1e3 * value:g}" for value in (error.x, error.y, error.z))
+    scatter = ", ".join(f"{1e3 * value:g}" for value in (noise.x, noise.y, noise.z))
     return (
-        f"Mismatch '{level.name}': hidden θ {liquid}; receiver off by {1e3 * error.x:g} and {1e3 * error.y:g} mm, tilt "
-        f"by {error.tilt:.3g} rad, speed × {error.speed_factor:g}; from pour to pour ± {1e3 * noise.x:g} and "
-        f"{1e3 * noise.y:g} mm, {noise.tilt:.3g} rad, × {noise.speed_factor:g}."
+        f"Mismatch '{level.name}': hidden θ {liquid}; receiver off by {off} mm (x, y, height), tilt by "
+        f"{error.tilt:.3g} rad, speed × {error.speed_factor:g}; from pour to pour ± {scatter} mm, "
+        f"{noise.tilt:.3g} rad, × {noise.speed_factor:g}."
     )
 
 
