@@ -44,6 +44,10 @@ class RunOptions:
     as_json: bool
     armed: bool
     """Hardware may move in this run."""
+    live: bool = False
+    """A live view is served while it runs …"""
+    live_at: str | None = None
+    """… at this ADDRESS[:PORT], where one is given."""
 
 
 def run(path: Path, options: RunOptions) -> None:
@@ -284,6 +288,7 @@ def _run(
     plan: CampaignPlan, verb: str, path: Path, options: RunOptions, stages: list[StageDefinition] | None = None
 ) -> Finished:
     from orchestrator.commands.arming import arm_campaign
+    from orchestrator.commands.live import live_view
     from orchestrator.commands.people import check_somebody_is_there
     from orchestrator.stages import stages_of
 
@@ -296,6 +301,7 @@ def _run(
     if any(stage.pours for stage in chosen):
         check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(plan, chosen, in_process=options.in_process)
+    live = live_view(plan, live=options.live, at=options.live_at)
     directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
     flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
     flag += "" if options.seed is None else f" --seed {options.seed}"
@@ -310,6 +316,7 @@ def _run(
         again=again,
         answer=options.answer,
         checksum=checksum,
+        live=live,
     )
     if finished.published.theta is not None:
         mention(f"θ* is in {finished.published.theta}; use it with --parameters")
