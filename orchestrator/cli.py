@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, daemon_verbs, runs_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
