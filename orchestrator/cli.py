@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, runs_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -261,6 +261,7 @@ app.command(
     )
 )(bench_verbs.pour)
 
+app.command(epilog=report.EXAMPLES)(report.report)
 app.add_typer(runs_verbs.runs)
 
 
@@ -304,6 +305,9 @@ def physics(
     from orchestrator.commands import physics as verb
 
     call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
+
+
+daemon_verbs.register(app)
 
 
 def main() -> None:
