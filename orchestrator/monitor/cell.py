@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -78,6 +79,8 @@ class Cell:
             base = home[0, 0, :2]
             low, high = np.minimum(base, 0.0) - 0.3, np.maximum(base, 0.0) + 0.3
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
+            # Where it waits, until it moves: what is logged without a time gives way to nothing that has one.
+            self._outlet.times(wall=time.time(), step=0, sim_time=0.0)
             self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home))
         self._outlet.log(
             f"{PLACE}/table",
@@ -163,20 +166,20 @@ class Cell:
         radius = 0.0 if liquid is None else 0.5 * shapes.spacing(liquid.positions[0], scene.liquid.volume)
         path = self._path(moves, liquid)
 
-        def frame(time: float, *, first: bool) -> Callable[[], None]:
+        def frame(moment: float, *, first: bool) -> Callable[[], None]:
             def log() -> None:
                 if first and len(path) > 1:
                     self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
                 if moves is not None:
-                    self._move(np.array([np.interp(time, moves[0], column) for column in moves[1].T]))
+                    self._move(np.array([np.interp(moment, moves[0], column) for column in moves[1].T]))
                 if liquid is not None:
-                    self._pour(liquid, time, radius, posed=moves is None)
-                beside(time)
+                    self._pour(liquid, moment, radius, posed=moves is None)
+                beside(moment)
 
             return log
 
-        moments = [frame(float(time), first=place == 0) for place, time in enumerate(times)]
-        self._films.add(now, step, [float(time) for time in times], moments)
+        moments = [frame(float(moment), first=place == 0) for place, moment in enumerate(times)]
+        self._films.add(now, step, [float(moment) for moment in times], moments)
 
     def _executed(self, measured: PourMeasurement) -> tuple[FloatArray, FloatArray] | None:
         record = measured.notes.get("executed")
@@ -187,8 +190,8 @@ class Cell:
             return self._figure.tool(moves[1][::5])[:, :3]
         return np.zeros((0, 3)) if liquid is None else np.asarray(liquid.pourer_poses, float)[:, :3]
 
-    def _pour(self, liquid: RecordedFrames, time: float, radius: float, *, posed: bool) -> None:
-        index = int(np.clip(np.searchsorted(liquid.times, time + 1e-6) - 1, 0, len(liquid.times) - 1))
+    def _pour(self, liquid: RecordedFrames, moment: float, radius: float, *, posed: bool) -> None:
+        index = int(np.clip(np.searchsorted(liquid.times, moment + 1e-6) - 1, 0, len(liquid.times) - 1))
         states = np.asarray(liquid.states[index])
         self._outlet.log(f"{PLACE}/liquid", shapes.particles(liquid.positions[index], states, radius))
         if posed:
