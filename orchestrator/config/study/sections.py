@@ -32,7 +32,7 @@ from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.doors import calibrations, deployments
 from orchestrator.strategies.settings import StrategySettings
-from orchestrator.study.plan import StudyPlan
+from orchestrator.study.plan import ALL, StudyPlan
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
 
@@ -104,6 +104,20 @@ class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "ka
     """Simulations told between two pours; not 'free', for then the clock would decide what is asked for."""
 
 
+class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial", "kappa", simulations="108", pours="6")):  # type: ignore[misc]
+    """C4 on pours that it chooses itself, each by what it will tell about the deployments."""
+
+    pours: PositiveCount | None = None
+    """Training pours that it chooses; it is scored on the repetition's test pours."""
+
+    design_simulations: PositiveCount = 64
+    """Simulations to choose them with."""
+
+    def changes(self) -> dict[str, Any]:
+        """Settings of C4 that are given here."""
+        return {name: value for name, value in super().changes().items() if name in C4Settings.model_fields}
+
+
 class CalibrationsBase(Section):
     """The calibrations that are compared."""
 
@@ -121,6 +135,9 @@ class CalibrationsBase(Section):
 
     C4_paper: C4Arm | None = None
     """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""
+
+    C4_active: C4ActiveArmSection | None = None
+    """C4 on fewer pours that were chosen actively; compared, and used by nobody."""
 
 
 class DeploymentsBase(Section):
@@ -196,7 +213,10 @@ class StudyFile(Section):
     name."""
 
     compared: Text | None = None
-    """Level at which C1 to C4 are compared; the first unless given. C4 is run at all levels, for D1 and D3."""
+    """Level at which C1 to C4 are compared, or 'all'; the first unless given. C4 is run at all levels."""
+
+    random_baseline: Count = 0
+    """Random parameters that each calibration is scored beside."""
 
     calibration: CalibrationsSection | None = None
     """The calibrations."""
@@ -253,8 +273,8 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     levels = levels_of(written, base.laboratory.name, bench)
     names = tuple(level.name for level in levels)
     compared = file.compared or (names[0] if names else "")
-    if names and compared not in names:
-        report.add(root.at("compared"), f"no such level; there are {', '.join(names)}")
+    if names and compared not in (*names, ALL):
+        report.add(root.at("compared"), f"no such level; there are {', '.join(names)}, and all")
     if (
         file.calibration is None
         and file.deployment is None
@@ -269,7 +289,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         parameter_prior=tuple(prior for prior in calibration.parameter_prior if prior.name in searched.names),
         pour_count=0,
         holdout=0,
-        random_baseline=0,
+        random_baseline=file.random_baseline,
         fixed_parameters={
             name: value for name, value in base.parameters.model_dump().items() if name not in searched.names
         },
