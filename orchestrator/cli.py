@@ -7,13 +7,15 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, runs_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
     Campaign,
     InProcess,
     Json,
+    Live,
+    LiveAt,
     OtherLaboratory,
     Parameters,
     Quiet,
@@ -62,6 +64,7 @@ def decant(
 @app.command(
     epilog=examples(
         "decant run configs/campaigns/quickstart.yaml",
+        "decant run configs/campaigns/quickstart.yaml --live   # open the printed address in a browser",
         "decant run my.yaml --resume   # after a stop, a crash or a power cut; nothing finished is done again",
     )
 )
@@ -72,6 +75,8 @@ def run(
     answer: Answer = None,
     in_process: InProcess = False,
     arm: Arm = False,
+    live: Live = False,
+    live_at: LiveAt = None,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     as_json: Json = False,
@@ -95,6 +100,8 @@ def run(
             seed=seed,
             as_json=as_json,
             armed=arm,
+            live=live,
+            live_at=live_at,
         ),
     )
 
@@ -112,6 +119,8 @@ def calibrate(
     answer: Answer = None,
     in_process: InProcess = False,
     arm: Arm = False,
+    live: Live = False,
+    live_at: LiveAt = None,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     as_json: Json = False,
@@ -135,6 +144,8 @@ def calibrate(
             seed=seed,
             as_json=as_json,
             armed=arm,
+            live=live,
+            live_at=live_at,
         ),
     )
 
@@ -281,6 +292,7 @@ app.command(
     )
 )(bench_verbs.pour)
 
+app.command(epilog=report.EXAMPLES)(report.report)
 app.add_typer(runs_verbs.runs)
 
 
@@ -324,6 +336,9 @@ def physics(
     from orchestrator.commands import physics as verb
 
     call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
+
+
+daemon_verbs.register(app)
 
 
 def main() -> None:

@@ -44,6 +44,10 @@ class RunOptions:
     as_json: bool
     armed: bool
     """Hardware may move in this run."""
+    live: bool = False
+    """A live view is served while it runs …"""
+    live_at: str | None = None
+    """… at this ADDRESS[:PORT], where one is given."""
 
 
 def run(path: Path, options: RunOptions) -> None:
@@ -55,7 +59,8 @@ def run(path: Path, options: RunOptions) -> None:
     _check_posterior(plan)
     finished = _run(plan, "run", path, options)
     if options.as_json:
-        print_json({"run": finished.result.directory.name, **summary_json(finished.published.summary)})
+        summary = summary_json(finished.published.summary)
+        print_json({"run": finished.result.directory.name, "report": finished.published.report, **summary})
 
 
 def _check_posterior(plan: CampaignPlan) -> None:
@@ -134,6 +139,7 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
         "run": str(finished.result.directory),
         "figures": finished.published.figures,
         "recording": finished.published.recording,
+        "report": finished.published.report,
     }
 
 
@@ -284,6 +290,7 @@ def _run(
     plan: CampaignPlan, verb: str, path: Path, options: RunOptions, stages: list[StageDefinition] | None = None
 ) -> Finished:
     from orchestrator.commands.arming import arm_campaign
+    from orchestrator.commands.live import live_view
     from orchestrator.commands.people import check_somebody_is_there
     from orchestrator.stages import stages_of
 
@@ -296,6 +303,7 @@ def _run(
     if any(stage.pours for stage in chosen):
         check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(plan, chosen, in_process=options.in_process)
+    live = live_view(plan, live=options.live, at=options.live_at)
     directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
     flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
     flag += "" if options.seed is None else f" --seed {options.seed}"
@@ -310,6 +318,7 @@ def _run(
         again=again,
         answer=options.answer,
         checksum=checksum,
+        live=live,
     )
     if finished.published.theta is not None:
         mention(f"θ* is in {finished.published.theta}; use it with --parameters")
