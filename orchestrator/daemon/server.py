@@ -17,6 +17,7 @@ from pythonjsonlogger.json import JsonFormatter
 
 from orchestrator.daemon.api import serve_app
 from orchestrator.daemon.auth import Tokens
+from orchestrator.daemon.notify import telling
 from orchestrator.daemon.settings import Settings
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.errors import RunError
@@ -84,12 +85,15 @@ async def _serve(settings: Settings, ready: Callable[[str], None]) -> None:
     url = _url(settings, listening)
     settings.address.write_text(url + "\n", encoding="utf-8")
     try:
-        await daemon.start()
-        _log.info("serving %s", url, extra={"url": url, "state": str(settings.state)})
-        ready(url)
-        await asyncio.wait({serving, asyncio.ensure_future(ending.asked.wait())}, return_when=asyncio.FIRST_COMPLETED)
-        _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
-        await daemon.close()
+        async with telling(settings.notify, daemon.feed.read(), f"{url}/") as daemon.words:
+            await daemon.start()
+            _log.info("serving %s", url, extra={"url": url, "state": str(settings.state)})
+            ready(url)
+            await asyncio.wait(
+                {serving, asyncio.ensure_future(ending.asked.wait())}, return_when=asyncio.FIRST_COMPLETED
+            )
+            _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
+            await daemon.close()
     finally:
         settings.address.unlink(missing_ok=True)
         server.should_exit = True

@@ -16,6 +16,7 @@ from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Count, FilePath, Name, PositiveCount, Section, Switch, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
+from orchestrator.daemon.notify import NotifySection
 from orchestrator.state_directory import state_directory
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -98,6 +99,9 @@ class DaemonFile(Section):
     keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
     """Room on the disk below which no campaign is begun."""
 
+    notify: NotifySection | None = None
+    """Word to people who are elsewhere; nobody is told anything unless given."""
+
     events: PositiveCount = 50_000
     """Events that are kept for those who ask for what they have missed."""
 
@@ -141,6 +145,7 @@ class Settings:
     keep_recordings: int | None = None
     recording_age: float | None = None
     keep_free: int = 500_000_000
+    notify: NotifySection | None = None
     events: int = 50_000
     quick_start: bool = field(default=True, compare=False)
     """Whether simulators are started at once, or with the first campaign."""
@@ -254,5 +259,6 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> Settings:
         keep_recordings=file.recordings.keep,
         recording_age=file.recordings.age,
         keep_free=round(file.keep_free * 1e6),
+        notify=file.notify,
         events=file.events,
     )

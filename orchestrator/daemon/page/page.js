@@ -86,9 +86,10 @@ function show() {
 const body = (id) => $(id).querySelector(".body");
 
 function showEmergency(emergency) {
+  if (emergency && $("emergency").hidden) announce("call", "Emergency stop");
   $("emergency").hidden = !emergency;
   draw($("emergency"), emergency, (latched) => latched && [
-    el("h2", { id: "emergency-head", role: "alert" }, "Emergency stop"),
+    el("h2", { id: "emergency-head" }, "Emergency stop"),
     el("p", {}, `By ${latched.by} at ${clock(latched.time)}${latched.reason ? `: ${latched.reason}` : ""}. All arms are stopped, `,
       "and nothing begins before it is cleared. A pour that was under way is UNKNOWN: somebody will be asked about it."),
     el("details", {}, el("summary", {}, "Clear it"),
@@ -192,4 +193,6 @@ $("login").addEventListener("submit", (event) => {
 });
 $("stop-all").addEventListener("click", acts.stopAll);
 
-if (knownToken()) enter(); else leave();
+function come() { if (knownToken()) enter(); else leave(); }
+addEventListener("hashchange", () => { if (location.hash.includes("token=")) come(); });
+come();

@@ -104,7 +104,7 @@ function details(table) {
 
 function answers(question, answer) {
   const big = (text) => button(`answer-${question.id}-${text}`, NAMES[text] || text, () => answer(text),
-    `big ${text === "no" || text === "lost" ? "" : "go"}`);
+    `big ${text === "done" || text === "yes" ? "go" : ""}`);
   if (question.wants === "done") return big("done");
   if (question.wants === "yes or no") return [big("yes"), big("no")];
   if (question.wants === "weight") return weights(question, ["Weight"], ([weight]) => answer(`${weight} g`));
