@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, report, runs_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -336,6 +336,9 @@ def physics(
     from orchestrator.commands import physics as verb
 
     call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
+
+
+daemon_verbs.register(app)
 
 
 def main() -> None:
