@@ -162,13 +162,18 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
 
 def prediction_stages(
-    plan: CampaignPlan, deployment: DeploymentPlan, seeds: int, thetas: Sequence[SimulationParameters] = ()
+    plan: CampaignPlan,
+    deployment: DeploymentPlan,
+    seeds: int,
+    thetas: Sequence[SimulationParameters] = (),
+    discrepancy: float | None = None,
 ) -> list[StageDefinition]:
     """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
 
     Args:
         seeds: how many, each.
         thetas: draws of a posterior that the seeds take turns with; none: the θ that was planned with.
+        discrepancy: shift that the calibration left over (`sim_engine.bands`); None: nobody knows.
     """
 
     def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
@@ -179,7 +184,8 @@ def prediction_stages(
             costing = Costing.of(deployment, scene, theta)
             draws = known.settings.draws(known, theta, seeds, seed)
             drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
-            return RepeatedSimulation(costing, action, seeds, seed, drawn, [draw.error for draw in draws])
+            errors = [draw.error for draw in draws]
+            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, discrepancy)
 
         return build
 
