@@ -9,13 +9,16 @@ from typing import Annotated, Any, Literal, Self
 from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
 from orchestrator.strategies.deployment.objectives import Objectives
-from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings
+from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings, StrategySettings
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, Loss
 from sim_engine.marks import FREE
 from sim_engine.space import Space
 from sim_engine.task import Scene
+
+Design = Literal["stratified", "active"]
+"""How calibration pours are chosen: spread evenly, or each by what it will tell about deployment."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class RecordedPour:
     Attributes:
         poured, spilled, retained: masses [kg].
         split: 'train', 'test' or 'transfer'.
+        scene: name of the one that it was made in; '' for that of its `RecordSet`.
     """
 
     action: Action
@@ -32,6 +36,7 @@ class RecordedPour:
     spilled: float
     retained: float
     split: str
+    scene: str = ""
 
     @property
     def poured_fraction(self) -> float:
@@ -42,6 +47,21 @@ class RecordedPour:
     def normalised_spillage(self) -> float | None:
         """r = spilled / poured, None where too little was poured for it."""
         return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
+
+
+@dataclass(frozen=True)
+class KnownSimulation:
+    """One that was made before a calibration, in one of its scenes.
+
+    Attributes:
+        theta: values of the searched parameters.
+        spillage: c_s.
+    """
+
+    theta: dict[str, float]
+    scene: str
+    action: Action
+    spillage: float
 
 
 @dataclass(frozen=True)
@@ -101,11 +121,30 @@ class NormalPrior:
 
 
 @dataclass(frozen=True)
-class CalibrationPlan:
-    """Which θ_s reproduces the weighed spills.
+class StagePlan:
+    """What all plans for one strategy have in common.
 
     Attributes:
         settings: which strategy, and its own settings.
+    """
+
+    settings: StrategySettings
+
+    @property
+    def strategy(self) -> str:
+        """Name of the strategy."""
+        return self.settings.strategy
+
+    def with_settings(self, **changes: Any) -> Self:
+        """The plan with other settings of the same strategy."""
+        return replace(self, settings=self.settings.model_copy(update=changes))
+
+
+@dataclass(frozen=True)
+class CalibrationPlan(StagePlan):
+    """Which θ_s reproduces the weighed spills.
+
+    Attributes:
         actions: space in which calibration pours are designed and the prior g draws.
         parameters: searched θ_s.
         fixed_parameters: θ_s values that are not searched.
@@ -117,6 +156,10 @@ class CalibrationPlan:
         constraints: on actions, beside the bounds of their space.
         prior: dimensions along which g is not uniform.
         parameter_prior: searched parameters that were measured beforehand, each with its tolerance.
+        further: scenes beside the first one, with other receivers, into which pours are made by turns.
+        design: how the pours are chosen.
+        design_simulations: made to choose them, where they are chosen actively.
+        known: simulations that were made before, filled in when the calibration begins.
     """
 
     settings: CalibrationSettings
@@ -132,15 +175,15 @@ class CalibrationPlan:
     constraints: tuple[Linear, ...] = ()
     prior: tuple[NormalPrior, ...] = ()
     parameter_prior: tuple[NormalPrior, ...] = ()
+    further: tuple[Scene, ...] = ()
+    design: Design = "stratified"
+    design_simulations: int = 0
+    known: tuple[KnownSimulation, ...] = ()
 
     @property
-    def strategy(self) -> str:
-        """Name of the strategy."""
-        return self.settings.strategy
-
-    def with_settings(self, **changes: Any) -> Self:
-        """The plan with other settings of the same strategy."""
-        return replace(self, settings=self.settings.model_copy(update=changes))
+    def scenes(self) -> tuple[Scene, ...]:
+        """All scenes that calibration pours are made in."""
+        return (self.scene, *self.further)
 
     @property
     def simulations(self) -> int:
@@ -152,11 +195,10 @@ class CalibrationPlan:
 
 
 @dataclass(frozen=True)
-class DeploymentPlan:
+class DeploymentPlan(StagePlan):
     """How to pour into vessels that calibration never saw.
 
     Attributes:
-        settings: which strategy, and its own settings.
         scenes: one per receiver.
         actions: searched action space.
         data: pours of before the campaign.
@@ -176,15 +218,6 @@ class DeploymentPlan:
     constraints: tuple[Linear, ...] = ()
     confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
-
-    @property
-    def strategy(self) -> str:
-        """Name of the strategy."""
-        return self.settings.strategy
-
-    def with_settings(self, **changes: Any) -> Self:
-        """The plan with other settings of the same strategy."""
-        return replace(self, settings=self.settings.model_copy(update=changes))
 
     @property
     def pours(self) -> int:

@@ -6,8 +6,6 @@ short queue of its own: one that is dead or slow keeps nobody waiting, neither t
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import json
 import logging
 import os
@@ -20,7 +18,6 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Section, Text
-from orchestrator.errors import RunError
 
 QUEUE = 50
 """Messages that wait for one receiver; while so many wait, further ones are dropped and counted."""
@@ -90,10 +87,8 @@ class Counts:
     dropped: int = 0
 
 
-class NotifyError(RunError):
+class NotifyError(ValueError):
     """A receiver that apprise does not know; the text says which, without its secrets."""
-
-    exit_code = 2
 
 
 class Notifier:
@@ -258,40 +253,6 @@ async def pass_on(events: AsyncIterator[Told | None], notifier: Notifier) -> Non
     async for sent in events:
         if sent is not None:
             notifier.note(sent.type, json.loads(sent.data) if sent.type in _TOLD else {}, sent.campaign)
-
-
-@contextlib.asynccontextmanager
-async def telling(
-    section: NotifySection | None, events: AsyncIterator[Told | None], page: str
-) -> AsyncIterator[dict[str, Counts]]:
-    """While this is open, people are told as the settings say; left once the events have ended.
-
-    Args:
-        section: of the settings; None tells nobody.
-        events: `feed.read()`, which ends when the feed is closed.
-        page: the link in messages, where the settings name no other.
-
-    Yields:
-        Messages so far, by receiver.
-
-    Raises:
-        NotifyError: a receiver can't be used.
-    """
-    if section is None:
-        yield {}
-        return
-    about = OCCASIONS if section.about is None else section.about
-    notifier = await asyncio.to_thread(
-        lambda: Notifier(section.to or (), about=about, silence=section.silence, page=section.page or page)
-    )
-    passing = asyncio.create_task(pass_on(events, notifier), name="word to people")
-    try:
-        yield notifier.counts
-    finally:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(5.0):
-                await passing
-        await asyncio.to_thread(notifier.close)
 
 
 @dataclass

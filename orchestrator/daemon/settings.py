@@ -62,6 +62,16 @@ class ListenSection(Section):
     """Largest request that is read: a campaign with the files that it refers to."""
 
 
+class LiveSection(Section):
+    """A live view of what runs, for browsers."""
+
+    host: Text = "127.0.0.1"
+    """Address to listen at. It has no password: whoever reaches it can look."""
+
+    port: Port | None = None
+    """TCP port of the viewer's page; the usual one, or the next free one, unless given."""
+
+
 class RecordingsSection(Section):
     """Which recordings (`.rrd`) are kept. Journals, figures and summaries always are."""
 
@@ -96,11 +106,14 @@ class DaemonFile(Section):
     recordings: RecordingsSection = RecordingsSection()
     """How long recordings are kept."""
 
-    keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
-    """Room on the disk below which no campaign is begun."""
+    live: LiveSection | None = None
+    """Serve a live view; none unless given."""
 
     notify: NotifySection | None = None
-    """Word to people who are elsewhere; nobody is told anything unless given."""
+    """Who is told what happens; nobody unless given."""
+
+    keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
+    """Room on the disk below which no campaign is begun."""
 
     events: PositiveCount = 50_000
     """Events that are kept for those who ask for what they have missed."""
@@ -145,8 +158,9 @@ class Settings:
     keep_recordings: int | None = None
     recording_age: float | None = None
     keep_free: int = 500_000_000
-    notify: NotifySection | None = None
     events: int = 50_000
+    live: tuple[str, int | None] | None = None
+    notify: NotifySection | None = None
     quick_start: bool = field(default=True, compare=False)
     """Whether simulators are started at once, or with the first campaign."""
 
@@ -259,6 +273,7 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> Settings:
         keep_recordings=file.recordings.keep,
         recording_age=file.recordings.age,
         keep_free=round(file.keep_free * 1e6),
-        notify=file.notify,
         events=file.events,
+        live=None if file.live is None else (file.live.host, file.live.port),
+        notify=file.notify,
     )

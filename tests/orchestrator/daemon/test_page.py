@@ -15,7 +15,6 @@ from orchestrator.daemon.settings import Rig
 from tests.orchestrator.daemon.browsing import OnPort, browser, on_port
 from tests.orchestrator.daemon.served import HeldBench, HeldLaboratory
 from tests.orchestrator.toy import ToyOptimizer, ToySimulators
-from tests.patience import PATIENCE
 
 pytest.importorskip("playwright")
 
