@@ -192,7 +192,7 @@ def found(
     gain = None
     if len(known):
         kept = over <= (1.0 if limit is None else limit.probability)
-        gain = float(worth(process, candidates[kept], known).max()) if kept.any() else 0.0
+        gain = float(worth(process, candidates[kept], known).max()) if kept.any() else None
     shifts, deviations, factor = process.displaced()
     drawn: tuple[Displacement, ...] = ()
     if problem.count == 0:
