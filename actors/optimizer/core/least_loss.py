@@ -40,6 +40,9 @@ Score = Callable[[Array], Array]
 LATEST = 8
 """Poured places, and as many to come, that simulations are made for."""
 
+FORESIGHT = 15
+"""Most pours whose savings count: what is found later could be found otherwise."""
+
 WORTH_AT = 256
 """Places all over the region at which the worth of one more pour is looked at."""
 
@@ -62,7 +65,7 @@ def least_loss(
         feasibility: of requests; None while nothing was refused. What can't be made is as bad as the worst.
     """
     best = float(process.predict(known)[0].min()) / process.worst if len(known) else 0.0
-    left = mismatch.left if len(known) else 0
+    left = min(mismatch.left, FORESIGHT) if len(known) else 0
 
     def score(points: Array) -> Array:
         means, deviations, _ = process.components(points)
