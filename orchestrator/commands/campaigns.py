@@ -59,7 +59,8 @@ def run(path: Path, options: RunOptions) -> None:
     _check_posterior(plan)
     finished = _run(plan, "run", path, options)
     if options.as_json:
-        print_json({"run": finished.result.directory.name, **summary_json(finished.published.summary)})
+        summary = summary_json(finished.published.summary)
+        print_json({"run": finished.result.directory.name, "report": finished.published.report, **summary})
 
 
 def _check_posterior(plan: CampaignPlan) -> None:
@@ -138,6 +139,7 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
         "run": str(finished.result.directory),
         "figures": finished.published.figures,
         "recording": finished.published.recording,
+        "report": finished.published.report,
     }
 
 

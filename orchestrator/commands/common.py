@@ -165,7 +165,12 @@ def run_in_front_of_people(
     from actors.laboratory import open_laboratory
     from actors.protocols import LaboratoryError
     from orchestrator.campaign import run_campaign
-    from orchestrator.commands.interrupted import file_trouble, given_up_pours, interruption
+    from orchestrator.commands.interrupted import (
+        file_trouble,
+        given_up_pours,
+        interruption,
+        report_of_what_stands,
+    )
     from orchestrator.commands.people import asked_about_unknown_pours, person_at_the_terminal
     from orchestrator.errors import RunError
     from orchestrator.events import Watcher
@@ -185,6 +190,7 @@ def run_in_front_of_people(
     if not resume:
         _warn_of_what_is_not_simulated(plan)
     monitor: RerunMonitor | None = None
+    result: CampaignResult | None = None
     try:
         display = ProgressDisplay(plan, quiet=is_quiet())
         operator = person_at_the_terminal(spec, display.paused) if pouring else None
@@ -234,8 +240,12 @@ def run_in_front_of_people(
             monitor.close()
         if live is not None:
             live.close()
+        if result is None and (page := report_of_what_stands(plan, directory)) is not None:
+            mention(f"report of what stands  {page}")
     published = publish(plan, result, monitor)
     print_summary(plan, published.summary)
+    if published.report is not None:
+        mention(f"report  {published.report}")
     return Finished(result, published)
 
 

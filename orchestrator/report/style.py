@@ -219,15 +219,33 @@ def unsaved() -> Iterator[list[Figure]]:
         _UNSAVED.reset(token)
 
 
+_ALSO: ContextVar[tuple[str, ...]] = ContextVar("other formats", default=())
+
+
+@contextlib.contextmanager
+def also_as(*suffixes: str) -> Iterator[None]:
+    """Meanwhile every PNG gets files of other formats beside it, '.svg' or '.pdf': for print, lines stay lines."""
+    token = _ALSO.set(suffixes)
+    try:
+        yield
+    finally:
+        _ALSO.reset(token)
+
+
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG, unless `unsaved` collects it; the folder is made if needed.
+    """Write a PNG (with other formats, inside `also_as`), unless `unsaved` collects it; the folder is made if needed.
 
     Raises:
-        OSError: the file can't be written.
+        OSError: a file can't be written.
     """
+    from matplotlib import rc_context
+
     if (figures := _UNSAVED.get()) is not None:
         figures.append(figure)
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=DPI, facecolor="white")
+    with rc_context({"svg.hashsalt": path.stem}):  # the same figure gives the same file
+        for suffix in (path.suffix, *_ALSO.get()):
+            undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
+            figure.savefig(path.with_suffix(suffix), dpi=DPI, facecolor="white", metadata=undated)
     return path

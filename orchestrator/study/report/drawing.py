@@ -90,8 +90,8 @@ class Drawn:
 
     def save(self, folder: Path) -> None:
         """PNG, SVG and CSV."""
-        style.save(self.figure, folder / f"{self.name}.png")
-        style.save(self.figure, folder / f"{self.name}.svg")
+        with style.also_as(".svg"):
+            style.save(self.figure, folder / f"{self.name}.png")
         write_csv(folder / f"{self.name}.csv", self.header, self.rows)
 
 
