@@ -32,6 +32,7 @@ from orchestrator.config.yaml.sections import Choice, Section
 from orchestrator.config.yaml.validate import sections_in
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment.adaptive import IgnoranceSettings, RiskLimitSettings, StopSettings
 from orchestrator.strategies.deployment.objectives import Objective
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.risk import RiskSettings
@@ -56,6 +57,9 @@ SECTIONS: dict[str, type[Section]] = {
     "risk": RiskSettings,
     "window": WindowSettings,
     "prices": PricesSettings,
+    "ignorance": IgnoranceSettings,
+    "risk_limit": RiskLimitSettings,
+    "stop": StopSettings,
     "data": campaign.DataSection,
     "loss": campaign.LossSection,
     "objective": Objective,
@@ -105,6 +109,9 @@ OF_SECTIONS = {
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
     "WindowSettings": "[window](#risk-and-the-safe-window)",
     "PricesSettings": "[prices](#prices)",
+    "IgnoranceSettings": "[ignorance](#ignorance-limits-and-the-end)",
+    "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
+    "StopSettings": "[stop](#ignorance-limits-and-the-end)",
     "DataSection": "[data](#existing-data)",
     "ProfileSection": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
