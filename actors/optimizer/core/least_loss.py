@@ -1,6 +1,6 @@
 """Where to pour when every pour counts, and where to simulate for it.
 
-With H pours to follow, b the least expected cost of an action that was poured, and f the cost by `AveragedProcess`, the
+With H pours to follow (4 at most), b the least expected cost of an action that was poured, and f the cost by `AveragedProcess`, the
 next pour minimises what it loses less what it may save in all that follow:
 
     E clip(f(x), 0, 1) − H E (b − f(x)⁺)⁺
@@ -40,7 +40,7 @@ Score = Callable[[Array], Array]
 LATEST = 8
 """Poured places, and as many to come, that simulations are made for."""
 
-FORESIGHT = 15
+FORESIGHT = 4
 """Most pours whose savings count: what is found later could be found otherwise."""
 
 WORTH_AT = 256
