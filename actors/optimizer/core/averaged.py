@@ -7,8 +7,8 @@ something more that nobody simulated:
     v_j² = σ_j² + e^{2 g_j} s_s²(A_j x + s_j),    y = f(x) + ε,    ε ~ N(0, (n + 0.15 μ_j(x))²)
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. The last
-hypothesis is ignorance: the simulator says nothing of this bench, and f is a GP around 0.6, more towards the corners. The
-posterior weights are prior times marginal likelihood of the observations. So nothing is ever forgotten: a hypothesis that
+hypothesis is ignorance: the simulator says nothing of this bench, and f is a GP around 0.6, more towards corners. The
+posterior weights are prior times marginal likelihood of the observations. So nothing is forgotten: a hypothesis that
 fails fades, and the weight of ignorance says how far the simulator is to be trusted.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
