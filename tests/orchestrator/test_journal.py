@@ -105,7 +105,8 @@ def test_pours_are_flushed_to_the_disk_and_simulations_need_not_be(path: Path) -
 def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal import Header, Journal, Kind
+        from orchestrator.journal import Journal, Kind
+        from orchestrator.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         for number in range(10**6):
             journal.append(Kind.NOTE, {{"number": number}})
@@ -128,7 +129,8 @@ def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) ->
 def test_a_second_process_is_refused_and_told_who_is_first(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal import Header, Journal
+        from orchestrator.journal import Journal
+        from orchestrator.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         print("open", flush=True)
         input()
