@@ -12,17 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.journal import (
-    FORMAT,
-    JOURNAL_NAME,
-    Draft,
-    Header,
-    Journal,
-    JournalError,
-    JournalLockedError,
-    JournalReader,
-    Kind,
-)
+from orchestrator.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
+from orchestrator.journal_file import FORMAT, Header, JournalError, JournalLockedError
 from orchestrator.states import State
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
