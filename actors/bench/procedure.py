@@ -133,7 +133,8 @@ class PourProcedure:
         if setup.balance is not None:
             await setup.balance.device.revive()
             await setup.balance.resume()
-        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed))
+        show = self._report.pour if self._report.watched else None
+        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
         await self._weighings.before()
 
     async def _move(self) -> None:
@@ -147,7 +148,7 @@ class PourProcedure:
         setup, path = self._setup, self._path
         self._report.enter("approach")
         try:
-            await setup.nature.lasting(setup.arm.move_to_start(path), path.approach_time)
+            await setup.nature.lasting(setup.arm.move_to_start(path, self._seen), path.approach_time)
         except STUCK as error:
             await self._consent.bring_home(error, begun=self._begun)
             raise
@@ -168,7 +169,7 @@ class PourProcedure:
         try:
             if self._broken is not None:
                 await setup.arm.release()  # agreed to with the un-tilting
-            await setup.arm.retreat(path)
+            await setup.arm.retreat(path, self._seen)
         except STUCK as error:
             await self._consent.bring_home(error, begun=self._begun)
         await self._let_it_land()
@@ -237,6 +238,10 @@ class PourProcedure:
 
     def _follow(self, state: ArmState) -> None:
         self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
+        self._seen(state)
+
+    def _seen(self, state: ArmState) -> None:
+        self._report.stand(state.joints, state.pourer)
 
     async def _watch(self) -> None:
         """Give the balance's display to those who watch; it can't hold the pour up."""
@@ -247,7 +252,7 @@ class PourProcedure:
             with contextlib.suppress(LaboratoryError):
                 weight = await balance.read()
                 if math.isfinite(weight.mass):
-                    self._report.show(weight.mass)
+                    self._report.show(weight.mass, weight.stable)
             await asyncio.sleep(LOOK_INTERVAL)
 
 
