@@ -17,6 +17,9 @@ from sim_engine.marks import FREE
 from sim_engine.space import Space
 from sim_engine.task import Scene
 
+Design = Literal["stratified", "active"]
+"""How calibration pours are chosen: spread evenly, or each by what it will tell about deployment."""
+
 
 @dataclass(frozen=True)
 class RecordedPour:
@@ -25,6 +28,7 @@ class RecordedPour:
     Attributes:
         poured, spilled, retained: masses [kg].
         split: 'train', 'test' or 'transfer'.
+        scene: name of the one that it was made in; '' for that of its `RecordSet`.
     """
 
     action: Action
@@ -32,6 +36,7 @@ class RecordedPour:
     spilled: float
     retained: float
     split: str
+    scene: str = ""
 
     @property
     def poured_fraction(self) -> float:
@@ -42,6 +47,21 @@ class RecordedPour:
     def normalised_spillage(self) -> float | None:
         """r = spilled / poured, None where too little was poured for it."""
         return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
+
+
+@dataclass(frozen=True)
+class KnownSimulation:
+    """One that was made before a calibration, in one of its scenes.
+
+    Attributes:
+        theta: values of the searched parameters.
+        spillage: c_s.
+    """
+
+    theta: dict[str, float]
+    scene: str
+    action: Action
+    spillage: float
 
 
 @dataclass(frozen=True)
@@ -136,6 +156,10 @@ class CalibrationPlan(StagePlan):
         constraints: on actions, beside the bounds of their space.
         prior: dimensions along which g is not uniform.
         parameter_prior: searched parameters that were measured beforehand, each with its tolerance.
+        further: scenes beside the first one, with other receivers, into which pours are made by turns.
+        design: how the pours are chosen.
+        design_simulations: made to choose them, where they are chosen actively.
+        known: simulations that were made before, filled in when the calibration begins.
     """
 
     settings: CalibrationSettings
@@ -151,6 +175,15 @@ class CalibrationPlan(StagePlan):
     constraints: tuple[Linear, ...] = ()
     prior: tuple[NormalPrior, ...] = ()
     parameter_prior: tuple[NormalPrior, ...] = ()
+    further: tuple[Scene, ...] = ()
+    design: Design = "stratified"
+    design_simulations: int = 0
+    known: tuple[KnownSimulation, ...] = ()
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """All scenes that calibration pours are made in."""
+        return (self.scene, *self.further)
 
     @property
     def simulations(self) -> int:

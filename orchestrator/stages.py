@@ -11,9 +11,11 @@ import numpy as np
 
 from orchestrator.errors import RunError
 from orchestrator.flights import Order
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, KnownSimulation, RecordSet
 from orchestrator.results import Results, learnt_by
+from orchestrator.strategies.calibration.active import ActivePours
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
@@ -67,7 +69,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     """
     found: list[Scene] = []
     if plan.calibration is not None:
-        found.append(plan.calibration.scene)
+        found += plan.calibration.scenes
         found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
     if plan.deployment is not None:
         found += plan.deployment.scenes
@@ -82,34 +84,41 @@ def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
     """All stages of a campaign in order: pours, calibration, evaluation, then a deployment for each receiver."""
     stages: list[StageDefinition] = []
     if plan.calibration is not None:
-        stages += calibration_stages(plan.calibration)
+        stages += calibration_stages(plan.calibration, plan.deployment)
     if plan.deployment is not None:
         stages += deployment_stages(plan, plan.deployment)
     return tuple(stages)
 
 
-def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
-    """Pours (unless records take their place), the strategy, and what came of it beside its rivals."""
+def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None = None) -> list[StageDefinition]:
+    """Pours (unless records take their place), the strategy, and what came of it beside its rivals.
+
+    Args:
+        deployment: what pours that are chosen actively are to teach about; None: about calibration's own actions.
+    """
     stages = []
     if plan.pour_count > 0:
 
         def pours(results: Results, seed: int) -> Strategy:
+            if plan.design == "active":
+                return ActivePours(plan, deployment, seed)
             return DesignedPours(
-                plan.scene, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
+                plan.scenes, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
             )
 
         stages.append(StageDefinition(POURS, pours, pours=True))
 
     def calibration(results: Results, seed: int) -> Strategy:
         pours = [scored.pour for scored in measured_pours(plan, results)]
-        return plan.settings.build(plan, pours, seed)
+        return plan.settings.build(replace(plan, known=known_simulations(plan, results)), pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
         theta = calibrated_theta(results).theta
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        plain = SimulationParameters.from_values(plan.fixed_parameters) if rivals else None
-        return Scorecard(theta, rivals, pours, plan.actions, seed, uncalibrated=plain)
+        measured = {prior.name: prior.mean for prior in plan.parameter_prior}
+        plain = SimulationParameters.from_values(plan.fixed_parameters | measured) if rivals else None
+        return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain)
 
     found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
     return [*stages, found, StageDefinition(EVALUATION, evaluation)]
@@ -162,13 +171,18 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
 
 def prediction_stages(
-    plan: CampaignPlan, deployment: DeploymentPlan, seeds: int, thetas: Sequence[SimulationParameters] = ()
+    plan: CampaignPlan,
+    deployment: DeploymentPlan,
+    seeds: int,
+    thetas: Sequence[SimulationParameters] = (),
+    discrepancy: float | None = None,
 ) -> list[StageDefinition]:
     """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
 
     Args:
         seeds: how many, each.
         thetas: draws of a posterior that the seeds take turns with; none: the θ that was planned with.
+        discrepancy: shift that the calibration left over (`sim_engine.bands`); None: nobody knows.
     """
 
     def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
@@ -179,7 +193,8 @@ def prediction_stages(
             costing = Costing.of(deployment, scene, theta)
             draws = known.settings.draws(known, theta, seeds, seed)
             drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
-            return RepeatedSimulation(costing, action, seeds, seed, drawn, [draw.error for draw in draws])
+            errors = [draw.error for draw in draws]
+            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, discrepancy)
 
         return build
 
@@ -230,14 +245,26 @@ def calibrated_theta(results: Results) -> CalibratedTheta:
 
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
     """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
-    made = []
+    made, scenes = [], {scene.name: scene for scene in plan.scenes}
     for pour in learnt_by(results, POURS, DesignPoured).measured if POURS in results else ():
-        action = plan.scene.action(dict(pour.action_si))
-        made.append(ScoredPour(plan.scene.name, MeasuredPour(action, pour.spillage, pour.poured, pour.split)))
+        scene = scenes.get(pour.scene, plan.scene)
+        action = scene.action(dict(pour.action_si))
+        measured = MeasuredPour(action, pour.spillage, pour.poured, pour.split, scene.name)
+        made.append(ScoredPour(scene.name, measured))
     return [*made, *_recorded(plan.records)]
+
+
+def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSimulation, ...]:
+    """What the stage that made the pours has simulated in the calibration's scenes."""
+    simulated = learnt_by(results, POURS, DesignPoured).simulated if POURS in results else ()
+    scenes = {scene.name: scene for scene in plan.scenes}
+    return tuple(
+        KnownSimulation(dict(one.theta), one.scene, scenes[one.scene].action(dict(one.action_si)), one.spillage)
+        for one in simulated
+    )
 
 
 def _recorded(records: RecordSet | None) -> list[ScoredPour]:
     if records is None:
         return []
-    return [ScoredPour(records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]
+    return [ScoredPour(pour.scene or records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]
