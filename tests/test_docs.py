@@ -73,7 +73,12 @@ def test_shown_commands_are_understood(page: Path) -> None:
         assert verb in verbs, line
         if not arguments:
             continue  # a verb that is only mentioned
-        verbs[verb].make_context(verb, list(arguments)).close()  # raises on what the command does not know
+        try:
+            verbs[verb].make_context(verb, list(arguments)).close()  # raises on what the command does not know
+        except Exception as error:
+            mentioned = all(word.startswith("-") for word in arguments)  # an option, which then needs no campaign
+            if not mentioned or type(error).__name__ != "MissingParameter":
+                raise
         for argument in arguments:
             if argument.startswith("configs/"):
                 assert (ROOT / argument).exists(), line
