@@ -1,7 +1,7 @@
 """Where to pour when every pour counts, and where to simulate for it.
 
-With H pours to follow (4 at most), b the least expected cost of an action that was poured, and f the cost by `AveragedProcess`, the
-next pour minimises what it loses less what it may save in all that follow:
+With H pours to follow (4 at most), b the least expected cost of an action that was poured, and f the cost by
+`AveragedProcess`, the next pour minimises what it loses less what it may save in all that follow:
 
     E clip(f(x), 0, 1) − H E (b − f(x)⁺)⁺
 
