@@ -61,7 +61,7 @@ def open_laboratory(
     need_bench: bool,
     make: Callable[[], Simulator] = pour_simulator,
     operator: Operator | None = None,
-    kept: InProcessSimulatorPool | None = None,
+    kept: ClosablePool | None = None,
 ) -> Laboratory:
     """A laboratory, to be entered with `async with`; nothing starts before that.
 
@@ -70,7 +70,8 @@ def open_laboratory(
         need_bench: whether pours will be asked for.
         make: makes simulators, where they run.
         operator: who answers questions, where a person does.
-        kept: where all runs in this process: simulators that outlive the laboratory, in place of its own.
+        kept: simulators that outlive the laboratory, in place of its own (`actors.warm`). Not on a cluster, whose
+            members come and go.
 
     Raises:
         LaboratoryError: a bench is needed and there is none, or nobody to stand beside it, or the mode is not known.
@@ -85,20 +86,24 @@ def open_laboratory(
         )
     if spec.in_process:
         return InProcessLaboratory(spec if need_bench else None, make, operator, kept)
-    return RayLaboratory(spec, make, need_bench=need_bench, operator=operator)
+    return RayLaboratory(spec, make, need_bench=need_bench, operator=operator, kept=kept if spec.ray is None else None)
 
 
-class _ClosablePool(SimulatorPool, Protocol):
-    async def close(self) -> None: ...
+class ClosablePool(SimulatorPool, Protocol):
+    """A pool that ends."""
+
+    async def close(self) -> None:
+        """End its simulators."""
+        ...
 
 
 class _OpenLaboratory:
     """What both kinds of laboratory have in common once they are open."""
 
     def __init__(self) -> None:
-        self._pool: _ClosablePool | None = None
-        self._kept: _ClosablePool | None = None
-        self._apart: _ClosablePool | None = None
+        self._pool: ClosablePool | None = None
+        self._kept: ClosablePool | None = None
+        self._apart: ClosablePool | None = None
         self._devices: list[Device] = []
         self._opened: OpenBench | None = None
         self._optimizer: Optimizer | None = None
@@ -141,6 +146,17 @@ class _OpenLaboratory:
             raise LaboratoryError("the laboratory is not open: use 'async with'")
         return self._optimizer
 
+    async def stop_arm(self) -> bool:
+        """Stop what moves, past everything that waits for the arm; it stays locked. Returns whether there is an arm.
+
+        Raises:
+            LaboratoryError: it can't be told; only its own emergency stop helps then.
+        """
+        if self._opened is None:
+            return False
+        await self._opened.bench.arm.stop()
+        return True
+
     @property
     def opened(self) -> OpenBench | None:
         """What is behind the bench; None where there is none."""
@@ -176,7 +192,7 @@ class InProcessLaboratory(_OpenLaboratory):
         spec: LaboratorySpec | None,
         make: Callable[[], Simulator] = pour_simulator,
         operator: Operator | None = None,
-        kept: InProcessSimulatorPool | None = None,
+        kept: ClosablePool | None = None,
     ) -> None:
         super().__init__()
         self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
@@ -216,6 +232,7 @@ class RayLaboratory(_OpenLaboratory):
         make: makes simulators, in their processes.
         need_bench: whether pours are needed.
         operator: a person, where one answers.
+        kept: simulators to use in place of its own; they stay open.
     """
 
     def __init__(
@@ -225,9 +242,10 @@ class RayLaboratory(_OpenLaboratory):
         *,
         need_bench: bool = False,
         operator: Operator | None = None,
+        kept: ClosablePool | None = None,
     ) -> None:
         super().__init__()
-        self._spec, self._make, self._operator = spec, make, operator
+        self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
         self._needs_bench = need_bench and spec.pours
         self._cluster: JoinedCluster | None = None
         self._liquid: RaySimulatorPool | None = None
@@ -261,7 +279,7 @@ class RayLaboratory(_OpenLaboratory):
         from actors.device import RayDevice
 
         here = None if self._cluster is None else self._cluster.here
-        self._pool = self._open_pool()
+        self._pool = self._kept or self._open_pool()
         proposer = RayDevice("optimiser", Proposer, node=here)
         self._devices.append(proposer)
         self._optimizer = DeviceOptimizer(proposer)

@@ -158,6 +158,19 @@ class Telling(Protocol):
         ...
 
 
+@runtime_checkable
+class Stoppable(Protocol):
+    """A laboratory whose arm can be stopped by somebody who does not wait for it."""
+
+    async def stop_arm(self) -> bool:
+        """Stop what moves; it stays locked. Returns whether there is an arm.
+
+        Raises:
+            LaboratoryError: it can't be told.
+        """
+        ...
+
+
 class Laboratory(Protocol):
     """Everything a campaign needs, opened and closed as one (`async with`)."""
 

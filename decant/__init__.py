@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from decant.campaigns import build_campaign, load_campaign, load_vessel, shipped, starting_set
+    from decant.catalogue import find_pours, find_runs
     from decant.driving import calibrate, plan, run
     from decant.runs import Run, open_run, publish
     from decant.simulating import Simulation, simulate
@@ -38,6 +39,8 @@ __all__ = [
     "build_campaign",
     "calibrate",
     "events",
+    "find_pours",
+    "find_runs",
     "load_campaign",
     "load_vessel",
     "open_run",
@@ -51,6 +54,7 @@ __all__ = [
 
 _HOMES = {
     "decant.campaigns": ("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),
+    "decant.catalogue": ("find_pours", "find_runs"),
     "decant.driving": ("calibrate", "plan", "run"),
     "decant.runs": ("Run", "open_run", "publish"),
     "decant.simulating": ("Simulation", "simulate"),

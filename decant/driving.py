@@ -115,14 +115,10 @@ def plan(
     Raises:
         ValueError, LaboratoryError, RunError: see `run`.
     """
-    planned = planning_plan(campaign, None, None, iterations)
+    vessel = load_vessel(Path(receiver)) if isinstance(receiver, str | Path) else receiver
+    planned = planning_plan(campaign, theta, vessel, iterations)
     deployment = planned.deployment
     assert deployment is not None
-    if receiver is not None:
-        vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver))
-        scene = replace(deployment.scenes[0], name=f"plan:{vessel.name}", receiver=vessel)
-        deployment = replace(deployment, scenes=(scene,))
-    planned = replace(planned, deployment=deployment, parameters=planned.parameters if theta is None else theta)
     stages = [*deployment_stages(planned, deployment), *prediction_stages(planned, deployment, seeds)]
     return _run(planned, stages, watch, None, in_process, as_written=receiver is None)
 

@@ -12,9 +12,10 @@ from orchestrator.config.load import load_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import CampaignPlan
 from orchestrator.pour_rows import Answer, Row, answers, pour_row
-from orchestrator.publish import Published
+from orchestrator.publish import FIGURES, Published, summary_of, write_report
 from orchestrator.publish import publish as write
 from orchestrator.report.results import deployments_of, predictions_of, theta_of
+from orchestrator.report.run_page import REPORT_NAME
 from orchestrator.report.units import loss_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
 from orchestrator.results import Results
@@ -102,6 +103,24 @@ class Run:
         from orchestrator.report.campaign import figures_of
 
         return figures_of(self.campaign, self.results)
+
+    def report(self, path: Path | str | None = None) -> Path:
+        """Write the page about the run, one HTML file that needs nothing beside it, with figures drawn anew.
+
+        Args:
+            path: of the page; 'report.html' in the run's folder unless given.
+
+        Raises:
+            OSError: it can't be written.
+            RunError: the journal can't be read.
+        """
+        from orchestrator.report.campaign import draw_figures
+
+        figures = draw_figures(self.directory / FIGURES, self.campaign, self.results)
+        summary = summary_of(self.campaign, self.result, figures)
+        return write_report(
+            self.directory / REPORT_NAME if path is None else Path(path), self.campaign, summary, self.directory
+        )
 
     def save_tables(self, directory: Path | str | None = None) -> list[Path]:
         """Write all tables as Parquet files.
@@ -219,7 +238,7 @@ def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run
 
 
 def publish(run: Run) -> Published:
-    """Write a run's figures, `theta.json` and `summary.json` into its folder, as `decant run` does at its end.
+    """Write a run's figures, `theta.json`, `summary.json` and report into its folder, as `decant run` does at its end.
 
     Raises:
         OSError: a file can't be written.

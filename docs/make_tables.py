@@ -18,6 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from orchestrator.catalogue.columns import TABLES as CATALOGUE
 from orchestrator.config import pose, vessel
 from orchestrator.config.campaign import sections as campaign
 from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
@@ -158,10 +159,12 @@ def parameters() -> str:
     default = SimulationParameters().model_dump()
     rows = []
     for name, info in SimulationParameters.info().items():
-        unit = "" if info.unit == "1" else f" {info.unit}"
-        rows.append(
-            (f"`{name}`", f"{info.lower:g} … {info.upper:g}{unit}", f"{default[name]:g}{unit}", _one_line(info.meaning))
+        unit = "" if info.shown == "1" else f" {info.shown}"
+        lower, upper, usual = (
+            f"{round(value / info.factor, 6):g}" for value in (info.lower, info.upper, default[name])
         )
+        beforehand = f" Beforehand ± {info.tolerance / info.factor:.2g}{unit}." if info.nuisance else ""
+        rows.append((f"`{name}`", f"{lower} … {upper}{unit}", f"{usual}{unit}", _one_line(info.meaning) + beforehand))
     return _table(("name", "bounds", "default", "meaning"), rows)
 
 
@@ -170,6 +173,8 @@ def effects() -> str:
     found = {(e.parameter, e.pour): e for e in sensitivity.effects(_measured("sensitivity"))}
     rows = []
     for name, info in SimulationParameters.info().items():
+        if info.nuisance:
+            continue
         cells = []
         for pour in sensitivity.POURS:
             e = found.get((name, pour))
@@ -209,6 +214,12 @@ def states() -> str:
     return _table(("state", "meaning"), [(f"{state}", said[state.name]) for state in State])
 
 
+def catalogued(table: str) -> str:
+    """What the columns of one of the catalogue's tables mean."""
+    rows = [(f"`{c.name}`", c.unit.replace("1", "fraction"), _one_line(c.meaning)) for c in CATALOGUE[table]]
+    return _table(("column", "unit", "meaning"), rows)
+
+
 def section(model: type[Section]) -> str:
     """Keys of a section as people write them."""
     rows = []
@@ -244,6 +255,8 @@ def _arms(model: type[Section]) -> dict[str, type[Section]]:
 
 
 TABLES: dict[str, Callable[[], str]] = {
+    "catalogue-runs": partial(catalogued, "run"),
+    "catalogue-pours": partial(catalogued, "pour"),
     "actions": actions,
     "parameters": parameters,
     "effects": effects,

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
-    Assignments,
     Campaign,
     InProcess,
     Json,
+    Live,
+    LiveAt,
     OtherLaboratory,
     Parameters,
     Quiet,
     Receiver,
     Resume,
     RunId,
-    SceneName,
     Seed,
     call,
     examples,
@@ -62,16 +61,10 @@ def decant(
     """What stands before the verbs."""
 
 
-class BackendChoice(StrEnum):
-    """Where the solver runs."""
-
-    CPU = "cpu"
-    CUDA = "cuda"
-
-
 @app.command(
     epilog=examples(
         "decant run configs/campaigns/quickstart.yaml",
+        "decant run configs/campaigns/quickstart.yaml --live   # open the printed address in a browser",
         "decant run my.yaml --resume   # after a stop, a crash or a power cut; nothing finished is done again",
     )
 )
@@ -82,6 +75,8 @@ def run(
     answer: Answer = None,
     in_process: InProcess = False,
     arm: Arm = False,
+    live: Live = False,
+    live_at: LiveAt = None,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     as_json: Json = False,
@@ -105,6 +100,8 @@ def run(
             seed=seed,
             as_json=as_json,
             armed=arm,
+            live=live,
+            live_at=live_at,
         ),
     )
 
@@ -122,6 +119,8 @@ def calibrate(
     answer: Answer = None,
     in_process: InProcess = False,
     arm: Arm = False,
+    live: Live = False,
+    live_at: LiveAt = None,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     as_json: Json = False,
@@ -145,6 +144,8 @@ def calibrate(
             seed=seed,
             as_json=as_json,
             armed=arm,
+            live=live,
+            live_at=live_at,
         ),
     )
 
@@ -225,50 +226,13 @@ def study(
     call(verb.study, file, jobs=jobs, dry_run=dry_run, report_only=report_only, as_json=as_json)
 
 
-@app.command(
+app.command(
     epilog=examples(
         "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
         "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
+        "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
     )
-)
-def simulate(
-    campaign: Campaign,
-    assignments: Assignments = None,
-    parameters: Parameters = None,
-    receiver: Receiver = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the initial positions; the first of several.")] = 0,
-    seeds: Annotated[
-        int, typer.Option(min=1, max=1000, help="How many seeds: SEED, SEED + 1, … Their spread is told.")
-    ] = 3,
-    scene: SceneName = None,
-    as_json: Json = False,
-    rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
-    png: Annotated[Path | None, typer.Option(help="Draw four moments of the pour.", show_default=False)] = None,
-    backend: Annotated[BackendChoice, typer.Option(help="Where the solver runs.")] = BackendChoice.CPU,
-    quiet: Quiet = False,
-) -> None:
-    """Simulate one pour of a campaign's scene, with several seeds, and say where the liquid went.
-
-    Actions without a unit are in deg, deg/s, deg/s^2, mm and s; what the campaign fixes needs no `--set`. With `--json`
-    fractions are of the load: received + spilled + retained + in_flight + escaped = 1; they, the recording and the
-    picture are the first seed's, means and standard deviations of all seeds stand under 'prediction'.
-    """
-    from orchestrator.commands import single
-
-    call(
-        single.simulate,
-        campaign,
-        assignments=assignments or [],
-        parameters=parameters,
-        receiver=receiver,
-        seed=seed,
-        seeds=seeds,
-        scene_name=scene,
-        as_json=as_json,
-        rrd=rrd,
-        png=png,
-        backend=backend.value,
-    )
+)(simulate_verb.simulate)
 
 
 @app.command(
@@ -328,6 +292,9 @@ app.command(
     )
 )(bench_verbs.pour)
 
+app.command(epilog=report.EXAMPLES)(report.report)
+app.add_typer(runs_verbs.runs)
+
 
 @app.command(epilog=examples("decant plugins", "decant plugins --json"))
 def plugins(as_json: Json = False) -> None:
@@ -369,6 +336,9 @@ def physics(
     from orchestrator.commands import physics as verb
 
     call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
+
+
+daemon_verbs.register(app)
 
 
 def main() -> None:

@@ -72,7 +72,7 @@ def read_former_run(directory: Path) -> FormerRun:
         for stage, pour, measured in weighed
     )
     mode = str(header.get("laboratory", {}).get("mode", "virtual"))
-    return FormerRun(path, mode, {scene["name"]: scene for scene in _scenes(header)}, pours)
+    return FormerRun(path, mode, {scene["name"]: scene for scene in scenes_in(header)}, pours)
 
 
 def _recorded(action: Action, measured: PourMeasurement, split: str) -> RecordedPour:
@@ -89,7 +89,8 @@ def _splits(results: Results) -> dict[tuple[str, int], str]:
     }
 
 
-def _scenes(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def scenes_in(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The scenes of a run, as they are in its journal's header (a fingerprint)."""
     calibration, deployment = header.get("calibration") or {}, header.get("deployment") or {}
     if calibration:
         yield calibration["scene"]

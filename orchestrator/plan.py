@@ -88,11 +88,11 @@ class ExistingPours:
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """The prior g along one dimension of an action: normal, cut off at the ends of its range.
+    """A prior along one dimension of an action or of θ: normal, cut off at the ends of its range.
 
     Attributes:
-        name: of the dimension.
-        mean, deviation: of the normal before it is cut off, in the dimension's SI unit.
+        name: of the dimension or parameter.
+        mean, deviation: of the normal before it is cut off, in SI.
     """
 
     name: str
@@ -116,6 +116,7 @@ class CalibrationPlan:
         random_baseline: how many random θ are scored for comparison.
         constraints: on actions, beside the bounds of their space.
         prior: dimensions along which g is not uniform.
+        parameter_prior: searched parameters that were measured beforehand, each with its tolerance.
     """
 
     settings: CalibrationSettings
@@ -130,6 +131,7 @@ class CalibrationPlan:
     random_baseline: int = 0
     constraints: tuple[Linear, ...] = ()
     prior: tuple[NormalPrior, ...] = ()
+    parameter_prior: tuple[NormalPrior, ...] = ()
 
     @property
     def strategy(self) -> str:

@@ -1,10 +1,10 @@
-"""What follows a run, whoever drove it: its recording is closed, its figures and summary and θ* are written."""
+"""What follows a run, whoever drove it: its recording is closed, its figures, summary, θ* and report are written."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -15,9 +15,14 @@ from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import regimes
 from orchestrator.report.campaign import draw_figures
-from orchestrator.report.results import theta_of
+from orchestrator.report.record import read_record
+from orchestrator.report.results import evaluation_of, theta_of
+from orchestrator.report.run_page import REPORT_NAME, run_page
 from orchestrator.report.summary import PoolUse, RunSummary, Totals, summarise, write_summary
+from orchestrator.runs import VERSIONS
 from orchestrator.strategies.calibration.base import CalibratedTheta
+from orchestrator.strategies.calibration.evaluation import Scores
+from orchestrator.strategies.calibration.scorecard import shift_left_over
 
 W = TypeVar("W")
 
@@ -54,16 +59,19 @@ class Published:
     Attributes:
         figures: by name.
         theta: the file of θ*, for `--parameters`; None where nothing was calibrated.
+        report: the page about the run, for people; None where it could not be written.
     """
 
     summary: RunSummary
     figures: dict[str, Path]
     recording: Path | None = None
     theta: Path | None = None
+    report: Path | None = None
 
 
 def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | None = None) -> Published:
-    """Close a run's recording, and write its figures (if the plan wants any), `theta.json` and `summary.json`.
+    """Close a run's recording, and write its figures (if the plan wants any), `theta.json`, `summary.json` and the
+    report. A run that stands still may be published, too: its report says where it stands.
 
     Safe to call again: the files are then written anew.
 
@@ -79,32 +87,90 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
     if recording is not None:
         recording.close()
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
-    summary = summarise(
+    summary = summary_of(
         plan,
-        result.results,
-        figures=figures,
+        result,
+        figures,
         recording=None if recording is None else recording.path,
         dropped_events=0 if recording is None else recording.dropped,
-        not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
-        best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
-        totals=_totals(plan, result),
     )
     write_summary(directory, summary)
     found = theta_of(result.results)
     theta = None if found is None else directory / THETA_FILE
     if theta is not None and found is not None:
-        theta.write_text(json.dumps(theta_file(found), indent=2) + "\n", encoding="utf-8")
-    return Published(summary, figures, None if recording is None else recording.path, theta)
+        written = theta_file(found, evaluation_of(result.results))
+        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+    report: Path | None = directory / REPORT_NAME
+    try:
+        write_report(directory / REPORT_NAME, plan, summary, directory)
+    except Exception as error:  # days of pouring don't end in a traceback about a page
+        _log.warning("the report was not written: %s: %s", type(error).__name__, error)
+        report = None
+    return Published(summary, figures, None if recording is None else recording.path, theta, report)
 
 
-def theta_file(found: CalibratedTheta) -> dict[str, Any]:
-    """What `theta.json` holds: θ*, and where it is known the posterior as weighted θ, each complete."""
+def summary_of(
+    plan: CampaignPlan,
+    result: CampaignResult,
+    figures: Mapping[str, Path],
+    *,
+    recording: Path | None = None,
+    dropped_events: int = 0,
+) -> RunSummary:
+    """The summary of a run as its folder holds it, of one that is not finished too."""
+    return summarise(
+        plan,
+        result.results,
+        figures=figures,
+        recording=recording,
+        dropped_events=dropped_events,
+        not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
+        best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
+        totals=_totals(plan, result),
+    )
+
+
+def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory: Path) -> Path:
+    """Write the page about a run, whole or not at all.
+
+    Args:
+        path: of the page.
+        summary: with the figures that go into it.
+        directory: of the run.
+
+    Raises:
+        OSError: it can't be written, or a figure can't be read.
+        RunError: the journal can't be read.
+    """
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        record = read_record(journal)
+    try:
+        versions = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        versions = {}
+    draft = path.with_suffix(".html.part")
+    draft.write_text(run_page(plan, summary, record, directory, versions=versions), encoding="utf-8")
+    draft.replace(path)
+    return path
+
+
+def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str, Any]:
+    """What `theta.json` holds: θ*, what it left over, and where it is known the posterior as weighted θ, each complete.
+
+    Args:
+        found: by the calibration.
+        scored: θ* on the weighed pours; None: nobody knows what it left over.
+    """
     theta = found.theta.model_dump()
-    if found.posterior is None:
-        return {"theta": theta}
-    draws = found.posterior.thetas
-    kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
-    return {"theta": theta, "posterior": [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]}
+    data: dict[str, Any] = {"theta": theta}
+    left = None if scored is None else shift_left_over(scored, len(found.searched))
+    if left is not None:
+        data["remaining_discrepancy"] = {"shift": left}
+    if found.posterior is not None:
+        draws = found.posterior.thetas
+        kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
+        data["posterior"] = [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]
+    return data
 
 
 def _totals(plan: CampaignPlan, result: CampaignResult) -> Totals:

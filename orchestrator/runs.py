@@ -19,6 +19,9 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.reserve import TO_BEGIN, require_space
 from orchestrator.states import State
 
+RESOLVED, VERSIONS = "resolved.json", "versions.json"
+"""What a run was asked for, and by which program."""
+
 
 class RunNotFoundError(JournalError):
     """There is no run to resume."""
@@ -57,8 +60,8 @@ def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
 
 def write_provenance(directory: Path, plan: CampaignPlan) -> None:
     """Keep with the run what is needed to reproduce it: resolved.json (the plan) and versions.json."""
-    _write_json(directory / "resolved.json", plan.resolved)
-    _write_json(directory / "versions.json", {"campaign": str(plan.source), "seed": plan.seed, **versions()})
+    _write_json(directory / RESOLVED, plan.resolved)
+    _write_json(directory / VERSIONS, {"campaign": str(plan.source), "seed": plan.seed, **versions()})
 
 
 def versions() -> dict[str, Any]:

@@ -9,7 +9,7 @@ VARIABLE = "DECANT_STATE"
 
 
 def state_directory() -> Path:
-    """`$DECANT_STATE`, else `decant` in the XDG state directory (`$XDG_STATE_HOME`, else `~/.local/state`).
+    """`$DECANT_STATE`, else what systemd gives a unit, else `decant` in `$XDG_STATE_HOME` or `~/.local/state`.
 
     It need not exist yet.
 
@@ -18,6 +18,8 @@ def state_directory() -> Path:
     """
     if named := os.environ.get(VARIABLE):
         return Path(named).absolute()
+    if given := os.environ.get("STATE_DIRECTORY"):
+        return Path(given.split(":")[0])
     if shared := os.environ.get("XDG_STATE_HOME"):
         return Path(shared).absolute() / "decant"
     try:

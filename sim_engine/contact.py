@@ -259,7 +259,7 @@ def contact_during(
     pourer: Vessel,
     receiver: Vessel,
     *,
-    receiver_at: tuple[float, float] = (0.0, 0.0),
+    receiver_at: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Contact, float] | None:
     """The first touch of two vessels during a motion.
 
@@ -267,7 +267,7 @@ def contact_during(
         motion: of the pourer.
         pourer: the moving one.
         receiver: stands upright.
-        receiver_at: where the receiver stands, x and y [m].
+        receiver_at: where the receiver stands, off the place and height that were intended [m].
 
     Returns:
         The contact and the pourer's tilt there [rad]; None when they stay clear of each other.
@@ -275,7 +275,7 @@ def contact_during(
     # A planned pourer turns about one line, and comes back through the poses that it went through on its way out.
     until = motion.phases[0].end if isinstance(motion, PourMotion) else motion.duration
     times, poses = poses_along(motion, pourer, until)
-    poses[:, :2] -= receiver_at
+    poses[:, :3] -= receiver_at
     contact = first_contact(pourer, receiver, poses)
     if contact is None:
         return None

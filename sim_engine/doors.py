@@ -108,12 +108,23 @@ class Door(Generic[T]):
                     broken.append(Broken(self.group, entry.name, package, reason))
                 continue
             try:
-                usable[entry.name] = self._accept(entry.load(), entry.name)
+                usable[entry.name] = _whole(self._accept(entry.load(), entry.name))
             except Exception as error:  # whatever a stranger's module raises, Decant goes on
                 broken.append(Broken(self.group, entry.name, package, f"{type(error).__name__}: {error}"))
             else:
                 packages[entry.name] = package
         return dict(sorted(usable.items())), tuple(broken), packages
+
+
+def _whole(found: T) -> T:
+    """What was loaded, unless it is a class that leaves open what it has to say.
+
+    Raises:
+        TypeError: it does; names what is missing.
+    """
+    if missing := sorted(getattr(found, "__abstractmethods__", ())) if isinstance(found, type) else []:
+        raise TypeError(f"its class {found} lacks {', '.join(f'{name!r}' for name in missing)}")
+    return found
 
 
 def _package(entry: EntryPoint) -> str:

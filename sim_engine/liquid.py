@@ -1,7 +1,8 @@
-"""Liquids and the simulator's knobs: what is poured (SI), and θ_s, what calibration may turn."""
+"""Liquids and the simulator's knobs: what is poured (SI), and what calibration may turn: θ_s, nuisances."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -11,10 +12,27 @@ from sim_engine.marks import FREE
 
 LARGEST_LIP_DROP = 1.0
 
+FARTHEST_TILT = math.radians(5.0)
+
+SHOWN = {"mm": 1e-3, "deg": math.pi / 180.0}
+"""Units that people read in place of SI units, and what one of them is in SI."""
+
+
+def _nuisance(unit: str, shown: str, tolerance: float) -> dict[str, Any]:
+    """What a bench's nuisance declares beside default, bounds and meaning: `tolerance` is a standard deviation."""
+    return {"unit": unit, "shown": shown, "tolerance": tolerance}
+
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """A simulation parameter as forms, schema and plots need it (bounds are those of the model field)."""
+    """A simulation parameter as forms, schema and plots need it (bounds are those of the model field).
+
+    Attributes:
+        unit: SI; '1' for a plain number.
+        shown: unit that people read and write.
+        tolerance: of a bench's nuisance, the standard deviation that it is thought to have before anything is measured,
+            in SI; 0 for what is turned in the solver.
+    """
 
     name: str
     unit: str
@@ -22,6 +40,18 @@ class ParameterInfo:
     upper: float
     integer: bool
     meaning: str
+    shown: str
+    tolerance: float
+
+    @property
+    def factor(self) -> float:
+        """One shown unit in SI."""
+        return SHOWN.get(self.shown, 1.0)
+
+    @property
+    def nuisance(self) -> bool:
+        """Whether it is about how a bench differs from what was commanded, and not about the solver."""
+        return self.tolerance > 0.0
 
 
 class Liquid(BaseModel):
@@ -57,7 +87,11 @@ class Liquid(BaseModel):
 
 
 class SimulationParameters(BaseModel):
-    """What calibration may turn (θ_s). Names follow FleX where it has one; meanings are ours."""
+    """What calibration may turn: θ_s and nuisances of the bench. Names follow FleX where it has one; meanings are ours.
+
+    Nuisances say how a bench differs, pour after pour, from what it was told: where the receiver stands, how the pourer
+    is held, how fast the arm's clock runs. The simulator applies them in one place (`PourTask.placement`).
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -85,6 +119,23 @@ class SimulationParameters(BaseModel):
     √(g d) on. A layer of particles can't be thinner than a spacing: at 0.5 its middle passes a lip with the head that a
     film's needs. At 0 a lip holds back more, as in solvers that don't correct their lips."""
 
+    receiver_x: float = Field(default=0.0, ge=-0.03, le=0.03, json_schema_extra=_nuisance("m", "mm", 0.005))
+    """The receiver stands that much further from the pourer than intended."""
+
+    receiver_y: float = Field(default=0.0, ge=-0.03, le=0.03, json_schema_extra=_nuisance("m", "mm", 0.003))
+    """The receiver stands that much sideways."""
+
+    receiver_z: float = Field(default=0.0, ge=-0.03, le=0.03, json_schema_extra=_nuisance("m", "mm", 0.003))
+    """The receiver stands that much higher: the liquid falls less far."""
+
+    tilt_zero: float = Field(
+        default=0.0, ge=-FARTHEST_TILT, le=FARTHEST_TILT, json_schema_extra=_nuisance("rad", "deg", math.radians(0.7))
+    )
+    """The pourer is held that much more tilted than commanded."""
+
+    speed_factor: float = Field(default=1.0, ge=0.8, le=1.25, json_schema_extra=_nuisance("1", "1", 0.02))
+    """Executed over commanded angular velocity."""
+
     @classmethod
     def info(cls) -> dict[str, ParameterInfo]:
         """Name, unit, bounds and meaning of every parameter."""
@@ -93,15 +144,27 @@ class SimulationParameters(BaseModel):
             lower = next(m.ge for m in field.metadata if hasattr(m, "ge"))
             upper = next(m.le for m in field.metadata if hasattr(m, "le"))
             extra: dict[str, Any] = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+            unit = str(extra.get("unit", "1"))
             table[name] = ParameterInfo(
                 name,
-                str(extra.get("unit", "1")),
+                unit,
                 float(lower),
                 float(upper),
                 field.annotation is int,
                 field.description or "",
+                str(extra.get("shown", unit)),
+                float(extra.get("tolerance", 0.0)),
             )
         return table
+
+    @classmethod
+    def nuisances(cls) -> dict[str, ParameterInfo]:
+        """Those that are about the bench."""
+        return {name: info for name, info in cls.info().items() if info.nuisance}
+
+    def of_the_solver(self) -> dict[str, float]:
+        """Values of those that are not about the bench."""
+        return self.model_dump(exclude=set(self.nuisances()))
 
     @classmethod
     def from_values(cls, values: dict[str, float]) -> SimulationParameters:

@@ -55,7 +55,7 @@ def check_motion(
     Raises:
         InvalidSceneError: with where, how deep and at which tilt.
     """
-    found = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y))
+    found = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y, error.z))
     if found is not None:
         contact, tilt = found
         text = describe_contact(contact, tilt=tilt)
@@ -102,7 +102,7 @@ class PourSimulator:
         Raises:
             InvalidSceneError: with the reason.
         """
-        scene, error = task.scene, task.pose_error or PoseError()
+        scene, error = task.scene, task.placement
         try:
             pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
             check_holds(pourer, scene.liquid.volume)
@@ -220,7 +220,7 @@ class PourSimulator:
         """The scene as the engine takes it, at the time from which it has to be simulated [s]."""
         from sim_engine.fluid.state import SUPPORT
 
-        scene, parameters, error = task.scene, task.parameters, task.pose_error or PoseError()
+        scene, parameters, error = task.scene, task.parameters, task.placement
         pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
         d = spacing(scene.liquid.volume, parameters.particles)
         drift = liquid_velocity(motion, pourer, start) if start > 0.0 else np.zeros(3)
@@ -231,8 +231,8 @@ class PourSimulator:
             parameters=parameters,
             pourer=self._walls(scene.pourer, SUPPORT * d),
             receiver=self._walls(scene.receiver, SUPPORT * d),
-            receiver_at=np.array([error.x, error.y, 0.0]),
-            spill_level=receiver.rim_height - d,
+            receiver_at=np.array([error.x, error.y, error.z]),
+            spill_level=receiver.rim_height + error.z - d,
             poses=motion.sample(np.arange(0.0, motion.duration + LONGEST_TAIL + 0.1, POSE_STEP)),
             settling=SETTLING,
             start=start,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sim_engine.action import Action
 from sim_engine.liquid import Liquid, SimulationParameters
@@ -55,6 +55,7 @@ class PoseError:
     Attributes:
         x: the receiver stands that much further from the pourer [m].
         y: … and that much sideways [m].
+        z: … and that much higher [m].
         tilt: the pourer is held that much more tilted than commanded [rad].
         speed_factor: executed over commanded angular velocity.
     """
@@ -63,6 +64,28 @@ class PoseError:
     y: float = 0.0
     tilt: float = 0.0
     speed_factor: float = 1.0
+    z: float = 0.0
+
+    @classmethod
+    def of(cls, parameters: SimulationParameters) -> PoseError:
+        """The nuisances of a bench as errors of placement and execution."""
+        return cls(
+            x=parameters.receiver_x,
+            y=parameters.receiver_y,
+            z=parameters.receiver_z,
+            tilt=parameters.tilt_zero,
+            speed_factor=parameters.speed_factor,
+        )
+
+    def and_then(self, other: PoseError) -> PoseError:
+        """Both errors together: places and tilts add up, speeds multiply."""
+        return PoseError(
+            x=self.x + other.x,
+            y=self.y + other.y,
+            z=self.z + other.z,
+            tilt=self.tilt + other.tilt,
+            speed_factor=self.speed_factor * other.speed_factor,
+        )
 
 
 @dataclass(frozen=True)
@@ -72,7 +95,8 @@ class PourTask:
     Attributes:
         seed: of the initial positions; same task, same seed → same bits on one CPU thread.
         record_rate: frames of all particles kept per simulated second; 0 keeps none.
-        pose_error: deviations from the intended scene; None for a plain simulation.
+        parameters: θ_s, and the bench's nuisances.
+        pose_error: deviations of this one pour, beside those nuisances; None for a plain simulation.
         motion: what an arm did, read back from it, in place of the motion planned for `action`; what of `pose_error`
             changes a motion must then be in it already.
     """
@@ -89,3 +113,14 @@ class PourTask:
         error = self.pose_error
         if self.motion is not None and error is not None and (error.tilt != 0.0 or error.speed_factor != 1.0):
             raise ValueError("an executed motion holds its own errors of tilt and speed; pose_error may only shift it")
+
+    @property
+    def placement(self) -> PoseError:
+        """How the pour truly goes: nuisances of the bench and `pose_error` together, the one place that joins them.
+
+        An executed motion tells its own tilt and speed; of the nuisances it leaves the receiver's place.
+        """
+        nuisances = PoseError.of(self.parameters)
+        if self.motion is not None:
+            nuisances = replace(nuisances, tilt=0.0, speed_factor=1.0)
+        return nuisances if self.pose_error is None else nuisances.and_then(self.pose_error)

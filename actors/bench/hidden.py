@@ -41,12 +41,13 @@ def draw_pose_error(spec: VirtualBenchSpec, seed: int) -> PoseError:
         spec: mean errors and standard deviations.
         seed: of the pour.
     """
-    noise = np.random.default_rng(stream(seed, "pose")).standard_normal(4)
+    noise = np.random.default_rng(stream(seed, "pose")).standard_normal(5)
     mean, deviation = spec.pose_error, spec.pose_noise
     factor = mean.speed_factor + deviation.speed_factor * noise[3]
     return PoseError(
         x=float(mean.x + deviation.x * noise[0]),
         y=float(mean.y + deviation.y * noise[1]),
+        z=float(mean.z + deviation.z * noise[4]),
         tilt=float(mean.tilt + deviation.tilt * noise[2]),
         # A standard deviation is not a bound; an arm that stands still or runs away is not an error of execution.
         speed_factor=float(np.clip(factor, 0.5, 1.5)),

@@ -181,7 +181,7 @@ class VirtualBench(Nature):
         """Masses spilled and retained [kg]; same motion, same seed, same masses."""
         mass = self.things.in_pourer
         scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))
-        shift = PoseError(x=error.x, y=error.y)
+        shift = PoseError(x=error.x, y=error.y, z=error.z)
         task = PourTask(scene, pour.action, SimulationParameters(), 0, pose_error=shift, motion=motion)
         spill = spill_of(await hidden_pour(self._spec, self._simulators, task, pour.seed), mass)
         return spill.spilled, spill.retained

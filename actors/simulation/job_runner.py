@@ -84,6 +84,8 @@ class JobRunner:
             raise JobCancelledError from None
         except Exception as error:
             raise SimulationError(f"the simulator failed: {type(error).__name__}: {error}") from error
+        if not isinstance(run, SimulatedPour):
+            raise SimulationError(f"the simulator answered with a {type(run).__name__}, not with a simulated pour")
         if self._is_first and time.process_time() - begun > self._long_first_job:
             self.close()
         self._is_first = False

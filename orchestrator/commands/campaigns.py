@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
     from sim_engine.liquid import SimulationParameters
+    from sim_engine.vessel.spec import VesselSpec
 
 
 _TOLD = {"prediction", "predicted_delivered_g", "predicted_delivered_ml", "risk", "window", "not_covered"}
@@ -43,6 +44,10 @@ class RunOptions:
     as_json: bool
     armed: bool
     """Hardware may move in this run."""
+    live: bool = False
+    """A live view is served while it runs …"""
+    live_at: str | None = None
+    """… at this ADDRESS[:PORT], where one is given."""
 
 
 def run(path: Path, options: RunOptions) -> None:
@@ -54,7 +59,8 @@ def run(path: Path, options: RunOptions) -> None:
     _check_posterior(plan)
     finished = _run(plan, "run", path, options)
     if options.as_json:
-        print_json({"run": finished.result.directory.name, **summary_json(finished.published.summary)})
+        summary = summary_json(finished.published.summary)
+        print_json({"run": finished.result.directory.name, "report": finished.published.report, **summary})
 
 
 def _check_posterior(plan: CampaignPlan) -> None:
@@ -133,6 +139,7 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
         "run": str(finished.result.directory),
         "figures": finished.published.figures,
         "recording": finished.published.recording,
+        "report": finished.published.report,
     }
 
 
@@ -222,14 +229,23 @@ def _drawn(plan: CampaignPlan, parameters: Path | None, thetas: int) -> tuple[Si
 
 
 def planning_plan(
-    plan: CampaignPlan, parameters: Path | None, receiver: Path | None, iterations: int | None
+    plan: CampaignPlan,
+    parameters: Path | SimulationParameters | None,
+    receiver: Path | VesselSpec | None,
+    iterations: int | None,
 ) -> CampaignPlan:
-    """A campaign turned into D1 without pours.
+    """A campaign turned into D1 without pours, and its record.
+
+    Args:
+        parameters: θ to plan with, or a file with it; the campaign's unless given.
+        receiver: another vessel than the campaign's, or its file.
+        iterations: as the campaign says unless given.
 
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
     from orchestrator.config.load import load_parameters, load_posterior, load_vessel
+    from orchestrator.config.record import record_of
     from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.stages import POSTERIOR_DRAWS
     from orchestrator.strategies.deployment.d1 import D1Settings
@@ -237,18 +253,20 @@ def planning_plan(
     deployment, theta = plan.deployment, plan.parameters
     posterior = deployment is not None and deployment.settings.needs_posterior
     thetas: tuple[SimulationParameters, ...] = ()
-    if posterior and parameters is None:
+    if posterior and not isinstance(parameters, Path):
         raise RefusalError(
             f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration "
             "by C4",
             BAD_INPUT,
         )
     try:
-        if parameters is not None:
+        if isinstance(parameters, Path):
             theta = load_parameters(parameters, plan.parameters)
             if posterior:
                 thetas = load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters)
-        vessel = load_vessel(receiver) if receiver is not None else None
+        elif parameters is not None:
+            theta = parameters
+        vessel = load_vessel(receiver) if isinstance(receiver, Path) else receiver
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
     if deployment is None:
@@ -262,19 +280,17 @@ def planning_plan(
     changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
     settings = D1Settings.like(deployment.settings, **changes)
     deployment = dataclasses.replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0)
-    return dataclasses.replace(
-        plan,
-        name=f"{plan.name}-plan",
-        parameters=theta,
-        calibration=None,
-        deployment=deployment,
+    planned = dataclasses.replace(
+        plan, name=f"{plan.name}-plan", parameters=theta, calibration=None, deployment=deployment
     )
+    return dataclasses.replace(planned, resolved=record_of(plan.resolved, planned))
 
 
 def _run(
     plan: CampaignPlan, verb: str, path: Path, options: RunOptions, stages: list[StageDefinition] | None = None
 ) -> Finished:
     from orchestrator.commands.arming import arm_campaign
+    from orchestrator.commands.live import live_view
     from orchestrator.commands.people import check_somebody_is_there
     from orchestrator.stages import stages_of
 
@@ -287,6 +303,7 @@ def _run(
     if any(stage.pours for stage in chosen):
         check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(plan, chosen, in_process=options.in_process)
+    live = live_view(plan, live=options.live, at=options.live_at)
     directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
     flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
     flag += "" if options.seed is None else f" --seed {options.seed}"
@@ -301,6 +318,7 @@ def _run(
         again=again,
         answer=options.answer,
         checksum=checksum,
+        live=live,
     )
     if finished.published.theta is not None:
         mention(f"θ* is in {finished.published.theta}; use it with --parameters")

@@ -24,6 +24,7 @@ from orchestrator.commands.waiting import Waiting
 if TYPE_CHECKING:
     from actors.protocols import Laboratory
     from orchestrator.campaign import CampaignResult
+    from orchestrator.monitor.live import LiveView
     from orchestrator.plan import CampaignPlan
     from orchestrator.publish import Published
     from orchestrator.stages import StageDefinition
@@ -144,6 +145,7 @@ def run_in_front_of_people(
     not_resumed: str = "",
     answer: str | None = None,
     checksum: str | None = None,
+    live: LiveView | None = None,
 ) -> Finished:
     """Run a campaign with a live display, a recording, figures and a summary.
 
@@ -155,6 +157,7 @@ def run_in_front_of_people(
         not_resumed: … where nothing resumes: what is not, and what of it is kept.
         answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
         checksum: of the safety settings that people have accepted for the controller of hardware.
+        live: view to open while it runs.
 
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.
@@ -162,7 +165,12 @@ def run_in_front_of_people(
     from actors.laboratory import open_laboratory
     from actors.protocols import LaboratoryError
     from orchestrator.campaign import run_campaign
-    from orchestrator.commands.interrupted import file_trouble, given_up_pours, interruption
+    from orchestrator.commands.interrupted import (
+        file_trouble,
+        given_up_pours,
+        interruption,
+        report_of_what_stands,
+    )
     from orchestrator.commands.people import asked_about_unknown_pours, person_at_the_terminal
     from orchestrator.errors import RunError
     from orchestrator.events import Watcher
@@ -182,6 +190,7 @@ def run_in_front_of_people(
     if not resume:
         _warn_of_what_is_not_simulated(plan)
     monitor: RerunMonitor | None = None
+    result: CampaignResult | None = None
     try:
         display = ProgressDisplay(plan, quiet=is_quiet())
         operator = person_at_the_terminal(spec, display.paused) if pouring else None
@@ -189,7 +198,10 @@ def run_in_front_of_people(
         if plan.outputs.rrd and not installed("rerun"):
             say("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
         elif plan.outputs.rrd:
-            monitor = RerunMonitor(directory / "campaign.rrd", plan)
+            if live is not None:
+                mention(f"live view: {live.open()}")
+            path = directory / "campaign.rrd"
+            monitor = RerunMonitor(path, plan) if live is None else live.watcher_for(plan, directory)
         with display:
             watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]
 
@@ -226,8 +238,14 @@ def run_in_front_of_people(
     finally:
         if monitor is not None:
             monitor.close()
+        if live is not None:
+            live.close()
+        if result is None and (page := report_of_what_stands(plan, directory)) is not None:
+            mention(f"report of what stands  {page}")
     published = publish(plan, result, monitor)
     print_summary(plan, published.summary)
+    if published.report is not None:
+        mention(f"report  {published.report}")
     return Finished(result, published)
 
 

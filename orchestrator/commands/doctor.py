@@ -36,12 +36,8 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
     """
     spec = read_laboratory(path)
     if spec.arm is None:
-        raise RefusalError(
-            f"{path}: laboratory {spec.name} has no arm that could be looked at; its bench is made of numbers, and "
-            "needs no doctor"
-            if spec.bench is not None
-            else f"{path}: laboratory {spec.name} has no bench",
-            BAD_INPUT,
+        raise without_arm(
+            path, spec, "looked at are an arm (whether it answers, its safety settings, tool and payload) and a balance"
         )
     virtual = spec.mode != "hardware"
     say(
@@ -71,6 +67,20 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are mended")
     say("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
+
+
+def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:
+    """Why there is nothing to do in a laboratory without an arm, and where there is.
+
+    Args:
+        asked: what the command is about.
+    """
+    has = "its bench is made of numbers" if spec.bench is not None else "it has no bench"
+    return RefusalError(
+        f"{path}: laboratory {spec.name} has no 'arm', {has}: {asked}. Name a laboratory that has one, for example "
+        "laboratories/virtual.yaml",
+        BAD_INPUT,
+    )
 
 
 def read_laboratory(path: Path) -> LaboratorySpec:

@@ -56,6 +56,28 @@ def given_up_pours(directory: Path) -> list[str]:
     return found
 
 
+def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
+    """Write the report of a run that was interrupted or broke off; None where there is nothing to report on.
+
+    Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
+    """
+    from orchestrator.campaign import read_result
+    from orchestrator.codec import digest
+    from orchestrator.fingerprint import fingerprint
+    from orchestrator.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.publish import FIGURES, summary_of, write_report
+    from orchestrator.report.campaign import draw_figures
+    from orchestrator.report.run_page import REPORT_NAME
+
+    with contextlib.suppress(Exception, KeyboardInterrupt), JournalReader(directory / JOURNAL_NAME) as journal:
+        if digest(journal.header.fingerprint) != digest(fingerprint(plan)):
+            return None  # it was refused, since this is another campaign
+        result = read_result(journal, directory)
+        figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+        return write_report(directory / REPORT_NAME, plan, summary_of(plan, result, figures), directory)
+    return None
+
+
 def file_trouble(error: OSError, directory: Path) -> str:
     """What went wrong with a file of a run: which one, and how much room there should be where the disk is full."""
     from orchestrator.reserve import MB, TO_BEGIN, free_space

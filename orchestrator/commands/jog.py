@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from actors.protocols import LaboratoryError
 from orchestrator.commands.arming import confirm, require_flag
-from orchestrator.commands.doctor import read_laboratory
+from orchestrator.commands.doctor import read_laboratory, without_arm
 from orchestrator.commands.hands_on import accepted_for, connected, reached, stoppable, typed_line
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, say
 
@@ -203,7 +203,7 @@ def jog(path: Path, *, armed: bool) -> None:
     """
     spec = read_laboratory(path)
     if spec.arm is None:
-        raise RefusalError(f"{path}: laboratory {spec.name} has no arm", BAD_INPUT)
+        raise without_arm(path, spec, "steps are typed for an arm that a driver moves")
     require_flag(spec, armed=armed, again=f"decant jog {path} --arm")
     if not sys.stdin.isatty():
         raise RefusalError("jogging is typed at a terminal, step by step, with nothing piped into it", BAD_INPUT)

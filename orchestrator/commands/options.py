@@ -56,6 +56,23 @@ Arm = Annotated[
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
 ]
+Live = Annotated[
+    bool,
+    typer.Option(
+        "--live",
+        help="Serve a live view for browsers while it runs: the address is printed. It can't slow anything down.",
+    ),
+]
+LiveAt = Annotated[
+    str | None,
+    typer.Option(
+        "--live-at",
+        metavar="ADDRESS[:PORT]",
+        help="Where to serve it: '0.0.0.0' for other machines too (there is no password), with a port of your choice. "
+        "Otherwise this machine only, port 9090 or the next free one.",
+        show_default=False,
+    ),
+]
 Parameters = Annotated[
     Path | None, typer.Option(help="θ: a theta.json of a calibration, or your own YAML or JSON.", show_default=False)
 ]

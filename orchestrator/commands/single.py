@@ -33,6 +33,7 @@ def simulate(
     receiver: Path | None,
     seed: int,
     seeds: int,
+    thetas: int | None,
     scene_name: str | None,
     as_json: bool,
     rrd: Path | None,
@@ -40,18 +41,20 @@ def simulate(
     backend: Backend = "cpu",
 ) -> None:
     """One pour in the simulator of this process, with several seeds: their mean and spread are the prediction."""
+    from orchestrator.commands.foretelling import foretelling
     from orchestrator.config.campaign.assignments import assigned_action
     from orchestrator.config.campaign.check import check_vessels
-    from orchestrator.config.load import load_parameters, load_vessel
+    from orchestrator.config.load import load_vessel
     from orchestrator.config.yaml.errors import ConfigError
     from sim_engine.backend import BackendError, require_backend
+    from sim_engine.bands import band_of
     from sim_engine.pour import InvalidSceneError, PourSimulator
     from sim_engine.spread import spreads
     from sim_engine.task import PourTask
 
     plan = read_campaign(path)
+    known = foretelling(plan, parameters, thetas, seeds)
     try:
-        theta = plan.parameters if parameters is None else load_parameters(parameters, plan.parameters)
         vessel = None if receiver is None else load_vessel(receiver)
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
@@ -68,7 +71,11 @@ def simulate(
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     record_rate = 20.0 if rrd or png else 0.0
-    tasks = [PourTask(scene, action, theta, seed + i, record_rate if i == 0 else 0.0) for i in range(seeds)]
+    turns = known.thetas
+    tasks = [
+        PourTask(scene, action, turns[i % len(turns)], seed + i, record_rate if i == 0 else 0.0)
+        for i in range(max(seeds, len(turns)))
+    ]
     try:
         require_backend(backend)
     except BackendError as error:
@@ -83,7 +90,7 @@ def simulate(
     outcomes = [run.outcome for run in runs]
     if rrd is not None or png is not None:
         _show(tasks[0], runs[0], rrd, png)
-    over_seeds = spreads(outcomes)
+    over_seeds, where = spreads(outcomes), band_of(outcomes, known.discrepancy)
     received = over_seeds.get("received")
     delivered = None if received is None else received.mean * scene.liquid.mass
     if as_json:
@@ -92,11 +99,16 @@ def simulate(
             {
                 **outcomes[0].as_json(),
                 "action": action.values(),
-                "theta": theta.model_dump(),
+                "theta": known.theta.model_dump(),
+                "thetas": len(known.drawn),
                 "scene": scene.name,
                 "delivered_g": None if delivered is None else 1e3 * delivered,
                 "delivered_ml": None if delivered is None else scene.liquid.millilitres(delivered),
-                "prediction": {**prediction, "seeds": [task.seed for task in tasks]},
+                "prediction": {
+                    **prediction,
+                    "band": None if where is None else where.as_json(),
+                    "seeds": [task.seed for task in tasks],
+                },
                 "regimes": None if regime is None else regime.as_json(),
                 "not_covered": [] if regime is None else [one.as_json() for one in regime.not_covered],
             }
@@ -105,6 +117,8 @@ def simulate(
         mention(f"{scene.name}: {action.display()}")
         amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
         print(told(outcomes, over_seeds, amount))
+        if where is not None:
+            print(f"spilled / poured {over_seeds['spillage'].percent()}, a pour: {where.percent()}   ({known.said})")
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)

@@ -124,6 +124,38 @@ _Theta = _theta_model()
 
 THETA_KEYS = ("theta", "parameters")
 POSTERIOR_KEY = "posterior"
+DISCREPANCY_KEY, SHIFT_KEY = "remaining_discrepancy", "shift"
+
+
+def has_posterior(path: Path) -> bool:
+    """Whether a file of θ has draws of a posterior.
+
+    Raises:
+        ConfigError: it is not YAML or JSON.
+    """
+    data = Document.read(resolved(path)).data
+    return isinstance(data, dict) and POSTERIOR_KEY in data
+
+
+def load_discrepancy(path: Path) -> float | None:
+    """The shift that a calibration left over (`sim_engine.bands`), from a run's `theta.json`; None if it has none.
+
+    Raises:
+        ConfigError: what stands there is not a number from 0 on.
+    """
+    document = Document.read(resolved(path))
+    found = document.data.get(DISCREPANCY_KEY) if isinstance(document.data, dict) else None
+    if found is None:
+        return None
+    value = found.get(SHIFT_KEY) if isinstance(found, dict) else None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < math.inf:
+        report = Report()
+        report.add(
+            Place(document).at(DISCREPANCY_KEY), f"needs a '{SHIFT_KEY}' from 0 on, as decant calibrate writes it"
+        )
+        report.raise_if_any()
+        return None
+    return float(value)
 
 
 def load_posterior(

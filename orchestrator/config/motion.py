@@ -12,7 +12,7 @@ from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import MADE, Section, Text
 from orchestrator.plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquid import ParameterInfo, SimulationParameters
 from sim_engine.space import Axis, Scale, Space
 from sim_engine.task import Pivot
 
@@ -27,13 +27,16 @@ EXAMPLES = {
     "height": "60 mm",
 } | {
     # A parameter's default is a good example of it.
-    name: f"{default:g}" if info.unit == "1" else f"{default:g} {info.unit}"
+    name: f"{default / info.factor:g}" + ("" if info.shown == "1" else f" {info.shown}")
     for (name, info), default in zip(
         SimulationParameters.info().items(), SimulationParameters().model_dump().values(), strict=True
     )
 }
 """A right value of every action dimension and simulation parameter, for messages and schemas."""
 
+
+SEARCHED_TOLERANCES = 3.0
+"""A measured value is searched so many of its standard deviations to both sides."""
 
 DEVIATIONS = {"rad/s": "20 deg/s", "rad": "10 deg", "rad/s^2": "200 deg/s^2", "s": "0.5 s", "m": "15 mm"}
 """A right standard deviation of a dimension in each unit."""
@@ -100,6 +103,38 @@ class RangeSection(Section):
         return Axis(name, float(self.range[0]), float(self.range[1]), self.scale, integer)
 
 
+class ParameterRangeSection(RangeSection):
+    """What calibration searches: `[lowest, highest]`, all values alike beforehand; or what was measured,
+    `{measured: …, tolerance: …}`, a normal prior that a range beside it cuts off.
+    """
+
+    required: ClassVar[dict[str, str]] = {}
+
+    measured: Any = None
+    """C4: what was measured or is known of it."""
+
+    tolerance: Any = None
+    """C4: standard deviation of that; without a range three of them to both sides are searched."""
+
+    info: ClassVar[ParameterInfo]
+
+    def searched(self) -> Axis | None:
+        """The axis that is searched; None where something is wrong here."""
+        info = self.info
+        if self.range is not None:
+            return self.axis(info.name, integer=info.integer)
+        if self.measured is None or self.tolerance is None:
+            return None
+        low, high = (self.measured + sign * SEARCHED_TOLERANCES * self.tolerance for sign in (-1.0, 1.0))
+        return Axis(info.name, max(low, info.lower), min(high, info.upper), self.scale, info.integer)
+
+    def normal(self) -> NormalPrior | None:
+        """The prior; None where all values are alike, or where something is wrong here."""
+        if self.measured is None or self.tolerance is None:
+            return None
+        return NormalPrior(self.info.name, float(self.measured), float(self.tolerance))
+
+
 class PriorSection(Section):
     """How likely values of a searched dimension are beforehand: a normal distribution, cut off at the range's ends."""
 
@@ -133,6 +168,20 @@ def _range_model(
         f"{_title(name)}Range", __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields
     )
     return model
+
+
+def _parameter_range_model(info: ParameterInfo) -> type[ParameterRangeSection]:
+    quantity = parameter_quantity(info.name)
+    typical = (info.tolerance or (info.upper - info.lower) / 20.0) / info.factor
+    example = f"{typical:.2g}" + ("" if info.shown == "1" else f" {info.shown}")
+    spread = Quantity(info.unit, example, 0.0, info.upper - info.lower, positive=True)
+    further: Any = {
+        key: (Annotated[float, number] | None, Field(default=None, description=_described(ParameterRangeSection, key)))
+        for key, number in (("measured", quantity), ("tolerance", spread))
+    }
+    model: Any = _range_model(info.name, quantity, ParameterRangeSection, **further)
+    model.info = info
+    return model  # type: ignore[no-any-return]
 
 
 def _action_range_model(dimension: Dimension) -> type[RangeSection]:
@@ -262,20 +311,26 @@ def _parameter_form(value: Any) -> str:
 
 
 class ParametersBase(Section):
-    """Parameters of the simulator: a value fixes one, a range has it searched by calibration."""
+    """Parameters: a value fixes one; a range, or what was measured with a tolerance, has it searched by calibration."""
 
     def fixed(self) -> dict[str, float]:
         """Parameters with a value, SI."""
         return {name: float(v) for name in self.written_keys() if isinstance(v := self.value(name), (int, float))}
 
+    def ranges(self) -> dict[str, ParameterRangeSection]:
+        """Parameters that are to be searched."""
+        given = {name: self.value(name) for name in self.written_keys()}
+        return {name: section for name, section in given.items() if isinstance(section, ParameterRangeSection)}
+
     def searched(self) -> dict[str, Axis]:
-        """Parameters with a range."""
-        info = SimulationParameters.info()
-        return {
-            name: section.axis(name, integer=info[name].integer)
-            for name in self.written_keys()
-            if isinstance(section := self.value(name), RangeSection) and section.range is not None
-        }
+        """Axes of parameters that are to be searched."""
+        axes = {name: section.searched() for name, section in self.ranges().items()}
+        return {name: axis for name, axis in axes.items() if axis is not None}
+
+    def priors(self) -> tuple[NormalPrior, ...]:
+        """Searched parameters whose values are not all alike beforehand."""
+        found = (section.normal() for section in self.ranges().values())
+        return tuple(prior for prior in found if prior is not None)
 
     def completed(self) -> Self:
         """With the defaults of parameters that are not named."""
@@ -283,8 +338,8 @@ class ParametersBase(Section):
         return self.model_copy(update=SimulationParameters().model_dump() | given)
 
     def in_force(self) -> dict[str, float]:
-        """What is named, SI: a value as it is, and of a range the default or what is nearest to it."""
-        default = SimulationParameters().model_dump()
+        """What is named, SI: a value, and of a range what was measured (or the default), or what is nearest."""
+        default = SimulationParameters().model_dump() | {prior.name: prior.mean for prior in self.priors()}
         return self.fixed() | {n: min(max(default[n], axis.lower), axis.upper) for n, axis in self.searched().items()}
 
 
@@ -293,7 +348,7 @@ def _parameters_model() -> type[ParametersBase]:
     for name, info in SimulationParameters.info().items():
         quantity = parameter_quantity(name)
         form: Any = Annotated[
-            Annotated[float, quantity, Tag("fixed")] | Annotated[_range_model(name, quantity), Tag("searched")],
+            Annotated[float, quantity, Tag("fixed")] | Annotated[_parameter_range_model(info), Tag("searched")],
             Discriminator(_parameter_form),
         ]
         fields[name] = (form | None, Field(default=None, description=info.meaning or None))

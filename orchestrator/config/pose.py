@@ -22,6 +22,9 @@ class PoseErrorSection(Section):
     y: Offset = 0.0
     """… and that much sideways."""
 
+    z: Offset = 0.0
+    """… and that much higher."""
+
     tilt: Tilt = 0.0
     """The pourer is held that much more tilted than commanded."""
 
@@ -37,6 +40,9 @@ class PoseNoiseSection(Section):
 
     y: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
     """Standard deviation of the sideways placement."""
+
+    z: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
+    """Standard deviation of the receiver's height."""
 
     tilt: Annotated[float, Quantity("rad", "0.3 deg", 0.0, 0.2)] = 0.0
     """Standard deviation of the tilt."""

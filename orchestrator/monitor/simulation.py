@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from orchestrator.monitor.monitor import solid
+from orchestrator.monitor.recording import solid
 from orchestrator.monitor.streams import Streams
 from orchestrator.report import style
 from sim_engine.simulated import SimulatedPour

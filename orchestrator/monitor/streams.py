@@ -7,7 +7,6 @@ simulations' time, one recording laid out behind the other).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orchestrator.monitor.blueprint import campaign_blueprint, simulation_blueprint
+from orchestrator.monitor.outlet import Outlet
 from orchestrator.report import style
 from sim_engine.space import Space
 from sim_engine.vessel.spec import VesselSpec
-
-# Said before the SDK is loaded: a laboratory's daemon talks to nobody unasked.
-os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 if TYPE_CHECKING:
     from actors.optimizer.core.problem import SurrogateMap
@@ -51,27 +48,27 @@ class Streams:
         name: of the recording, for people.
         receivers: what people call each deployment scene, by its name; None for a single simulation.
         loss_label: of the pours' loss.
+        url: of a Rerun server that gets the same; '' for none.
 
     Raises:
         OSError: the file can't be written.
     """
 
     def __init__(
-        self, path: Path, *, name: str, receivers: Mapping[str, str] | None = None, loss_label: str = "loss"
+        self,
+        path: Path,
+        *,
+        name: str,
+        receivers: Mapping[str, str] | None = None,
+        loss_label: str = "loss",
+        url: str = "",
     ) -> None:
         import rerun as rr
 
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # FileSink only logs that it can't write; find out while somebody still listens.
-        path.open("wb").close()
         self._rr = rr
-        self._recording = rr.RecordingStream(APPLICATION)
-        self._recording.set_sinks(rr.FileSink(str(path)))
-        self._recording.set_log_tick_enabled(False)
-        self._recording.set_log_time_enabled(False)
-        self._recording.send_recording_name(name)
+        self._recording = Outlet(path, application=APPLICATION, name=name, url=url)
         blueprint = simulation_blueprint() if receivers is None else campaign_blueprint(receivers, loss_label)
-        self._recording.send_blueprint(blueprint)
+        self._recording.show(blueprint)
         self._film_end = 0.0
         self._meshes: dict[str, str] = {}
         self._styled: set[str] = set()
@@ -93,9 +90,7 @@ class Streams:
 
     def at(self, *, wall: float, pour: int) -> None:
         """Set the time of what follows: `wall` in seconds since 1970, `pour` pours finished."""
-        self._recording.set_time("wall", timestamp=wall)
-        self._recording.set_time("pour", sequence=pour)
-        self._recording.set_time("sim_time", duration=self._film_end)
+        self._recording.times(wall=wall, pour=pour, sim_time=self._film_end)
 
     def film(
         self,
@@ -121,7 +116,7 @@ class Streams:
         start = self._film_end + (0.5 if self._film_end > 0.0 else 0.0)
         kept = self._thin(times)
         for index in kept:
-            record.set_time("sim_time", duration=start + times[index] - times[0])
+            record.times(sim_time=start + float(times[index] - times[0]))
             pose = np.asarray(frames.pourer_poses[index], dtype=float)
             record.log(
                 "/scene/pourer",
@@ -138,7 +133,7 @@ class Streams:
             for state in range(4):
                 record.log(f"/scene/share/{state}", rr.Scalars(100.0 * float(shares[state])))
         self._film_end = start + float(times[-1] - times[0])
-        record.set_time("sim_time", duration=self._film_end)
+        record.times(sim_time=self._film_end)
 
     @staticmethod
     def _thin(times: NDArray[np.float64]) -> list[int]:
@@ -247,15 +242,9 @@ class Streams:
         """A page of text; replaces the one before."""
         self._recording.log(entity, self._rr.TextDocument(markdown, media_type="text/markdown"))
 
-    def close(self, timeout: float = 5.0) -> None:
-        """Write everything out and end the recording.
-
-        Raises:
-            RuntimeError: it couldn't be written out in time.
-        """
-        # The file's footer, which viewers need to seek, is written when the sink goes.
-        self._recording.flush(timeout_sec=timeout)
-        self._recording.disconnect()
+    def close(self) -> None:
+        """Write everything out and end the recording; waits for the file and for no server."""
+        self._recording.close()
 
 
 def _coloured(values: NDArray[np.float64], name: str) -> NDArray[np.uint8]:

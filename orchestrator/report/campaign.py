@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-def draw_figures(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Path]:
+def draw_figures(
+    directory: Path, plan: CampaignPlan, results: Results, formats: tuple[str, ...] = (".svg",)
+) -> dict[str, Path]:
     """Draw what the results allow: discrepancy map and trials, test discrepancy, spillage against pours, loss maps,
     and the first pours against what was simulated.
 
@@ -49,16 +51,18 @@ def draw_figures(directory: Path, plan: CampaignPlan, results: Results) -> dict[
         directory: where the PNGs go.
         plan: of the campaign.
         results: what the stages learnt.
+        formats: suffixes of the files that are written beside each PNG.
 
     Returns:
-        Name of each figure → its file.
+        Name of each figure → its PNG.
     """
     drawn: dict[str, Path] = {}
-    for name, job in _jobs(directory, plan, results).items():
-        try:
-            drawn[name] = job()
-        except Exception as error:
-            _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
+    with style.also_as(*formats):
+        for name, job in _jobs(directory, plan, results).items():
+            try:
+                drawn[name] = job()
+            except Exception as error:
+                _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
     return drawn
 
 

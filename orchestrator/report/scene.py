@@ -54,7 +54,7 @@ def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
         result,
         build_vessel(scene.pourer),
         build_vessel(scene.receiver),
-        receiver_shift=0.0 if task.pose_error is None else task.pose_error.x,
+        receiver_shift=(task.placement.x, task.placement.z),
         title=title,
         note=note,
     )
@@ -68,7 +68,7 @@ def draw_pour(
     *,
     title: str,
     note: str = "",
-    receiver_shift: float = 0.0,
+    receiver_shift: tuple[float, float] = (0.0, 0.0),
     snapshots: int = 4,
 ) -> Path:
     """Snapshots of a pour seen from the side (vessels cut open at y = 0), above the shares of the liquid over time.
@@ -77,7 +77,7 @@ def draw_pour(
         path: PNG to write.
         result: a simulated pour with frames.
         pourer: its surface.
-        receiver: its surface; it stands on the table at x = `receiver_shift` [m].
+        receiver: its surface; it stands at x and z = `receiver_shift` [m].
         title: first line.
         note: second line.
         receiver_shift: see above.
@@ -96,7 +96,7 @@ def draw_pour(
     shares = _shares(frames.states)
     chosen = _moments(times, shares, snapshots)
     outlines = [section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)]
-    stand = UPRIGHT + np.array([receiver_shift, 0, 0, 0, 0, 0, 0])
+    stand = UPRIGHT + np.array([receiver_shift[0], 0, receiver_shift[1], 0, 0, 0, 0])
     window = _window(outlines, np.asarray(frames.pourer_poses, float)[chosen], stand)
     aspect = (window[3] - window[2]) / (window[1] - window[0])
     width = 3.1 * snapshots

@@ -57,12 +57,15 @@ def display_unit(name: str) -> str:
     if name in ACTION_DIMENSIONS:
         return ACTION_DIMENSIONS[name].display_unit.replace("^2", "²")
     info = SimulationParameters.info().get(name)
-    return "" if info is None or info.unit == "1" else info.unit
+    return "" if info is None or info.unit == "1" else info.shown
 
 
 def display_factor(name: str) -> float:
-    """SI value of one display unit; 1 for simulation parameters, which are shown in SI."""
-    return ACTION_DIMENSIONS[name].factor if name in ACTION_DIMENSIONS else 1.0
+    """SI value of one display unit; 1 for names that are neither action nor parameter."""
+    if name in ACTION_DIMENSIONS:
+        return ACTION_DIMENSIONS[name].factor
+    info = SimulationParameters.info().get(name)
+    return 1.0 if info is None else info.factor
 
 
 def display_value(name: str, value: float | None) -> str:
@@ -216,15 +219,33 @@ def unsaved() -> Iterator[list[Figure]]:
         _UNSAVED.reset(token)
 
 
+_ALSO: ContextVar[tuple[str, ...]] = ContextVar("other formats", default=())
+
+
+@contextlib.contextmanager
+def also_as(*suffixes: str) -> Iterator[None]:
+    """Meanwhile every PNG gets files of other formats beside it, '.svg' or '.pdf': for print, lines stay lines."""
+    token = _ALSO.set(suffixes)
+    try:
+        yield
+    finally:
+        _ALSO.reset(token)
+
+
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG, unless `unsaved` collects it; the folder is made if needed.
+    """Write a PNG (with other formats, inside `also_as`), unless `unsaved` collects it; the folder is made if needed.
 
     Raises:
-        OSError: the file can't be written.
+        OSError: a file can't be written.
     """
+    from matplotlib import rc_context
+
     if (figures := _UNSAVED.get()) is not None:
         figures.append(figure)
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=DPI, facecolor="white")
+    with rc_context({"svg.hashsalt": path.stem}):  # the same figure gives the same file
+        for suffix in (path.suffix, *_ALSO.get()):
+            undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
+            figure.savefig(path.with_suffix(suffix), dpi=DPI, facecolor="white", metadata=undated)
     return path

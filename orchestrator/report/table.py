@@ -197,14 +197,35 @@ def _prediction(over_seeds: Mapping[str, Spread]) -> str:
 
 
 def print_summary(plan: CampaignPlan, summary: RunSummary) -> None:
-    """Write the summary's table to stderr.
+    """Write the summary's table to stderr."""
+    _print(summary_table(plan, summary), to_stderr=True)
 
-    Where that is not a terminal, nobody has a width to fit in: lines are as long as names and paths want them.
+
+def print_table(rows: Sequence[Mapping[str, str]], *, right: Sequence[str] = (), title: str | None = None) -> None:
+    """Write a table to stdout; columns in which nothing stands are left out.
+
+    Args:
+        rows: head → cell, the same heads in each.
+        right: heads of columns with numbers.
     """
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", title_style="bold", box=_box(), pad_edge=False)
+    shown = [head for head in rows[0] if any(row[head] for row in rows)] if rows else []
+    for head in shown:
+        table.add_column(Text(head), justify="right" if head in right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(row[head]) for head in shown))
+    _print(table)
+
+
+def _print(table: RenderableType, *, to_stderr: bool = False) -> None:
+    """Where that is not a terminal, nobody has a width to fit in: lines are as long as names and paths want them."""
     from rich.console import Console
     from rich.measure import Measurement
 
-    console, table = Console(stderr=True), summary_table(plan, summary)
+    console = Console(stderr=to_stderr)
     if not console.is_terminal:
         wanted = Measurement.get(console, console.options.update(max_width=LONGEST_LINE), table).maximum
         console.width = max(PLAIN_WIDTH, wanted)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast, get_args
 
 from orchestrator.plan import CampaignPlan, DeploymentPlan
 from orchestrator.requests import Pour, Prediction
 from orchestrator.strategies.deployment.costs import Costing
-from sim_engine.losses import Loss, normalised_spillage
+from sim_engine.losses import Loss, LossName, normalised_spillage
 from sim_engine.outcome import PourMeasurement
 
 
@@ -67,6 +68,12 @@ def loss_unit(loss: Loss) -> LossUnit:
             return LossUnit("spilled [g]", "g", 1.0)
         case "particles":
             return LossUnit("spilled [particles]", "particles", 1.0)
+
+
+def named_loss_unit(name: str) -> LossUnit:
+    """How to show a loss of which only the name is known; what isn't one is a share."""
+    names: tuple[str, ...] = get_args(LossName)
+    return loss_unit(Loss(cast("LossName", name))) if name in names else SPILLAGE
 
 
 def deployment_unit(plan: DeploymentPlan) -> LossUnit:

@@ -6,6 +6,7 @@ come the YAML keys with their errors, the JSON schema, the tables of the docs, t
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
@@ -89,13 +90,13 @@ class CalibrationSettings(StrategySettings):
         """Whether its result has draws of θ given the pours."""
         return False
 
+    @abstractmethod
     def simulations_on(self, train: int) -> int:
         """Single simulated pours that it may spend on so many training pours."""
-        raise NotImplementedError
 
+    @abstractmethod
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
         """The strategy itself."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -176,6 +177,6 @@ class DeploymentSettings(StrategySettings):
         """What it spends into one receiver, in words."""
         return f"{self.pours} pours"
 
+    @abstractmethod
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
         """The strategy itself."""
-        raise NotImplementedError

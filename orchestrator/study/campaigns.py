@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orchestrator.config.record import record_of
 from orchestrator.journal import JOURNAL_NAME
 from orchestrator.plan import CampaignPlan, OutputPlan, RecordedPour, RecordSet
 from orchestrator.results import Results, learnt_by
@@ -33,7 +34,6 @@ from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.study.cells import FINAL, GRID, Cell
 from orchestrator.study.plan import StudyPlan
-from orchestrator.study.record import cell_record
 from orchestrator.study.strategies import AnsweredByTable, FinalPour, SimulatedTable, Tabled
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
@@ -52,7 +52,7 @@ def campaign_of(
         directory: of its run.
     """
     plan, stages = _planned(study, cell, load, directory)
-    return replace(plan, resolved=cell_record(study.base.resolved, plan)), stages
+    return replace(plan, resolved=record_of(study.base.resolved, plan)), stages
 
 
 def _planned(study: StudyPlan, cell: Cell, load: Load, directory: Path) -> tuple[CampaignPlan, list[StageDefinition]]:

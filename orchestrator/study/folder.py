@@ -20,6 +20,7 @@ from orchestrator.study.cells import Cell
 from orchestrator.study.plan import StudyPlan, study_fingerprint
 
 CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "process-{}.log", "study.json"
+SOURCE = "study-file.txt"
 
 
 class StudyError(RunError):
@@ -120,7 +121,23 @@ def opened(study: StudyPlan) -> Iterator[Path]:
         check_settings(study)
         text = json.dumps(study_fingerprint(study), indent=1, ensure_ascii=False)
         write_whole(folder / SETTINGS, text + "\n")
+        write_whole(folder / SOURCE, f"{study.source}\n")
         yield folder
+
+
+def file_of(folder: Path) -> Path:
+    """The study's file, as it was called when the study ran last.
+
+    Raises:
+        StudyError: nobody knows it, or it is not there any more.
+    """
+    try:
+        path = Path((folder / SOURCE).read_text(encoding="utf-8").strip())
+    except OSError:
+        raise StudyError(f"{folder}: nothing says here which file the study is of; name the file (YAML)") from None
+    if not path.is_file():
+        raise StudyError(f"{folder}: its file was {path}, which is not there any more; name the file (YAML)")
+    return path
 
 
 def check_settings(study: StudyPlan) -> None:

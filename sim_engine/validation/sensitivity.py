@@ -207,7 +207,8 @@ def sensitivity(
         progress: told how many simulations are done, and how many there are.
     """
     base = SimulationParameters(particles=extent.particles)
-    turned = {n: i for n, i in SimulationParameters.info().items() if not extent.parameters or n in extent.parameters}
+    known = {n: i for n, i in SimulationParameters.info().items() if not i.nuisance}
+    turned = {n: i for n, i in known.items() if not extent.parameters or n in extent.parameters}
     grids = {name: grid(info, float(getattr(base, name)), extent.values) for name, info in turned.items()}
     jobs = list(_jobs(base, grids, extent))
     spilled: dict[tuple[str, SimulationParameters], list[float]] = {}

@@ -87,11 +87,11 @@ def solver_fingerprint() -> str:
 
 def describe(parameters: SimulationParameters) -> str:
     """θ but for its number of particles, as people read it."""
-    units = {name: info.unit for name, info in SimulationParameters.info().items()}
+    infos = SimulationParameters.info()
     shown = [
-        f"{name.replace('_', ' ')} {value:g} {units[name]}".removesuffix(" 1")
+        f"{name.replace('_', ' ')} {value:g} {infos[name].unit}".removesuffix(" 1")
         for name, value in parameters.model_dump().items()
-        if name != "particles"
+        if name != "particles" and not infos[name].nuisance
     ]
     return ", ".join(shown)
 

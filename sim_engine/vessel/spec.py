@@ -93,6 +93,8 @@ def _shape(loaded: object, name: str) -> type[Shape]:
         raise ValueError(
             f"its field 'kind' should be Literal['{name}'] = '{name}', the name that it is registered under"
         )
+    if loaded.outline is Shape.outline and loaded.build is Shape.build:
+        raise TypeError(f"its class {loaded.__name__} lacks 'outline' or 'build'")
     return loaded
 
 

@@ -65,6 +65,8 @@ def test_an_error_of_the_engine_names_itself_and_the_pool_goes_on(make_pool, fak
         pool = make_pool(fake())
         with pytest.raises(SimulationError, match="ZeroDivisionError: spacing"):
             await pool.simulate(task(name="broken"))
+        with pytest.raises(SimulationError, match="answered with a str, not with a simulated pour"):
+            await pool.simulate(task(name="odd"))
         assert (await pool.simulate(task())).outcome.seed == 1
         assert pool.statistics().deaths == 0
         await pool.close()

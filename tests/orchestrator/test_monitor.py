@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from orchestrator.events import LogLine
@@ -18,33 +17,8 @@ from orchestrator.monitor.simulation import simulation_rrd
 from orchestrator.monitor.worker import QueueThread
 from sim_engine.simulated import RecordedFrames, SimulatedPour
 from tests.orchestrator import watched
+from tests.orchestrator.recorded import Contents
 from tests.patience import PATIENCE
-
-
-class Contents:
-    """What is in an .rrd: rows by entity, and the timelines they are on."""
-
-    def __init__(self, path: Path) -> None:
-        from rerun.chunk import RrdReader
-
-        reader = RrdReader(str(path))
-        self.blueprints = len(reader.blueprints())
-        self.columns: dict[str, dict[str, list[object]]] = {}
-        for chunk in reader.stream():
-            table = chunk.to_record_batch()
-            entity = self.columns.setdefault(str(chunk.entity_path), {})
-            for name, column in zip(table.schema.names, table.columns, strict=True):
-                if pa.types.is_temporal(column.type):  # nanoseconds, finer than Python's times
-                    column = column.cast(pa.int64())  # noqa: PLW2901
-                entity.setdefault(name, []).extend(column.to_pylist())
-
-    def values(self, entity: str, component: str) -> list[object]:
-        """All rows of a component, in no particular order of chunks."""
-        return [v for name, rows in self.columns[entity].items() if component in name for v in rows if v is not None]
-
-    def rows(self, entity: str, timeline: str = "wall") -> int:
-        """Rows of an entity on a timeline."""
-        return len(self.columns[entity].get(timeline, ()))
 
 
 @pytest.fixture(scope="module")

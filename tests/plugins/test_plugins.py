@@ -242,3 +242,49 @@ def test_a_dialect_from_outside_is_found_out_and_has_a_virtual_balance(site: Pat
 def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
     program = "import runpy; print(runpy.run_path('docs/make_tables.py')['TABLES']['vessel']())"
     assert any("`cone`" in line and "A cone that opens upwards" in line for line in python(site, program))
+
+
+UNFINISHED = """
+from typing import Literal
+from orchestrator.config.laboratory.arms import ArmSettings
+from orchestrator.config.laboratory.balance import BalanceDeviceSection
+from orchestrator.strategies.calibration.settings import DesignSettings
+from orchestrator.strategies.deployment.objectives import Objective
+from sim_engine.vessel.spec import Shape
+
+class Arm(ArmSettings):
+    kind: Literal["arm"] = "arm"
+
+class Balance(BalanceDeviceSection):
+    kind: Literal["balance"] = "balance"
+
+class Design(DesignSettings):
+    strategy: Literal["design"] = "design"
+
+class Wish(Objective):
+    name: Literal["wish"] = "wish"
+
+class Bowl(Shape):
+    kind: Literal["bowl"] = "bowl"
+"""
+
+
+def test_a_class_that_leaves_out_what_its_kind_has_to_say_is_refused_with_its_package(tmp_path: Path) -> None:
+    (tmp_path / "unfinished.py").write_text(UNFINISHED)
+    metadata = tmp_path / "unfinished-0.1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: unfinished\nVersion: 0.1\n")
+    (metadata / "entry_points.txt").write_text(
+        "[decant.arms]\narm = unfinished:Arm\n[decant.balances]\nbalance = unfinished:Balance\n"
+        "[decant.strategies]\ndesign = unfinished:Design\n[decant.objectives]\nwish = unfinished:Wish\n"
+        "[decant.vessels]\nbowl = unfinished:Bowl\n"
+    )
+    broken = {one["name"]: one for one in json.loads(command(tmp_path)("plugins", "--json").stdout)["broken"]}
+    assert {one["package"] for one in broken.values()} == {"unfinished 0.1"}
+    assert {name: one["reason"].partition(" lacks ")[2] for name, one in broken.items()} == {
+        "arm": "'resolve'",
+        "balance": "'device'",
+        "design": "'build', 'thetas', 'with_thetas'",
+        "wish": "'cost'",
+        "bowl": "'outline' or 'build'",
+    }

@@ -117,17 +117,22 @@ BAD = {
 }
 
 
-@pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a program says of it in an environment where the example is registered."""
-    folder, site = tmp_path_factory.mktemp("campaign"), tmp_path_factory.mktemp("site")
+def register(site: Path) -> None:
+    """Have the example's strategy and objective registered for whoever has this folder on its path."""
     metadata = site / "decant_example-1.0.dist-info"
-    metadata.mkdir()
+    metadata.mkdir(parents=True)
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: decant-example\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text(
         "[decant.strategies]\nhypercube = tests.plugins.decant_example.strategy:HypercubeSettings\n"
         "[decant.objectives]\ngentle = tests.plugins.decant_example.objective:Gentle\n"
     )
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What a program says of it in an environment where the example is registered."""
+    folder, site = tmp_path_factory.mktemp("campaign"), tmp_path_factory.mktemp("site")
+    register(site)
     (folder / "good.yaml").write_text(CAMPAIGN)
     for name, (old, new) in BAD.items():
         assert old in CAMPAIGN
@@ -175,3 +180,54 @@ def test_what_is_wrong_is_said_as_of_ours(known: dict[str, Any], case: str, mess
     said = known["errors"][f"bad-{case}"]
     assert message in said
     assert said.count(".yaml:") == 1, "one cause, one message"
+
+
+# -- a study with it ---------------------------------------------------------------------------------------------------
+
+STUDY = """
+import json, sys
+from pathlib import Path
+from orchestrator.study.report.page import write_report
+from tests.orchestrator.study_files import read, written
+from tests.orchestrator.toy_study import run_toy_study
+from orchestrator.config.study.sections import load_study
+from orchestrator.config.yaml.errors import ConfigError
+
+folder = Path(sys.argv[1])
+data = read("quick")
+data["calibration"] = {"C4": data["calibration"]["C4"]}
+data["mismatch"] = data["mismatch"][:1]
+twice = {"repetitions": 2, "pours": 2}
+data["deployment"] = {"D2": twice, "hypercube": {**twice, "centred": True}}
+study = load_study(written(folder, data))
+status = run_toy_study(study)
+page = write_report(study, study.folder)
+try:
+    data["deployment"]["hypercube"]["per_pour"] = 3
+    load_study(written(folder, data))
+except ConfigError as error:
+    said = str(error)
+finished = sorted(status.finished)
+print(json.dumps({"failed": status.failed, "finished": finished, "page": page.read_text(), "error": said}))
+"""
+
+
+@pytest.mark.slow
+def test_a_study_compares_it_with_ours(tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    register(site)
+    path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", STUDY, str(tmp_path / "study")],
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told["failed"] == {}
+    assert "final.small.hypercube.deployment-narrow.02.01" in told["finished"]
+    assert "hypercube − D2" in told["page"]
+    assert "per_pour: belongs to D3, not to hypercube" in told["error"]

@@ -29,7 +29,7 @@ from sim_engine.validation.sensitivity import (
 )
 from tests.depth import examples
 
-INFOS = SimulationParameters.info()
+INFOS = {name: info for name, info in SimulationParameters.info().items() if not info.nuisance}
 NOISE = 0.01
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from actors.optimizer.core.mismatch import Mismatch
 from actors.optimizer.core.problem import Point, SuggestProblem
 
 MAX_OBSERVATIONS = 2_000
@@ -59,6 +60,10 @@ def check(problem: SuggestProblem) -> None:
         raise ValueError(f"widening = {problem.widening} is outside 0.01 … 100")
     if problem.acquisition == "knowledge" and problem.mean not in ("simulated", "pooled", "scaled"):
         raise ValueError(f"acquisition='knowledge' is over simulations, and mean={problem.mean!r} knows none")
+    if (problem.mean == "adaptive") != (problem.mismatch is not None):
+        raise ValueError("mean='adaptive' needs a mismatch, and no other mean knows one")
+    if problem.mismatch is not None:
+        _check_mismatch(problem.mismatch, dimension)
     _check_effort(problem)
     _check_posterior(problem)
     _check_constraints(problem)
@@ -82,6 +87,14 @@ def _check_risk(problem: SuggestProblem) -> None:
             raise ValueError(f"risk: disturbance {index} has {sizes} numbers, which fit neither space nor the others")
         if not all(math.isfinite(value) for value in (*one.scales, *one.shifts, *one.context)):
             raise ValueError(f"risk: disturbance {index} is not finite")
+
+
+def _check_mismatch(mismatch: Mismatch, dimension: int) -> None:
+    sizes = {len(mismatch.play), *(len(part) for one in mismatch.drawn for part in (one.scales, one.shifts))}
+    if sizes != {dimension}:
+        raise ValueError(f"mismatch: play and displacements have {sorted(sizes)} axes, the space has {dimension}")
+    if not (0.0 < mismatch.ignorance < 1.0 and 0.0 < mismatch.worst < math.inf and mismatch.left >= 0):
+        raise ValueError("mismatch: ignorance must be inside 0 … 1, the worst cost above 0, and left not below")
 
 
 def _check_effort(problem: SuggestProblem) -> None:

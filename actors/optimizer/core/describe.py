@@ -40,15 +40,16 @@ def describe(
     description: dict[str, object] = {
         "means": tuple(map(float, means)),
         "deviations": tuple(map(float, deviations)),
-        "noises": () if problem.beside or problem.risk else tuple(map(float, process.noise_at(points))),
+        "noises": () if problem.beside or problem.risk else tuple(map(float, model.noise_at(points))),
         "best_point": tuple(map(float, known[best])),
         "best_mean": float(at_known[best]),
         "best_deviation": float(known_deviations[best]),
-        "best_noise": None if problem.beside or problem.risk else float(process.noise_at(known[best : best + 1])[0]),
+        "best_noise": None if problem.beside or problem.risk else float(model.noise_at(known[best : best + 1])[0]),
         "hyperparameters": {
             "signal": process.signal,
             "noise": process.noise,
             **process.hyperparameters,
+            **({} if model.averaged is None else model.averaged.hyperparameters),
             **dict(zip((f"length.{name}" for name in _axis_names(problem)), map(float, process.lengths), strict=True)),
         },
     }
@@ -80,6 +81,7 @@ def posterior_of(
         count=question.count,
         snap=region.snap,
         rng=rng,
+        prior=array(question.prior, 2),
     )
     return Posterior(tuples(sampled.points), tuple(map(float, sampled.discrepancies)), sampled.effective)
 

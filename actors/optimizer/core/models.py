@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.optimizer.core.asked import Asked, array
+from actors.optimizer.core.averaged import AveragedProcess
 from actors.optimizer.core.folded import AbsoluteProcess
 from actors.optimizer.core.problem import SuggestProblem
 from actors.optimizer.core.risk import RiskProcess
@@ -31,7 +32,7 @@ class Model:
 
     Attributes:
         surrogate: of what is minimised.
-        process: with the observations in it.
+        process: with the observations in it; where hypotheses are averaged over, of the simulations alone.
         lengths: (dimension,) lengthscales of the searched axes. Around a simulated mean they are the simulations':
             a handful of pours says little about what the pours' remainder depends on.
         fitted: all processes that were fitted, in order.
@@ -41,12 +42,17 @@ class Model:
     process: GaussianProcess
     lengths: Array
     fitted: tuple[GaussianProcess, ...]
+    averaged: AveragedProcess | None = None
+
+    def noise_at(self, points: Array) -> Array:
+        """Standard deviations (m,) of single real observations at points (m, dimension), in the cost's unit."""
+        return (self.averaged or self.process).noise_at(points)
 
 
 def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
     """The surrogate that the problem asks for; None with too few observations."""
     points, costs = asked.points, asked.costs
-    informed = problem.mean in ("simulated", "pooled", "scaled") and len(asked.simulated) >= 2
+    informed = problem.mean in ("simulated", "pooled", "scaled", "adaptive") and len(asked.simulated) >= 2
     varying = problem.noise == "varying"
     first = _search_for(problem, 0)
     if informed and problem.mean == "simulated":
@@ -56,6 +62,10 @@ def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
         second = _search_for(problem, 1)
         process = simulated_mean_process(simulated, points, costs, varying=varying, search=second)
         return Model(process, process, simulated.lengths, (simulated, process))
+    if informed and problem.mismatch is not None:
+        simulated = constant_mean_process(asked.simulated, asked.simulated_costs, search=first)
+        averaged = AveragedProcess(simulated, points, costs, problem.mismatch)
+        return Model(averaged, simulated, simulated.lengths, (simulated,), averaged)
     if informed:
         process = joint_process(
             asked.simulated,

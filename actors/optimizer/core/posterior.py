@@ -53,8 +53,9 @@ def sample_posterior(
     count: int,
     snap: Callable[[Array], Array],
     rng: np.random.Generator,
+    prior: Array | None = None,
 ) -> Sampled:
-    """Draw θ from p(θ | pours) ∝ N(e(θ); 0, S(θ) + n² I + σ_δ² M), uniform in the cube.
+    """Draw θ from p(θ | pours) ∝ p(θ) N(e(θ); 0, S(θ) + n² I + σ_δ² M), θ in the cube.
 
     e_i(θ) = m(θ, a_i) + o_i is weighed minus simulated spillage of pour i; S(θ) the surrogate's posterior covariance
     over the pours; n² the variances of a weighing and of simulations around the surrogate, which hold what it can't
@@ -68,6 +69,8 @@ def sample_posterior(
         noise: standard deviation of a weighed pour.
         count: of draws to return.
         snap: rounds integer axes of points (m, dimension).
+        prior: p(θ), (dimension, 2) centres and deviations of normals in the cube; along axes with a deviation of 0, and
+            along all of them without any row, it is uniform.
 
     Source: Kennedy & O'Hagan, Bayesian calibration of computer models, 2001; Goodman & Weare, Ensemble samplers with
         affine invariance, 2010.
@@ -77,6 +80,8 @@ def sample_posterior(
     likelihood = _Likelihood(process, contexts, offsets, noise, dimension, snap)
     walkers = max(WALKERS, 4 * (dimension + 1))
     median, width = DISCREPANCY_PRIOR
+    centres, deviations = (np.zeros((dimension, 2)) if prior is None or not len(prior) else prior).T
+    precision = np.divide(1.0, deviations, out=np.zeros(dimension), where=deviations > 0.0)
 
     def density(x: Array) -> Array:
         inside = np.all((x[:, :dimension] >= 0.0) & (x[:, :dimension] <= 1.0), axis=1)
@@ -85,6 +90,7 @@ def sample_posterior(
             logs = x[inside, dimension]
             values[inside] = likelihood(x[inside, :dimension], np.exp(logs))
             values[inside] -= 0.5 * ((logs - math.log(median)) / width) ** 2
+            values[inside] -= 0.5 * (((x[inside, :dimension] - centres) * precision) ** 2).sum(axis=1)
         return values
 
     assert n > 0

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from actors.optimizer.core.mismatch import Mismatch, MismatchFound
 from sim_engine.space import Space
 
 Point = tuple[float, ...]
 """A point of the unit cube."""
 
-MeanName = Literal["constant", "zero", "simulated", "pooled", "scaled"]
-AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol", "knowledge"]
+MeanName = Literal["constant", "zero", "simulated", "pooled", "scaled", "adaptive"]
+AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol", "knowledge", "least_loss"]
 NoiseName = Literal["constant", "varying"]
 
 
@@ -61,12 +62,15 @@ class PosteriorQuestion:
         offsets: weighed minus regressed spillage at each; the regressed one is in the differences that were observed.
         noise: standard deviation of a weighed pour.
         count: of draws wanted.
+        prior: centre and standard deviation along every axis of the unit cube, of normals that its faces cut off; where
+            a deviation is 0, all values are alike. Empty: they are along all axes.
     """
 
     contexts: tuple[Point, ...]
     offsets: tuple[float, ...]
     noise: float
     count: int = 200
+    prior: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -152,11 +156,14 @@ class SuggestProblem:
         seed: of every random choice in the answer.
         mean: prior mean of the surrogate: 'constant' (fitted), 'zero' (the paper's), 'simulated' (posterior mean of a
             GP over `simulated`, the paper's D3), 'pooled' (`simulated` and `data` in one GP, simulations with a noise
-            and an offset of their own), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once).
-        simulated: cheap observations of the same cost, for the last three.
+            and an offset of their own), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once),
+            'adaptive' (an average over the ways in which the simulator may be wrong, see `mismatch`).
+        simulated: cheap observations of the same cost, for the last four.
         acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
             answer the penalised 'lcb'); 'random' and 'sobol' only draw. 'knowledge' looks for *simulations*: where one
             more of them would teach most about which action is best (a mean that knows simulations is needed).
+            'least_loss' (for 'adaptive'): the first point is a pour that loses little on the way to a good action, the
+            others are simulations that tell in which way the simulator is wrong.
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has at least two dimensions, the answer carries the surrogate on a square
             grid over the two axes that matter most.
@@ -182,6 +189,7 @@ class SuggestProblem:
             minimised, predicted and mapped is the measure over the disturbances of a request.
         pouring: 'knowledge': places of real observations whose outcome is out; `pending` are simulations then.
         effort: limits the fit, and has the answer carry what was fitted.
+        mismatch: 'adaptive': how the simulator may be wrong, and how many pours follow.
         plain: 'lcb' as it stands in the paper: κ is kept, and no point only fills space on a plateau.
     """
 
@@ -209,6 +217,7 @@ class SuggestProblem:
     pouring: tuple[Point, ...] = ()
     effort: Effort | None = None
     plain: bool = False
+    mismatch: Mismatch | None = None
 
     @property
     def beside(self) -> int:
@@ -273,6 +282,7 @@ class Suggestion:
         risk: with a risk: what else is known at `SuggestProblem.predict_at`.
         values: 'knowledge': what a simulation at each point is worth, those before it given; in the cost's unit, ≥ 0.
         pour_value: 'knowledge': the same of the one real observation that is worth most.
+        mismatch: 'adaptive': what the observations say about the simulator.
         fitted: with `SuggestProblem.effort`: hyperparameters of each process, to start the next fit with.
     """
 
@@ -295,3 +305,4 @@ class Suggestion:
     values: tuple[float, ...] = ()
     pour_value: float | None = None
     fitted: tuple[tuple[float, ...], ...] = ()
+    mismatch: MismatchFound | None = None

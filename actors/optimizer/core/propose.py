@@ -14,6 +14,7 @@ from actors.optimizer.core.asked import Asked, tuples
 from actors.optimizer.core.checks import check
 from actors.optimizer.core.describe import describe, posterior_of
 from actors.optimizer.core.knowledge import Knowledge, most_instructive
+from actors.optimizer.core.least_loss import found, proposals
 from actors.optimizer.core.models import Model, fit
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.region import Feasibility
@@ -66,6 +67,8 @@ def _answer(problem: SuggestProblem) -> Suggestion:
         candidates = _candidates(problem, asked, model, rng)
         knowledge = most_instructive(problem, model.process, candidates, asked.busy, asked.pouring, feasibility)
         points = knowledge.points
+    elif problem.acquisition == "least_loss" and model.averaged is not None:
+        points = proposals(problem, asked, model.averaged, _candidates(problem, asked, model, rng), feasibility, rng)
     else:
         points = _search(problem, asked, model, feasibility, rng)
 
@@ -78,6 +81,8 @@ def _answer(problem: SuggestProblem) -> Suggestion:
         answer["fitted"] = tuples([process.theta for process in model.fitted])
     if knowledge is not None:
         answer |= {"values": tuple(map(float, knowledge.values)), "pour_value": knowledge.pour_value}
+    if model is not None and model.averaged is not None:
+        answer["mismatch"] = found(problem, asked, model.averaged, points, feasibility, rng)
     if feasibility is not None and len(points):
         answer["feasibilities"] = tuple(map(float, np.exp(feasibility.log_probability(points))))
     return Suggestion(
@@ -89,7 +94,7 @@ def _answer(problem: SuggestProblem) -> Suggestion:
 
 def _candidates(problem: SuggestProblem, asked: Asked, model: Model, rng: np.random.Generator) -> Array:
     """Places to think about: all over the region, and around the best of those observed."""
-    seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled") else asked.known
+    seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled", "adaptive") else asked.known
     if problem.risk is not None:
         seen = np.clip(seen, 0.0, 1.0)  # what was executed may lie beside the box
     means = model.surrogate.predict(seen)[0]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from actors.spec import LaboratorySpec
 from orchestrator.config.campaign.record import campaign_record
 from orchestrator.config.campaign.resolve_calibration import resolve_calibration
 from orchestrator.config.campaign.resolve_deployment import resolve_deployment
 from orchestrator.config.campaign.scenes import SceneBuilder
+from orchestrator.config.campaign.searched import check_ranges
 from orchestrator.config.campaign.sections import CampaignFile
 from orchestrator.config.motion import ParametersBase
 from orchestrator.config.yaml.files import resolved
@@ -33,11 +33,17 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     searched = {} if parameters is None else parameters.searched()
     default = SimulationParameters().model_dump()
     fixed = {name: float(value) for name, value in default.items() if name not in searched} | fixed
-    _check_ranges(file, searched, root, report)
+    check_ranges(file, root, report)
     calibration = deployment = None
     if file.calibration is not None:
         calibration = resolve_calibration(
-            file.calibration, builder, fixed, searched, root.at("calibration"), laboratory
+            file.calibration,
+            builder,
+            fixed,
+            searched,
+            root.at("calibration"),
+            laboratory,
+            () if parameters is None else parameters.priors(),
         )
     if file.deployment is not None:
         deployment = resolve_deployment(file.deployment, builder, root.at("deployment"), laboratory)
@@ -83,21 +89,3 @@ def _directory(text: str | None, root: Place) -> Path:
 
 def _is_virtual(laboratory: LaboratorySpec) -> bool:
     return laboratory.mode == "virtual" and laboratory.bench is not None
-
-
-def _check_ranges(file: CampaignFile, searched: dict[str, Any], root: Place, report: Report) -> None:
-    parameters = root.at("simulator", "parameters")
-    if file.calibration is None and not report.is_broken(root.at("calibration")):
-        for name in searched:
-            report.add(
-                parameters.at(name),
-                "is a range, and nothing searches it; write one value, or add a 'calibration' section",
-            )
-    in_parameters = any(loc[:2] == parameters.loc for _, loc in report.broken)
-    if file.calibration is not None and not searched and not in_parameters:
-        report.add(
-            root.at("calibration"),
-            "has nothing to search; give a range to at least one of simulator.parameters, "
-            "for example 'cohesion: [0 N/m, 0.1 N/m]'",
-            key=True,
-        )

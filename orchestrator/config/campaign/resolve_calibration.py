@@ -22,6 +22,7 @@ def resolve_calibration(
     searched: dict[str, Axis],
     place: Place,
     laboratory: LaboratorySpec | None,
+    known: tuple[NormalPrior, ...] = (),
 ) -> CalibrationPlan | None:
     """The plan of a calibration; what is wrong goes to the report, and then the plan may be None.
 
@@ -29,6 +30,7 @@ def resolve_calibration(
         fixed: θ that are not searched.
         searched: axes of those that are, by name.
         place: of the section.
+        known: what is known of searched ones beforehand.
     """
     report = builder.report
     pours, at = section.pours, place.at("pours")
@@ -109,6 +111,7 @@ def resolve_calibration(
         records=records,
         transfer=transfer,
         random_baseline=section.random_baseline,
+        parameter_prior=known,
     )
 
 

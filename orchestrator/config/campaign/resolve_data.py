@@ -9,7 +9,7 @@ from orchestrator.codec import CodecError
 from orchestrator.config.campaign.records import column_name, read_records
 from orchestrator.config.campaign.sections import DataSection
 from orchestrator.config.yaml.errors import did_you_mean
-from orchestrator.config.yaml.files import missing_file, resolved
+from orchestrator.config.yaml.files import missing_file, out_of_bounds, resolved
 from orchestrator.config.yaml.source import Place, Report
 from orchestrator.former import FormerRun, fitting, pours_in, read_former_run
 from orchestrator.journal import JOURNAL_NAME, JournalError
@@ -119,6 +119,9 @@ def _of_run(
 def former_run(run: str, place: Place, report: Report) -> FormerRun | None:
     """A former run by its folder; None where there is none that can be read."""
     directory = resolved(place.directory / run)
+    if (outside := out_of_bounds(directory)) is not None:
+        report.add(place, f"{directory} {outside}")
+        return None
     if not (directory / JOURNAL_NAME).is_file():
         what = (
             "has no journal; name the folder of a run" if directory.is_dir() else "no such folder; name that of a run"

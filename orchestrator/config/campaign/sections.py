@@ -101,7 +101,7 @@ class CalibrationSection(Section):
     @property
     def settings(self) -> CalibrationSettings:
         """What belongs to the strategy."""
-        return settings_in(self, CalibrationSettings)
+        return settings_in(self, CalibrationSettings)  # type: ignore[type-abstract]
 
 
 class DataSection(Section):
@@ -175,7 +175,7 @@ class DeploymentSection(Section):
     @property
     def settings(self) -> DeploymentSettings:
         """What belongs to the strategy."""
-        return settings_in(self, DeploymentSettings)
+        return settings_in(self, DeploymentSettings)  # type: ignore[type-abstract]
 
 
 class LearningSection(DeploymentSection):

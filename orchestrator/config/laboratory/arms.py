@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import TYPE_CHECKING, ClassVar
 
 from orchestrator.config.laboratory.cell import CellSection
@@ -23,6 +24,7 @@ class ArmSettings(Section):
         """Which plug-in would have it, if it could be loaded."""
         return next((str(broken) for broken in ARMS.broken if broken.name == word), "")
 
+    @abstractmethod
     def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> ArmSpec | None:
         """The arm's settings; what is wrong goes to the report, and then there are none.
 
@@ -32,7 +34,6 @@ class ArmSettings(Section):
             report: takes problems.
             mode: of the laboratory, 'virtual' or 'hardware'.
         """
-        raise NotImplementedError
 
 
 def _arm(loaded: object, name: str) -> type[ArmSettings]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -105,9 +106,9 @@ class BalanceDeviceSection(Section):
             mode: of the laboratory, 'virtual' or 'hardware'.
         """
 
+    @abstractmethod
     def device(self) -> BalanceDevice:
         """The settings as values, which know their driver."""
-        raise NotImplementedError
 
 
 class SerialSection(BalanceDeviceSection):

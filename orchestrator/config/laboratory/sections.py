@@ -57,10 +57,11 @@ class HiddenLiquidBase(Section):
 
 
 def hidden_liquid_model() -> type[HiddenLiquidBase]:
-    """The section with one key per simulation parameter."""
+    """The section with one key per parameter of the solver; a bench's nuisances are its `pose_error`."""
     fields: Any = {
         name: (Annotated[float, parameter_quantity(name)] | None, Field(default=None, description=info.meaning or None))
         for name, info in SimulationParameters.info().items()
+        if not info.nuisance
     }
     model: type[HiddenLiquidBase] = create_model(
         "HiddenLiquid", __base__=HiddenLiquidBase, __doc__=HiddenLiquidBase.__doc__, __cls_kwargs__=MADE, **fields

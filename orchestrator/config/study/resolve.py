@@ -110,10 +110,12 @@ def calibration_arms(
         levels: all names; C4 is run at all of them, the others at `compared`.
     """
     arms = []
-    for written in ("C1", "C2", "C3", "C4", "C4_paper") if section is not None else ():
+    for written in () if section is None else type(section).model_fields:
         arm: Any = section.value(written) if section is not None else None
-        at, kind = root.at("calibration", written), calibrations()[written[:2]]
-        if arm is None or any(arm.value(key) is None for key in arm.required if key != "repetitions"):
+        if arm is None:
+            continue
+        at, kind = root.at("calibration", written), calibrations()[arm.variant]
+        if any(arm.value(key) is None for key in arm.required if key != "repetitions"):
             continue
         base_settings, changes = base.settings, arm.changes()
         if "averaging" in kind.model_fields:
@@ -129,7 +131,8 @@ def calibration_arms(
         settled = settings.settled(base.parameters.names, train, PlacedComplaints(at, report, frozenset()))
         if settled is None:
             continue
-        plan = replace(base, settings=settled, prior=base.prior if kind.has_prior else ())
+        prior, known = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
+        plan = replace(base, settings=settled, prior=prior, parameter_prior=known)
         where = levels if written == "C4" else (compared,)
         arms.append(CalibrationArm(_label(written), plan, arm.repetitions or 1, where))
     return tuple(arms)
@@ -150,18 +153,18 @@ def deployment_arms(
         return ()
     most = max((arm.repetitions for arm in calibrated if arm.label == "C4"), default=0)
     arms: list[DeploymentArm] = []
-    for key in ("D1", "D2", "D2_paper", "D3", "D3_paper"):
+    for key in type(section).model_fields:
         arm: Any = section.value(key)
-        at, kind = root.at("deployment", key), deployments()[key[:2]]
         if arm is None:
             continue
+        at, kind = root.at("deployment", key), deployments()[arm.variant]
         if key == "D2_paper" and arm.mean == "constant":
             report.add(at.at("mean"), "D2_paper has the paper's mean, 'zero'; remove the key, or compare with D2")
         repetitions = arm.repetitions or 1
         if kind.simulates and repetitions > most:
             report.add(
                 at.at("repetitions") if arm.repetitions is not None else at,
-                f"{key[:2]} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
+                f"{arm.variant} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
                 f"add 'calibration: {{C4: {{repetitions: {repetitions}, simulations: 108}}}}'",
             )
         if any(arm.value(needed) is None for needed in arm.required if needed != "repetitions"):

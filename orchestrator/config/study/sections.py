@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -18,7 +19,7 @@ from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Text
+from orchestrator.config.yaml.sections import MADE, Count, Name, PathOr, PositiveCount, Section, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
@@ -29,6 +30,7 @@ from orchestrator.strategies.calibration.c4 import C4Settings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.doors import calibrations, deployments
 from orchestrator.strategies.settings import StrategySettings
 from orchestrator.study.plan import StudyPlan
 from sim_engine.liquid import SimulationParameters
@@ -102,7 +104,7 @@ class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "ka
     """Simulations told between two pours; not 'free', for then the clock would decide what is asked for."""
 
 
-class CalibrationsSection(Section):
+class CalibrationsBase(Section):
     """The calibrations that are compared."""
 
     C1: C1Arm | None = None
@@ -121,7 +123,7 @@ class CalibrationsSection(Section):
     """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""
 
 
-class DeploymentsSection(Section):
+class DeploymentsBase(Section):
     """The deployments that are compared, into each of the base campaign's receivers."""
 
     D1: D1ArmSection | None = None
@@ -138,6 +140,22 @@ class DeploymentsSection(Section):
 
     D3_paper: D3ArmSection | None = None
     """D3 as in the paper: a GP of the residual around the simulations' mean, always trusted."""
+
+
+def _with_others(base: type[Section], installed: Mapping[str, type[StrategySettings]]) -> Any:
+    """The section with a key for each strategy that a package adds; its settings are those of the strategy."""
+    fields: Any = {}
+    for name, settings in installed.items():
+        if name not in base.model_fields:
+            own = settings.model_fields.keys() - {"strategy"}
+            meaning = settings.model_fields["strategy"].description
+            fields[name] = (_arm(settings, *sorted(own)) | None, Field(None, description=meaning))
+    name = base.__name__.replace("Base", "Section")
+    return create_model(name, __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields)
+
+
+CalibrationsSection: Any = _with_others(CalibrationsBase, calibrations())
+DeploymentsSection: Any = _with_others(DeploymentsBase, deployments())
 
 
 class StudyFile(Section):
@@ -248,6 +266,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     plan = replace(
         calibration,
         parameters=searched,
+        parameter_prior=tuple(prior for prior in calibration.parameter_prior if prior.name in searched.names),
         pour_count=0,
         holdout=0,
         random_baseline=0,
@@ -255,8 +274,8 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
             name: value for name, value in base.parameters.model_dump().items() if name not in searched.names
         },
     )
-    calibrations = calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
-    deployments = deployment_arms(file.deployment, base.deployment, calibrations, root, report)
+    arms = calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
+    poured = deployment_arms(file.deployment, base.deployment, arms, root, report)
     if report.problems or file.name is None:
         return None
     return StudyPlan(
@@ -265,8 +284,8 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         source=root.document.path,
         base=replace(base, name=file.name, seed=file.seed, calibration=plan, deployment=None),
         levels=levels,
-        calibrations=calibrations,
-        deployments=deployments,
+        calibrations=arms,
+        deployments=poured,
         pour_count=count,
         holdout=holdout,
         compared=compared,
@@ -311,6 +330,10 @@ def _with_parameters(base: CampaignPlan, changes: ParametersBase, place: Place, 
     calibration = replace(
         base.calibration,
         parameters=Space(tuple(axes.values())),
+        parameter_prior=(
+            *(prior for prior in base.calibration.parameter_prior if prior.name not in (*fixed, *searched)),
+            *changes.priors(),
+        ),
         fixed_parameters={name: value for name, value in known.items() if name not in axes},
     )
     return replace(base, calibration=calibration)

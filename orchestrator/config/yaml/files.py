@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import stat
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 
 from orchestrator.config.yaml.errors import did_you_mean
@@ -13,8 +16,36 @@ SIZE_LIMIT = 500_000
 """Largest file that is read [bytes]: a campaign has 2,000, a theta.json with its posterior 15,000."""
 
 
+_roots: ContextVar[tuple[Path, ...] | None] = ContextVar("roots", default=None)
+
+
 class UnreadableError(Exception):
     """A file can't be read; the message says why, without its name."""
+
+
+@contextlib.contextmanager
+def confined(roots: Sequence[Path]) -> Iterator[None]:
+    """As long as this lasts no file is read but these, and those in these folders: for campaigns of strangers.
+
+    Args:
+        roots: absolute, behind links.
+    """
+    token = _roots.set(tuple(roots))
+    try:
+        yield
+    finally:
+        _roots.reset(token)
+
+
+def out_of_bounds(path: Path) -> str | None:
+    """Why a path may not be looked at; None where it may. What is behind it decides, not how it is written."""
+    roots = _roots.get()
+    if roots is None:
+        return None
+    there = resolved(path)
+    if any(there == root or root in there.parents for root in roots):
+        return None
+    return "lies outside of the folders that this campaign may refer to"
 
 
 def resolved(path: Path) -> Path:
@@ -27,6 +58,8 @@ def resolved(path: Path) -> Path:
 
 def why_unreadable(path: Path) -> str | None:
     """What is wrong with a path that should be that of a file; None where it is one."""
+    if (outside := out_of_bounds(path)) is not None:
+        return outside
     try:
         mode = path.stat().st_mode
     except OSError as error:

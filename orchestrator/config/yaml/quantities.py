@@ -26,6 +26,7 @@ milli- = 1e-3 = m-
 centi- = 1e-2 = c-
 kilo- = 1e3 = k-
 mega- = 1e6 = M-
+giga- = 1e9 = G-
 meter = [length] = m = metre
 second = [time] = s = sec
 gram = [mass] = g
@@ -35,6 +36,7 @@ degree = 0.017453292519943295 * radian = deg = °
 revolution = 6.283185307179586 * radian = rev = turn
 minute = 60 * second = min
 hour = 3600 * second = h
+day = 86400 * second
 rpm = revolution / minute
 hertz = 1 / second = Hz
 newton = kilogram * meter / second ** 2 = N

@@ -281,5 +281,9 @@ class Calibration(ABC, Generic[S]):
 
 
 def described(values: Mapping[str, float]) -> str:
-    """Parameters for people: 'particles 1200  cohesion 0.031'."""
-    return "  ".join(f"{name} {value:.4g}" for name, value in values.items())
+    """Parameters for people: 'particles 1200  cohesion 0.031  receiver_x 3.2 mm'."""
+    infos = SimulationParameters.info()
+    return "  ".join(
+        f"{name} {value / infos[name].factor:.4g}" + (f" {infos[name].shown}" if infos[name].factor != 1.0 else "")
+        for name, value in values.items()
+    )

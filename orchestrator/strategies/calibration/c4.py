@@ -13,7 +13,13 @@ from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, TriedOnce, described
 from orchestrator.strategies.calibration.design import MeasuredPour
-from orchestrator.strategies.calibration.posterior import PosteriorFound, central, left_open, posterior_found
+from orchestrator.strategies.calibration.posterior import (
+    PosteriorFound,
+    central,
+    left_open,
+    posterior_found,
+    unit_prior,
+)
 from orchestrator.strategies.calibration.prior import actions_of_prior
 from orchestrator.strategies.calibration.settings import Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
@@ -212,7 +218,9 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             )
             noise = (regression.hyperparameters or {}).get("noise", 0.0)
             problem = replace(
-                self._problem(everything=True), count=0, posterior=PosteriorQuestion(places, offsets, noise)
+                self._problem(everything=True),
+                count=0,
+                posterior=PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan)),
             )
             self._questions.put(problem, "posterior", drawn)
 

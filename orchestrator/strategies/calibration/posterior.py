@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from actors.optimizer.core.problem import Point, Posterior
 from orchestrator.strategies.learnt import Part
 from sim_engine.space import Space
+
+if TYPE_CHECKING:
+    from orchestrator.plan import CalibrationPlan
 
 Array = NDArray[np.float64]
 
@@ -97,6 +100,19 @@ def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
         effective=posterior.effective,
         thetas=tuple(space.decode(tuple(point)) for point in posterior.points),
     )
+
+
+def unit_prior(plan: CalibrationPlan) -> tuple[tuple[float, float], ...]:
+    """What is known of the searched θ beforehand, as a `PosteriorQuestion` has it."""
+    known = {prior.name: prior for prior in plan.parameter_prior}
+    if not known:
+        return ()
+    rows = []
+    for axis in plan.parameters.axes:
+        prior = known.get(axis.name)
+        alike = (0.5, 0.0)
+        rows.append(alike if prior is None else (axis.encode(prior.mean), prior.deviation / (axis.upper - axis.lower)))
+    return tuple(rows)
 
 
 def region(points: Array) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ from orchestrator.strategies.calibration.baselines import mean_predictor_discrep
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, Scores
 from orchestrator.strategies.progress import Progress
+from sim_engine.bands import left_over
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
 
@@ -19,6 +20,22 @@ CALIBRATED = "theta"
 
 UNCALIBRATED = "uncalibrated"
 """Label of the θ that one would take without calibrating."""
+
+
+def shift_left_over(scores: Scores, fitted: int) -> float | None:
+    """What θ* left over of the training pours, as a shift (`sim_engine.bands`).
+
+    Args:
+        scores: of a scorecard.
+        fitted: number of parameters that were searched.
+    """
+    pairs = [
+        (pair.measured, pair.simulated)
+        for pair in scores.pairs
+        if pair.theta == CALIBRATED and pair.split == "train"
+        if pair.measured is not None and pair.simulated is not None
+    ]
+    return left_over(pairs, fitted)
 
 
 class Scorecard:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, ClassVar, Self
 
 from orchestrator.config.yaml.quantities import Quantity
@@ -28,13 +29,13 @@ class DesignSettings(CalibrationSettings):
     """Single simulated pours: a limit, or, alone, all that says how many θ are tried."""
 
     @property
+    @abstractmethod
     def thetas(self) -> int:
         """How many θ are tried, once settled."""
-        raise NotImplementedError
 
+    @abstractmethod
     def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Complaints) -> Self | None:
         """The settings with the number of θ that is given, or that `simulations` allows."""
-        raise NotImplementedError
 
     def simulations_on(self, train: int) -> int:
         """Each θ on all of them."""

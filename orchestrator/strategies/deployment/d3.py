@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from actors.optimizer.core.problem import Data, MeanName, Suggestion, SuggestProblem
+from actors.optimizer.core.mismatch import Mismatch
+from actors.optimizer.core.problem import AcquisitionName, Data, MeanName, Suggestion, SuggestProblem
 from orchestrator.config.yaml.sections import Count, CountOrFree
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment.play import play_of
 from orchestrator.strategies.deployment.pours import Foretold, PourTrial
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
@@ -47,16 +49,30 @@ class D3Settings(SearchSettings):
     prices: PricesSettings | None = None
     """With 'per_pour: free': what a pour and a simulation cost."""
 
-    model: Literal["residual", "pooled", "scaled"] = "scaled"
-    """How simulations enter the surrogate of pours; 'residual' is the paper's."""
+    model: Literal["adaptive", "residual", "pooled", "scaled"] = "adaptive"
+    """How simulations enter the surrogate of pours; 'adaptive' averages over ways in which the simulator may be wrong,
+    'residual' is the paper's."""
 
-    trust: TrustOrAlways = TrustSettings()
-    """When the first pours say that the simulator is wrong, and what follows; 'always' believes it, as the paper."""
+    trust: TrustOrAlways | None = None
+    """For the other models: when the first pours say that the simulator is wrong, and what follows; 'always' believes
+    it, as the paper."""
 
     @property
     def beside(self) -> int | None:
         """Simulations told between two pours; None: for as long as a pour takes."""
         return None if self.per_pour == "free" else int(self.per_pour)
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether it averages over the ways in which the simulator may be wrong."""
+        return self.model == "adaptive"
+
+    @property
+    def checked(self) -> TrustSettings | None:
+        """When the simulator is called wrong; None if it never is, or if every pour weighs it."""
+        if self.adaptive or self.trust == "always":
+            return None
+        return self.trust if isinstance(self.trust, TrustSettings) else TrustSettings()
 
     @property
     def plain(self) -> bool:
@@ -94,6 +110,10 @@ class D3Settings(SearchSettings):
         if self.prices is not None and self.beside is not None:
             text = f"decides nothing with 'per_pour: {self.per_pour}'; write 'per_pour: free', or remove it"
             complaints.add(text, "prices", key=True)
+        if self.trust is not None and self.adaptive:
+            complaints.add(
+                "decides nothing with 'model: adaptive', which weighs the simulator by every pour", "trust", key=True
+            )
 
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
         """The strategy itself."""
@@ -123,8 +143,8 @@ class Hybrid(Deployment[D3Settings]):
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        trust = self._settings.trust
-        self._check = TrustCheck(trust, self._costing.worst) if isinstance(trust, TrustSettings) else None
+        checked = self._settings.checked
+        self._check = None if checked is None else TrustCheck(checked, self._costing.worst)
         self._unasked: Ask | None = None
         self._asked: Ask | None = None
 
@@ -204,7 +224,7 @@ class Hybrid(Deployment[D3Settings]):
         """The next pour, and with it the simulations that run beside it."""
         problem = self._hybrid(
             count=1 + (0 if self._followed == "D2" else self._settings.simulations_beside),
-            acquisition="lcb" if self._pours or self._former else "posterior_minimum",
+            acquisition=self._acquisition,
             map_resolution=MAP_RESOLUTION,
         )
 
@@ -213,6 +233,13 @@ class Hybrid(Deployment[D3Settings]):
             self._simulate(suggestion, "refine", first=1)
 
         self._questions.put(problem, "pour", pour)
+
+    @property
+    def _acquisition(self) -> AcquisitionName:
+        """Of the next pour."""
+        if self._settings.adaptive and not self._compromise.exploring:
+            return "least_loss"
+        return "lcb" if self._pours or self._former else "posterior_minimum"
 
     def _refine(self, count: int) -> None:
         """More simulations while the pour takes its time."""
@@ -234,8 +261,19 @@ class Hybrid(Deployment[D3Settings]):
                 return self._problem(poured, **changes)
             case "widen":
                 return self._problem(poured, mean="pooled", widening=WIDENING, simulated=simulated, **changes)
-            case _:
+            case _ if not self._settings.adaptive:
                 return self._problem(poured, mean=MEANS[self._settings.model], simulated=simulated, **changes)
+            case _ if changes.get("acquisition") == "knowledge":  # what one more simulation is worth beside a pour
+                return self._problem(poured, mean="scaled", simulated=simulated, **changes)
+            case _:
+                changes |= {"mean": "adaptive", "mismatch": self._mismatch}
+                return self._problem(poured, simulated=simulated, **changes)
+
+    @property
+    def _mismatch(self) -> Mismatch:
+        """How the simulator may be wrong."""
+        left = max(self._plan.pours - self._counted - 1, 0)
+        return Mismatch(play_of(self._plan.actions), worst=self._costing.worst, left=left)
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
         return self._informed(poured, simulated)

@@ -187,7 +187,7 @@ class FreeHybrid(Hybrid):
             self._pour_first(suggestion)
             self._rested_at, self._map_due = None, True
 
-        acquisition = "lcb" if self._pours or self._former else "posterior_minimum"
+        acquisition = self._acquisition
         if self._followed == "D2":
             self._put(self._hybrid(count=1, acquisition=acquisition, map_resolution=MAP_RESOLUTION), "pour", pour)
         else:

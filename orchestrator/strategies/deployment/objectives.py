@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -40,9 +41,9 @@ class Objective(Section):
     weight: Annotated[float, Quantity("1", "1.0", 1e-6, 1e6)] = 1.0
     """In the weighted sum."""
 
+    @abstractmethod
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
         """f of a pour that delivers enough."""
-        raise NotImplementedError
 
     def worst(self, scene: Scene, actions: Space) -> float:
         """Largest f of a pour that delivers enough."""

@@ -19,7 +19,7 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
 
-ERRORS = ("x", "y", "tilt", "speed_factor")
+ERRORS = ("x", "y", "tilt", "speed_factor", "z")
 
 FARTHEST = 3.5
 """Standard deviations beyond which no error is drawn: less than one in two thousand."""
@@ -96,8 +96,8 @@ class Draw:
 class Disturbances:
     """Draws of errors and θ: quasi-random, normal by the inverse of its distribution.
 
-    An error that only moves a searched dimension (x: x_offset, y: y_offset, speed: angular_velocity) is to the
-    surrogate just that, an action a little beside the one that was asked for: what is executed is what is observed.
+    An error that only moves a searched dimension (x: x_offset, y: y_offset, z: height, speed: angular_velocity) is to
+    the surrogate just that, an action a little beside the one that was asked for: what is executed is what is observed.
     So these errors cost no dimension, and every simulation tells about its neighbours. Other errors (tilt, or a
     dimension that is not searched), and θ, are coordinates beside the action.
 
@@ -210,7 +210,7 @@ def _number(parameters: SimulationParameters, name: str) -> float:
 
 def _folded(error: str, actions: Space) -> int | None:
     """Index of the searched axis that an error only moves; None: there is none."""
-    name = {"x": "x_offset", "y": "y_offset", "speed_factor": "angular_velocity"}.get(error)
+    name = {"x": "x_offset", "y": "y_offset", "z": "height", "speed_factor": "angular_velocity"}.get(error)
     if name not in actions.names:
         return None
     index = actions.names.index(name)
@@ -225,6 +225,8 @@ def _moved(axis: Axis, error: str, drawn: PoseError) -> tuple[float, float]:
         return 1.0, drawn.x / width
     if error == "y":  # the receiver moves, so the pourer is off the other way
         return 1.0, -drawn.y / width
+    if error == "z":  # a receiver that stands higher: the lip is that much less above it
+        return 1.0, -drawn.z / width
     if axis.scale == "log":
         return 1.0, math.log(drawn.speed_factor) / math.log(axis.upper / axis.lower)
     return drawn.speed_factor, (drawn.speed_factor - 1.0) * axis.lower / width

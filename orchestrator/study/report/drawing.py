@@ -27,6 +27,9 @@ COLOURS = {
     "D3": style.BEST,
     "D3-paper": style.GOOD,
 }
+OTHERS = (style.ESCAPED, style.FALLING, style.INK)
+"""Colours of strategies that packages add."""
+
 PAPER = "-paper"
 """End of the label of a strategy as the paper has it: dashed, its marks open."""
 
@@ -87,8 +90,8 @@ class Drawn:
 
     def save(self, folder: Path) -> None:
         """PNG, SVG and CSV."""
-        style.save(self.figure, folder / f"{self.name}.png")
-        style.save(self.figure, folder / f"{self.name}.svg")
+        with style.also_as(".svg"):
+            style.save(self.figure, folder / f"{self.name}.png")
         write_csv(folder / f"{self.name}.csv", self.header, self.rows)
 
 
@@ -102,8 +105,13 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
 
 
 def colour(arm: str) -> str:
-    """Colour of a strategy; all D1 have one, and a label that is not known has that of its strategy."""
-    return COLOURS.get(arm) or COLOURS[strategy_of(arm)]
+    """Colour of a strategy; all D1 have one, and those of packages have one by their name."""
+    return COLOURS.get(arm) or COLOURS.get(strategy_of(arm)) or OTHERS[sum(arm.encode()) % len(OTHERS)]
+
+
+def is_ours(arm: str) -> bool:
+    """Whether an arm is one of Decant's own strategies, or its uncalibrated simulator."""
+    return arm in COLOURS or strategy_of(arm) in COLOURS
 
 
 def strategy_of(arm: str) -> str:

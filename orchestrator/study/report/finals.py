@@ -16,7 +16,7 @@ from orchestrator.study.report.deployments import (
     means,
     places,
 )
-from orchestrator.study.report.drawing import Drawn, legend
+from orchestrator.study.report.drawing import Drawn, is_ours, legend
 from orchestrator.study.report.effects import Effect, effect
 from orchestrator.study.report.gather import Gathered, Key, mean
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate
@@ -89,9 +89,16 @@ def final_rows(study: StudyPlan, found: Gathered) -> tuple[list[str], list[list[
 
 
 def final_pairs(arms: Sequence[str]) -> list[tuple[str, str]]:
-    """Which strategies' recommended actions are compared: D3 with D2, both forms of D3, D3 with the longest D1."""
+    """Which strategies' recommended actions are compared: D3 with D2, the paper's form and the longest D1; the paper's
+    form with D2; those of packages with D2."""
     longest = max((arm for arm in arms if arm.startswith("D1-")), key=lambda arm: int(arm[3:]), default="")
-    pairs = [("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3", longest)]
+    pairs = [
+        ("D3", "D2"),
+        ("D3", "D3-paper"),
+        ("D3-paper", "D2"),
+        ("D3", longest),
+        *((arm, "D2") for arm in arms if not is_ours(arm)),
+    ]
     return [(first, second) for first, second in pairs if first in arms and second in arms]
 
 

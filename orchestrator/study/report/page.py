@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from orchestrator.report import page
 from orchestrator.report.units import deployment_unit
 from orchestrator.study.cells import cells_of
 from orchestrator.study.code import told
@@ -15,17 +14,14 @@ from orchestrator.study.plan import Level, StudyPlan
 from orchestrator.study.report.calibrations import draw_calibrations
 from orchestrator.study.report.deployments import draw_deployments
 from orchestrator.study.report.drawing import Drawn, write_csv
+from orchestrator.study.report.effects import FEWEST
 from orchestrator.study.report.finals import draw_finals
 from orchestrator.study.report.gather import Gathered, gather
 from orchestrator.study.report.intervals import Estimate
 from orchestrator.study.report.tables import Table, tables
+from orchestrator.study.report.words import plain_words
 
 REPORT, PAGE = "report", "index.html"
-
-_STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
-img{max-width:100%}figure{margin:2rem 0}figcaption,.note{color:#555;font-size:.9rem}
-table{border-collapse:collapse;font-size:.9rem}td,th{padding:.25rem .7rem;border-bottom:1px solid #ddd}
-td,th{text-align:left}"""
 
 _RESAMPLED = (
     "A repetition resamples the pours: errors of grip and placement, the liquid's initial positions and the balance's "
@@ -72,35 +68,54 @@ def write_report(study: StudyPlan, folder: Path) -> Path:
     shown = tables(study, found)
     for table in shown:
         write_csv(report / f"{table.name}.csv", *table.flat())
-    page = report / PAGE
-    write_whole(page, _page(study, found, told(results), drawn, shown, report))
-    return page
+    path = report / PAGE
+    write_whole(path, _page(study, found, told(results), drawn, shown, report))
+    return path
 
 
 def _page(
     study: StudyPlan, found: Gathered, code: str, drawn: Sequence[Drawn], shown: Sequence[Table], report: Path
 ) -> str:
-    title = html.escape(f"Study {study.name}")
-    parts = [
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
-        f"<style>{_STYLE}</style></head><body><h1>{title}</h1>",
-    ]
-    if found.finished < found.cells:
-        parts.append(f"<p><b>Unfinished: {found.finished} of {found.cells} cells are there.</b></p>")
-    parts.append(f"<p>{html.escape(_summary(study, found))}</p>")
-    for table in shown:
-        parts.append(_table(table))
-    for one in drawn:
-        counterpart = f"Counterpart of the paper's figure {one.number}. " if one.number else ""
-        picture = base64.b64encode((report / f"{one.name}.svg").read_bytes()).decode("ascii")
-        parts.append(
-            f'<figure id="{one.name}"><h2>{html.escape(one.title)}</h2>'
-            f'<img alt="{html.escape(one.title)}" src="data:image/svg+xml;base64,{picture}">'
-            f"<figcaption>{html.escape(one.caption)} {counterpart}Numbers: {one.name}.csv.</figcaption></figure>"
+    return page.render(
+        "study.html.j2",
+        title=f"Study {study.name}",
+        kicker="Report of a study: strategies side by side, repeated",
+        heading=f"Study {study.name}",
+        unfinished=f"Unfinished: {found.finished} of {found.cells} cells are there." * (found.finished < found.cells),
+        lead=_summary(study, found),
+        words=plain_words(shown),
+        open=_unknown(study, found),
+        tables=[(one.name, one.title, one.caption, _table(one)) for one in shown],
+        figures=[
+            (one.name, one.title, page.Picture.of(report / f"{one.name}.png", one.title, _caption(one), wide=True))
+            for one in drawn
+        ],
+        resampled=_RESAMPLED,
+        settings=[*_settings(study), code],
+        footer="Every number of every figure and table lies beside this page as CSV, the figures as PNG and SVG.",
+    )
+
+
+def _caption(one: Drawn) -> str:
+    counterpart = f"Counterpart of the paper's figure {one.number}. " if one.number else ""
+    return f"{one.caption} {counterpart}Numbers: {one.name}.csv."
+
+
+def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
+    """What a reader must not take from it."""
+    counts = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
+    said = ["All benches are VIRTUAL: what a real robot, cup and liquid would do is not in these numbers."]
+    if counts and min(counts) < FEWEST:
+        said.append(
+            f"Some strategies have {min(counts)} repetitions: below {FEWEST} no difference is tested, and intervals "
+            "are wide or missing. Such numbers show that everything works, and nothing more."
         )
-    parts.append(f"<h2>What a repetition is</h2><p>{html.escape(_RESAMPLED)}</p>")
-    parts.append("<h2>Settings</h2>" + "".join(f"<p>{html.escape(line)}</p>" for line in [*_settings(study), code]))
-    return "\n".join([*parts, "</body></html>\n"])
+    if found.finished < found.cells:
+        said.append("Cells are missing: what is compared may change when they are there.")
+    receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
+    if receivers:
+        said.append(f"It holds for these receivers ({', '.join(receivers)}), this liquid and these ranges of actions.")
+    return said
 
 
 def _summary(study: StudyPlan, found: Gathered) -> str:
@@ -134,24 +149,19 @@ def _settings(study: StudyPlan) -> list[str]:
 
 
 def _level(level: Level) -> str:
-    liquid = ", ".join(f"{name} {value:g}" for name, value in level.bench.liquid.model_dump().items())
+    liquid = ", ".join(f"{name} {value:g}" for name, value in level.bench.liquid.of_the_solver().items())
     error, noise = level.bench.pose_error, level.bench.pose_noise
+    off = ", ".join(f"{1e3 * value:g}" for value in (error.x, error.y, error.z))
+    scatter = ", ".join(f"{1e3 * value:g}" for value in (noise.x, noise.y, noise.z))
     return (
-        f"Mismatch '{level.name}': hidden θ {liquid}; receiver off by {1e3 * error.x:g} and {1e3 * error.y:g} mm, tilt "
-        f"by {error.tilt:.3g} rad, speed × {error.speed_factor:g}; from pour to pour ± {1e3 * noise.x:g} and "
-        f"{1e3 * noise.y:g} mm, {noise.tilt:.3g} rad, × {noise.speed_factor:g}."
+        f"Mismatch '{level.name}': hidden θ {liquid}; receiver off by {off} mm (x, y, height), tilt by "
+        f"{error.tilt:.3g} rad, speed × {error.speed_factor:g}; from pour to pour ± {scatter} mm, "
+        f"{noise.tilt:.3g} rad, × {noise.speed_factor:g}."
     )
 
 
-def _table(table: Table) -> str:
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in table.header)
-    body = "".join(
-        "<tr>"
-        + "".join(f"<td>{html.escape(v.text() if isinstance(v, Estimate) else str(v))}</td>" for v in row)
-        + "</tr>"
-        for row in table.rows
-    )
-    return (
-        f'<section id="{table.name}"><h2>{html.escape(table.title)}</h2><table><tr>{head}</tr>{body}</table>'
-        f'<p class="note">{html.escape(table.caption)}</p></section>'
-    )
+def _table(one: Table) -> page.Table:
+    cells = [[v.text() if isinstance(v, Estimate) else str(v) for v in row] for row in one.rows]
+    columns = range(len(one.header))
+    numbers = frozenset(i for i in columns if any(isinstance(row[i], int | float | Estimate) for row in one.rows))
+    return page.Table(one.title, one.header, [page.Row(row) for row in cells], numbers)

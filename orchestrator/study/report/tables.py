@@ -14,6 +14,7 @@ from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.deployments import checkpoints, loss_range, mean_loss, most_pours, places
+from orchestrator.study.report.drawing import is_ours
 from orchestrator.study.report.effects import ALL, Effect, at_pour_of, effect, tests_of
 from orchestrator.study.report.finals import CAPTION, final_effects, final_rows
 from orchestrator.study.report.gather import Gathered, Key, at_pour, mean
@@ -137,15 +138,15 @@ PAIRS = (
     ("C4-paper", "C3"),
     ("C3", "C2"),
 )
-"""Calibrations whose test discrepancies are compared."""
+"""Calibrations whose test discrepancies are compared; those of packages are with C4."""
 
 ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3-paper", "D2-paper"), ("D2", "D2-paper"))
-"""Deployments whose losses are compared."""
+"""Deployments whose losses are compared; those of packages are with D2."""
 
 
 def _calibration_effects(study: StudyPlan, found: Gathered) -> list[list[str | int | float | Estimate]]:
     rows: list[list[str | int | float | Estimate]] = []
-    for first, second in PAIRS:
+    for first, second in (*PAIRS, *((name, "C4") for name in found.calibrated if not is_ours(name))):
         if first in found.calibrated and second in found.calibrated:
             one = effect(tests_of(found, first), tests_of(found, second), SHARE)
             rows.append(_effect_row(f"{first} − {second}", "test discrepancy [%]", study.compared, "—", one, 100.0))
@@ -157,7 +158,7 @@ def _deployment_effects(study: StudyPlan, found: Gathered) -> list[list[str | in
         return []
     levels, receivers, arms = places(study, found)
     unit, rows = deployment_unit(study.deployments[0].plan), list[list[str | int | float | Estimate]]()
-    for first, second in ARMS:
+    for first, second in (*ARMS, *((arm, "D2") for arm in arms if not is_ours(arm))):
         if first not in arms or second not in arms:
             continue
         for level in levels:

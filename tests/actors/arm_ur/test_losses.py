@@ -76,7 +76,7 @@ def goes_on_only_by_an_operator(rig: Rig) -> None:
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("fault", ["drop", "stall"])
+@pytest.mark.parametrize("fault", [pytest.param("drop", marks=pytest.mark.slow), "stall"])
 def test_a_lost_line_ends_the_pour_and_the_arm_stands_until_released(make_rig: Make, fault: str) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER)
     pouring = rig.pouring()

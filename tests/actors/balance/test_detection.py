@@ -60,7 +60,7 @@ def test_finding_out_tares_and_zeroes_nothing(unknown, each_dialect):
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize(("dialect", "baud"), [("kcp", 19200), ("kern-swt", 4800), ("sbi", 1200)])
+@pytest.mark.parametrize(("dialect", "baud"), [("kcp", 19200), ("sbi", 1200)])
 def test_the_speed_is_found_out(unknown, dialect, baud):
     far = VirtualSerialBalance.start(dialect, baud=baud, time_scale=PACE)
     try:
@@ -100,7 +100,9 @@ def test_gibberish_is_said_to_be_a_matter_of_speed_and_parity(unknown):
         far.close()
 
 
-@pytest.mark.parametrize("voice", ["kcp", "kern-swt", "mt-sics", "sbi"])
+@pytest.mark.parametrize(
+    "voice", ["sbi", *(pytest.param(voice, marks=pytest.mark.slow) for voice in ("kcp", "kern-swt", "mt-sics"))]
+)
 def test_a_balance_that_takes_its_time_is_recognised_all_the_same(unknown, voice):
     far, balance = unknown(voice)
     far.faults(delay=0.9)  # a default answer_time is 1 s

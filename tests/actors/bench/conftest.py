@@ -209,25 +209,26 @@ OpenStage = Callable[..., contextlib.AbstractAsyncContextManager[Stage]]
 
 @pytest.fixture
 def open_stage() -> OpenStage:
-    """Opens a wired bench around the cheap liquid, with an operator that does as it is told."""
+    """Opens a wired bench; see `opened_stage`."""
+    return opened_stage
 
-    @contextlib.asynccontextmanager
-    async def open_it(
-        spec: LaboratorySpec | None = None,
-        *,
-        answers: Mapping[str, Sequence[str]] | None = None,
-        late: Mapping[str, float] | None = None,
-        **changes: Any,
-    ) -> AsyncIterator[Stage]:
-        laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle)
-        stage = Stage(laboratory)
-        laboratory.listen(stage.notices.append)
-        async with laboratory:
-            stage.attend()
-            stage.operator.script(answers or {}, late or {})
-            yield stage
 
-    return open_it
+@contextlib.asynccontextmanager
+async def opened_stage(
+    spec: LaboratorySpec | None = None,
+    *,
+    answers: Mapping[str, Sequence[str]] | None = None,
+    late: Mapping[str, float] | None = None,
+    **changes: Any,
+) -> AsyncIterator[Stage]:
+    """A wired bench around the cheap liquid, with an operator that does as it is told."""
+    laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle)
+    stage = Stage(laboratory)
+    laboratory.listen(stage.notices.append)
+    async with laboratory:
+        stage.attend()
+        stage.operator.script(answers or {}, late or {})
+        yield stage
 
 
 async def reach(seen: list[Any], checkpoint: str, patience: float = PATIENCE) -> None:

@@ -38,6 +38,7 @@ asyncio.run(play())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_whose_motion_was_forgotten_is_unknown_and_the_next_one_is_poured():
     program = subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, text=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,10 +12,12 @@ import pytest
 from actors.arm.joint_path import unpack
 from actors.arm.path.transforms import pourer_motion
 from actors.balance.placement import Placement
+from actors.bench.stand_ins import History
 from actors.operator import OperatorSpec
-from actors.protocols import InvalidActionError, NotPouredError
+from actors.protocols import InvalidActionError, NotPouredError, PourProgress
+from sim_engine.outcome import PourMeasurement
 
-from .conftest import ACTION, SCENE, reach, wired_spec
+from .conftest import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
 
 
 @pytest.mark.realtime
@@ -36,75 +38,84 @@ def test_wherever_the_balance_stands_what_was_executed_is_what_is_measured(open_
     assert unsafe == []
 
 
-@pytest.mark.realtime
-def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_when_hands_come_in(open_stage):
-    async def play():
-        async with open_stage() as stage:
-            await stage.pour()
-            history = await stage.site.history(stage.answered_at["set_up"])
-            return stage, history
+@dataclass
+class Poured:
+    """A pour that was looked at from all sides, and how often what was asked in one that followed.
 
-    stage, history = asyncio.run(play())
-    times, joints = np.array(history.times), np.array(history.joints)
+    Attributes:
+        history: what the controller remembers from the pour's set-up on.
+        heard, heard_twice: what the operator was asked in the first pour, and in both.
+    """
+
+    stage: Stage
+    measured: PourMeasurement
+    history: History
+    seen: list[PourProgress]
+    heard: list[str]
+    heard_twice: list[str]
+    notes: str
+
+
+@pytest.fixture(scope="module")
+def poured() -> Poured:
+    async def play() -> Poured:
+        seen: list[PourProgress] = []
+        async with opened_stage() as stage:
+            measured = await stage.pour(progress=seen.append)
+            history = await stage.site.history(stage.answered_at["set_up"])
+            heard, notes, consent = list(stage.heard), stage.said("note"), dict(stage.answered_at)
+            await stage.pour()
+            heard_twice = list(stage.heard)
+            stage.answered_at.update(consent)
+            return Poured(stage, measured, history, seen, heard, heard_twice, notes)
+
+    return asyncio.run(play())
+
+
+@pytest.mark.realtime
+def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_when_hands_come_in(poured):
+    times, joints = np.array(poured.history.times), np.array(poured.history.joints)
     spec = wired_spec().arm
     moved = np.flatnonzero(np.max(np.abs(joints - joints[0]), axis=1) > 1e-3)
-    assert times[moved[0]] - stage.answered_at["start"] >= 0.9 * spec.announcement
+    assert times[moved[0]] - poured.stage.answered_at["start"] >= 0.9 * spec.announcement
     np.testing.assert_allclose(joints[-1], spec.home, atol=1e-3)
-    assert stage.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
-    ((text, seconds),) = stage.operator.announced
+    assert poured.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
+    text, seconds = poured.stage.operator.announced[0]
     assert "moves in 3 s" in text
     assert seconds == pytest.approx(spec.announcement / spec.time_scale)  # of the clock
 
 
 @pytest.mark.realtime
-def test_the_record_says_what_was_executed_asked_and_weighed(open_stage):
-    async def play():
-        async with open_stage() as stage:
-            return await stage.pour(), stage
-
-    measured, stage = asyncio.run(play())
-    notes = measured.notes
+def test_the_record_says_what_was_executed_asked_and_weighed(poured):
+    notes = poured.measured.notes
     executed = unpack(notes["executed"])
     assert executed.completed
     tilt = pourer_motion(executed.joints, executed.times, wired_spec().arm).tilt(executed.times)
     assert math.degrees(tilt.max()) == pytest.approx(90.0, abs=3.0)
     assert {"rms_angle", "max_tool", "lag"} <= set(notes["executed"]["tracking"])
-    assert [one["about"] for one in notes["operator"]] == stage.heard
+    assert [one["about"] for one in notes["operator"]] == poured.heard
     assert notes["arm"]["model"] == "UR10"
     assert notes["mode"] == "virtual"
     for key, grams in notes["weighings_g"].items():
-        assert f"weighed, {key}: {grams:.2f} g" in stage.said("note")
+        assert f"weighed, {key}: {grams:.2f} g" in poured.notes
 
 
 @pytest.mark.realtime
-def test_the_empty_pourer_is_weighed_once_and_every_pour_is_confirmed(open_stage):
-    async def play():
-        async with open_stage() as stage:
-            await stage.pour()
-            await stage.pour()
-            return stage.heard
-
-    heard = asyncio.run(play())
-    assert heard.count("pourer_empty") == 1
-    assert heard.count("start") == 2
+def test_the_empty_pourer_is_weighed_once_and_every_pour_is_confirmed(poured):
+    assert poured.heard_twice.count("pourer_empty") == 1
+    assert poured.heard_twice.count("start") == 2
 
 
 @pytest.mark.realtime
-def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_stage):
-    seen = []
-
-    async def play():
-        async with open_stage() as stage:
-            await stage.pour(progress=seen.append)
-
-    asyncio.run(play())
+def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(poured):
     order = ["operator", "approach", "tilt", "hold", "return", "settle", "weigh", "record"]
-    passed = list(dict.fromkeys(p.checkpoint for p in seen))
+    passed = list(dict.fromkeys(p.checkpoint for p in poured.seen))
     assert [c for c in order if c in passed] == passed
     assert {"operator", "approach", "tilt", "settle", "weigh", "record"} <= set(passed)
-    assert [p.fraction for p in seen] == sorted(p.fraction for p in seen)
-    assert seen[-1].fraction == pytest.approx(1.0)
-    assert max(p.balance for p in seen if p.balance is not None) > 0.15
+    fractions = [p.fraction for p in poured.seen]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == pytest.approx(1.0)
+    assert max(p.balance for p in poured.seen if p.balance is not None) > 0.15
 
 
 @pytest.mark.realtime

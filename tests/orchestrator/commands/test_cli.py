@@ -94,6 +94,11 @@ def write_inputs(folder: Path) -> None:
         write(f"{name}.csv", table)
         spoil(f"{name}-csv.yaml", "pours.csv", f"{name}.csv", RECORDED)
 
+    header, *lines = CSV.splitlines()
+    offsets = ("x_offset_mm", 66, 20, 66)
+    close = [f"{line},{offset}" for line, offset in zip([header, *lines], offsets, strict=True)]
+    write("close.csv", "\n".join(close) + "\n")
+    write("odd-theta.json", '{"theta": {"cohesion": 0.05}, "remaining_discrepancy": {"shift": -1}}')
     write("misspelt-theta.yaml", "theta: {cohesoin: 0.05}\n")
     write("wild-theta.json", '{"theta": {"cohesion": 50}}')
     write("list-theta.json", "[1, 2]")
@@ -133,6 +138,15 @@ BAD: dict[str, str] = {
     "calibrate column-csv.yaml": "column.csv:1:1: column 'spilled_g' is missing",
     "calibrate mass-csv.yaml": "poured 90 g + retained 90 g = 180 g, but 100 g were loaded",
     "calibrate nothing-csv.yaml": "nothing.csv: is empty; it needs a header and a line for each pour",
+    "simulate small.yaml --from number.csv": "number.csv:3:9: poured_g: '9x5' is not a number",
+    "simulate small.yaml --from gone.csv": "gone.csv: no such file",
+    "simulate small.yaml --from pours.csv --scene narrow": "pours.csv:2:1: makes no action of scene 'deployment-n",
+    "simulate small.yaml --from close.csv": "close.csv:3:1: cups touch: at tilt ",
+    "simulate small.yaml --from pours.csv --set x_offset=70": "--set: the table given with --from says what is poured",
+    "simulate small.yaml --from pours.csv --rrd pour.rrd": "--rrd pour.rrd: records one pour; it does not go with",
+    "simulate small.yaml --from pours.csv --thetas 3": "--thetas 3: goes with --parameters, the theta.json of a",
+    f"{SIMULATE} --csv out.csv": "--csv out.csv: goes with --from, a table of weighed pours",
+    f"{SIMULATE} --parameters odd-theta.json": "odd-theta.json:1:56: remaining_discrepancy: needs a 'shift' from 0 on",
     # values on the command line
     "run small.yaml --laboratory gone.yaml": "gone.yaml: no such file",
     "plan small.yaml --laboratory small.yaml": "small.yaml: describes a campaign, but a laboratory is needed here",
@@ -324,6 +338,8 @@ def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
     prediction = outcome["prediction"]
     assert prediction["seeds"] == [5, 6, 7]
     assert prediction["received"]["count"] == 3
+    assert prediction["band"]["low"] < prediction["spillage"]["mean"] < prediction["band"]["high"]
+    assert prediction["band"]["level"] == 0.9
     assert prediction["received"]["deviation"] > 0.0
     assert abs(prediction["received"]["mean"] - outcome["received"]) < 5 * prediction["received"]["deviation"] + 1e-9
     assert outcome["regimes"]["lip"]["weber"][0] < outcome["regimes"]["lip"]["weber"][1]
@@ -340,8 +356,41 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert done.returncode == 0, done.stderr
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
     assert "mean ± standard deviation, 2 seeds" in done.stdout
+    assert re.search(
+        r"spilled / poured \d+\.\d ± \d+\.\d %, a pour: \d+\.\d … \d+\.\d %   \(bands of seeds", done.stdout
+    )
     assert re.search(r"delivered \d+\.\d g, \d+\.\d mL", done.stdout)
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
+
+
+def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
+    theta = {"cohesion": 0.05}
+    draws = [{"theta": {"cohesion": 0.02 * i}, "weight": 1.0} for i in range(4)]
+    (inputs / "theta.json").write_text(
+        json.dumps({"theta": theta, "remaining_discrepancy": {"shift": 0.2}, "posterior": draws}), encoding="utf-8"
+    )
+    done = process(
+        "simulate small.yaml --from pours.csv --parameters theta.json --seeds 2 --csv scored.csv --png scored.png "
+        "--json",
+        inputs,
+    )
+    (inputs / "theta.json").unlink()
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["scene"] == "calibration"
+    assert [pour["measured"] for pour in found["pours"]] == pytest.approx([4 / 90, 8 / 95, 0.09])
+    assert [pour["line"] for pour in found["pours"]] == [2, 3, 4]
+    assert {split: one["pours"] for split, one in found["scores"].items()} == {"train": 2, "test": 1, "all": 3}
+    errors = [abs(pour["measured"] - pour["predicted"]["mean"]) for pour in found["pours"]]
+    assert found["scores"]["all"]["mean_error"] == pytest.approx(sum(errors) / 3)
+    assert found["scores"]["all"]["held"] == sum(pour["inside"] for pour in found["pours"])
+    assert (found["simulations"], found["thetas"]) == (6, 2)
+    assert found["bands"]["discrepancy_shift"] == 0.2
+    for pour in found["pours"]:
+        assert pour["band"]["low"] <= pour["predicted"]["mean"] <= pour["band"]["high"]
+    assert len((inputs / "scored.csv").read_text(encoding="utf-8").splitlines()) == 4
+    assert (inputs / "scored.png").read_bytes().startswith(b"\x89PNG")
+    assert "3 pours, 2 simulations each, bands of seeds, 2 θ of the posterior" in done.stderr
 
 
 def test_one_seed_has_no_spread_and_says_so() -> None:
@@ -404,7 +453,13 @@ HELP = {
     "run": ["decant run my.yaml --resume", "Ctrl-C pauses", "runs/ID"],
     "calibrate": ["decant calibrate configs/campaigns/recorded.yaml --json", "theta.json", "N/m"],
     "plan": ["--receiver vase.yaml", "deg/s, mm and s", "Nothing is poured"],
-    "simulate": ["--set x_offset=90   # deg/s and mm", "'angular_velocity=0.7 rad/s'", "in_flight", "--seeds"],
+    "simulate": [
+        "--set x_offset=90   # deg/s and mm",
+        "'angular_velocity=0.7 rad/s'",
+        "in_flight",
+        "--seeds",
+        "--from pours.csv",
+    ],
     "validate": ["decant validate configs/campaigns/*.yaml", "units, bounds"],
     "schema": ["decant schema result > result.json"],
 }

@@ -92,7 +92,11 @@ def test_virtual_laboratory_is_started_looked_at_and_called_virtual() -> None:
 
 
 def test_a_bench_of_numbers_and_a_bad_file_are_refused_with_exit_code_2(tmp_path: Path) -> None:
-    assert doctor(Path("configs/laboratories/twin.yaml")).exit_code == 2
+    numbers = doctor(Path("configs/laboratories/twin.yaml"))
+    assert numbers.exit_code == 2
+    assert "laboratory twin has no 'arm', its bench is made of numbers: looked at are an arm" in " ".join(
+        numbers.stderr.split()
+    )
     assert doctor(tmp_path / "nowhere.yaml").exit_code == 2
     (tmp_path / "bad.yaml").write_text("name: x\nmode: hardwear\n")
     bad = doctor(tmp_path / "bad.yaml")

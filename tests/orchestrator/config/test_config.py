@@ -147,7 +147,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           ray: {{address: "head.local:6379", bench_resource: left_bench}}
           bench:
             liquid: {{particles: 3100, cohesion: 31 mN/m, viscosity: 7 Hz, friction: 0.31}}
-            pose_error: {{x: 1.1 mm, y: -2 mm, tilt: 0.7 deg, speed_factor: 1.03}}
+            pose_error: {{x: 1.1 mm, y: -2 mm, z: 0.7 mm, tilt: 0.7 deg, speed_factor: 1.03}}
             pose_noise: {{x: 0.3 mm, y: 0.4 mm, tilt: 0.2 deg, speed_factor: 0.02}}
             balance: {{resolution: 0.01 g, noise: 0.2 g, drift: 0.5 g/min, settling_time: 2.5 s}}
             time_scale: 12
@@ -204,8 +204,8 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
     assert lab.ray == RaySpec("head.local:6379", "left_bench")
     assert (bench.liquid.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
-    assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03))
-    assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02))
+    assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03, 0.0007))
+    assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02, 0.0))
     assert (bench.time_scale, bench.operator_time, bench.settling_time) == pytest.approx((12.0, 60.0, 2.5))
     assert (bench.balance_resolution, bench.balance_noise) == pytest.approx((1e-5, 2e-4))
     assert bench.balance_drift == pytest.approx(0.5e-3 / 60.0)
@@ -263,9 +263,12 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         ),
         ("strategy: D2\n  pours: 9\n  mean: zero", D2Settings(pours=9, mean="zero")),
         ("strategy: D3\n  pours: 9\n  per_pour: 0", D3Settings(pours=9, per_pour=0)),
-        ("strategy: D3\n  pours: 9", D3Settings(pours=9, per_pour=2, prior_simulations=37, model="scaled")),
+        ("strategy: D3\n  pours: 9", D3Settings(pours=9, per_pour=2, prior_simulations=37, model="adaptive")),
         ("strategy: D3\n  pours: 9\n  per_pour: free", D3Settings(pours=9, per_pour="free")),
-        ("strategy: D3\n  pours: 9\n  trust: always", D3Settings(pours=9, trust="always")),
+        (
+            "strategy: D3\n  pours: 9\n  model: scaled\n  trust: always",
+            D3Settings(pours=9, model="scaled", trust="always"),
+        ),
     ],
 )
 def test_strategies_have_their_own_budgets(keys: str, expected: DeploymentSettings, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import yaml
 from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
+from orchestrator.commands.campaigns import planning_plan
 from orchestrator.config.campaign.sections import CALIBRATIONS, DEPLOYMENTS, CalibrationSection, DeploymentSection
 from orchestrator.config.load import load_campaign
 from orchestrator.config.study.sections import load_study
@@ -65,6 +66,19 @@ def test_cells_of_a_study_are_kept_in_the_language_of_campaigns(name: str, tmp_p
         plan, _ = campaign_of(study, cell, lambda other, needed=needed: needed, tmp_path / cell.id)  # type: ignore[misc]
         assert reloaded(plan, tmp_path) == plan, cell.id
     assert len(kinds) > 4
+
+
+@pytest.mark.parametrize("vessel", ["tumbler.yaml", "mug.yaml"])
+def test_a_planning_run_keeps_the_theta_and_the_vessel_that_it_planned_with(vessel: str, tmp_path: Path) -> None:
+    campaign = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
+    theta = tmp_path / "theta.json"
+    theta.write_text(json.dumps({"theta": {"cohesion": 0.0123456789}}))
+    planned = planning_plan(campaign, theta, CONFIGS / "vessels" / vessel, 3)
+    again = reloaded(planned, tmp_path)
+    assert again.parameters.cohesion == 0.0123456789
+    assert [scene.receiver for scene in again.deployment.scenes] == [s.receiver for s in planned.deployment.scenes]  # type: ignore[union-attr]
+    assert again.deployment.settings == planned.deployment.settings  # type: ignore[union-attr]
+    assert again.calibration is None
 
 
 # -- generated campaigns -----------------------------------------------------------------------------------------------

@@ -150,7 +150,7 @@ def test_a_study_has_the_papers_methods_beside_ours(tmp_path: Path) -> None:
     own, papers_own = (plan.deployment(label).plan.settings for label in ("D3", "D3-paper"))
     assert isinstance(own, D3Settings)
     assert isinstance(papers_own, D3Settings)
-    assert (own.model, own.per_pour, own.plain) == ("scaled", 2, False)
+    assert (own.model, own.per_pour, own.plain) == ("adaptive", 2, False)
     assert (papers_own.model, papers_own.per_pour, papers_own.plain) == ("residual", 0, True)
     assert papers_own.trust == "always"
     cells = {cell.id: cell for cell in cells_of(plan)}

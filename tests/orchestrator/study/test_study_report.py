@@ -174,7 +174,9 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
     assert "Unfinished" not in page
     assert not re.search(r'(src|href)="(?!data:)', page), "the page refers to something beside it"
     assert "A repetition resamples the pours" in page
-    assert "Student&#x27;s t over repetitions" in page
+    assert "Student&#39;s t over repetitions" in page
+    assert "nothing tells" in page or " is better than " in page
+    assert "below 5 no difference is tested" in page
     assert "test pours recur between repetitions" in page
     assert "Code: 1 different for" in page
 

@@ -154,7 +154,7 @@ WRONG = {
     "of a parameter": (
         "cohesion: [0 N/m, 0.1 N/m]",
         "cohesion: {range: [0 N/m, 0.1 N/m], prior: {mean: 0.05 N/m, deviation: 0.01 N/m}}",
-        "simulator.parameters.cohesion.prior: unknown key; known here: range, scale",
+        "simulator.parameters.cohesion.prior: unknown key; known here: measured, range, scale, tolerance",
     ),
     "used by nobody": (
         "simulator:",

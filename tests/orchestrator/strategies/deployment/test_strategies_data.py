@@ -130,7 +130,7 @@ def test_a_hybrid_pours_first_where_the_former_pours_and_the_simulations_say(tmp
     hybrid = strategy(deployment(tmp_path, text))
     played = Play(narrow_cup)(hybrid)
     first = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
-    assert (len(first.data), len(first.simulated), first.acquisition) == (3, 6, "lcb")
+    assert (len(first.data), len(first.simulated), first.acquisition) == (3, 6, "least_loss")
     assert hybrid.result().former_pours == 3
 
 

@@ -1,4 +1,4 @@
-"""What the run of a cell keeps of its campaign: the base campaign's record with what the cell has otherwise."""
+"""What a run keeps of a campaign that was made from another: that one's record, with what is otherwise."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.sections import Section
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from sim_engine.vessel.spec import MeshShape, ProfileShape, VesselSpec
 
 
-def cell_record(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
-    """The campaign of a cell in the language of campaign files, JSON-ready.
+def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
+    """A plan in the language of campaign files, JSON-ready. Loading it gives the plan again.
 
-    Loading it gives the cell's plan; weighed pours, which it reads from the journal of another cell, to the last bits.
+    Pours that the cell of a study takes over from another cell are its shares of the load; loading reads the masses of
+    that cell's journal instead, which differ from them by rounding. θ drawn from a posterior are not part of it.
 
     Args:
-        base: the record of the base campaign.
-        plan: of the cell.
+        base: the record of the campaign that the plan was made from.
+        plan: of a study's cell, or for planning alone.
     """
     record = {key: value for key, value in base.items() if key not in ("calibration", "deployment")}
     outputs = {**asdict(plan.outputs), "record_rate": f"{plan.outputs.record_rate!r} 1/s"}
@@ -49,7 +51,7 @@ def _laboratory(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
     if bench is None:
         return dict(base)
     changed = {
-        "liquid": written(HiddenLiquid(**bench.liquid.model_dump())),
+        "liquid": written(HiddenLiquid(**bench.liquid.of_the_solver())),
         "pose_error": written(PoseErrorSection(**asdict(bench.pose_error))),
         "pose_noise": written(PoseNoiseSection(**asdict(bench.pose_noise))),
         "time_scale": bench.time_scale,
@@ -61,6 +63,8 @@ def _parameters(plan: CampaignPlan) -> dict[str, Any]:
     values: dict[str, Any] = plan.parameters.model_dump()
     for axis in () if plan.calibration is None else plan.calibration.parameters.axes:
         values[axis.name] = {"range": [axis.lower, axis.upper], "scale": axis.scale}
+    for prior in () if plan.calibration is None else plan.calibration.parameter_prior:
+        values[prior.name] |= {"measured": prior.mean, "tolerance": prior.deviation}
     return written(Parameters.model_validate(values))
 
 
@@ -76,12 +80,30 @@ def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]
     section = base["deployment"]
     named = next(table for table in (section, base) if "receivers" in table or "receiver" in table)
     receivers = named["receivers"] if "receivers" in named else [named["receiver"]]
-    wanted = {scene.receiver.name for scene in plan.scenes}
+    known = {one["name"]: one for one in receivers}
     common = {key: value for key, value in _common(section, LearningSection).items() if key != "receiver"}
     if plan.data is None:
         common.pop("data", None)
     common["confirm"] = plan.confirm
-    return {**common, "receivers": [one for one in receivers if one["name"] in wanted], **written(plan.settings)}
+    vessels = [known.get(scene.receiver.name) or vessel_record(scene.receiver) for scene in plan.scenes]
+    return {**common, "receivers": vessels, **written(plan.settings)}
+
+
+def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
+    """A vessel as a file has it."""
+    shape = vessel.shape
+    match shape:
+        case ProfileShape():
+            inner, thickness = [list(point) for point in shape.inner], {"wall": shape.wall, "floor": shape.floor}
+            profile = {"unit": "m", "inner": inner, **{key: f"{value!r} m" for key, value in thickness.items()}}
+            return {"name": vessel.name, "profile": profile}
+        case MeshShape():
+            unit = {} if shape.unit is None else {"unit": shape.unit}
+            return {"name": vessel.name, "mesh": str(shape.path), "up": shape.up, **unit}
+        case Section():
+            return {"name": vessel.name, shape.kind: written(shape)}
+        case _:
+            raise TypeError(f"a vessel of the kind {shape.kind!r} can't be written down")
 
 
 def _common(base: Mapping[str, Any], section: type[Section]) -> dict[str, Any]:

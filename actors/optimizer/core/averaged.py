@@ -1,0 +1,310 @@
+"""Averaging over the ways in which a simulator can be wrong, each weighed by the observations.
+
+Hypothesis j says that the bench does at action x what the simulator does at a displaced one, more or less of it, and
+something more that nobody simulated:
+
+    f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(A_j x + s_j), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
+    v_j² = σ_j² + e^{2 g_j} s_s²(A_j x + s_j),    y = f(x) + ε,    ε ~ N(0, (n + 0.15 μ_j(x))²)
+
+f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. The last
+hypothesis is ignorance: the simulator says nothing of this bench, and f is a GP around 0.6. The posterior weights are
+prior times marginal likelihood of the observations. So nothing is ever forgotten: a hypothesis that fails
+fades, and the weight of ignorance says how far the simulator is to be trusted.
+
+Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
+Limitations: the hypotheses are a fixed set; predictions come from the 16 heaviest of them, and ignorance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.spatial.distance import cdist
+from scipy.special import ndtr, ndtri
+from scipy.stats import qmc
+
+from actors.optimizer.core.mismatch import Mismatch
+from actors.optimizer.core.surrogate import GaussianProcess
+
+Array = NDArray[np.float64]
+
+HYPOTHESES = 512
+HEAVIEST = 16
+GAIN = 0.3
+"""Standard deviation of g."""
+RESTS = (0.02, 0.3)
+"""Smallest and largest σ, in units of the largest cost; evenly by its logarithm, as ℓ."""
+LENGTHS = (0.15, 0.6)
+FARTHER = (0.4, 3.0)
+"""Factors on a displacement's deviations, evenly by their logarithm: tails for a bench that is far off."""
+NOISE, NOISE_GROWTH = 0.02, 0.15
+"""Deviation of one observation where nothing is lost, and what it grows by where everything is."""
+IGNORANT_MEAN, IGNORANT_SIGNAL = 0.6, 0.4
+IGNORANT_LENGTHS = (0.15, 0.3, 0.6)
+KNOWN_SHARE = 0.75
+"""Share of the hypotheses around displacements that were found before, where some were."""
+KNOWN_SPREAD = 0.25
+"""Deviation of what is added to those, in that of the play."""
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Ways in which the simulator can be wrong.
+
+    Attributes:
+        scales, shifts: (J, dimension) of the displacements.
+        gains: (J,), logarithms.
+        rests: (J,), σ.
+        lengths: (J,), ℓ.
+    """
+
+    scales: Array
+    shifts: Array
+    gains: Array
+    rests: Array
+    lengths: Array
+
+    @classmethod
+    def of(cls, mismatch: Mismatch) -> Hypotheses:
+        """Draw, the same for the same question: quasi-random, so that few cover much."""
+        dimension = len(mismatch.play)
+        rows = qmc.Sobol(2 * dimension + 5, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
+        rows = np.clip(rows, 1e-6, 1.0 - 1e-6)
+        z = ndtri(rows[:, : 2 * dimension])
+        gain, rest, length, far, known = rows[:, 2 * dimension :].T
+        spread = _evenly(FARTHER, far)
+        scales, shifts = np.ones((HYPOTHESES, dimension)), np.zeros((HYPOTHESES, dimension))
+        if mismatch.drawn:
+            index = np.minimum((known / KNOWN_SHARE * len(mismatch.drawn)).astype(int), len(mismatch.drawn) - 1)
+            around = known < KNOWN_SHARE
+            spread = np.where(around, KNOWN_SPREAD, spread)
+            scales[around] = np.array([one.scales for one in mismatch.drawn])[index[around]]
+            shifts[around] = np.array([one.shifts for one in mismatch.drawn])[index[around]]
+        shift, factor, origin = (
+            np.array([getattr(play, name) for play in mismatch.play]) for name in ("shift", "factor", "origin")
+        )
+        factors = np.exp(spread[:, None] * factor * z[:, dimension:])
+        moved = spread[:, None] * shift * z[:, :dimension] + (factors - 1.0) * origin
+        return cls(
+            factors * scales,
+            factors * shifts + moved,
+            GAIN * ndtri(gain),
+            _evenly(RESTS, rest),
+            _evenly(LENGTHS, length),
+        )
+
+    def only(self, kept: NDArray[np.int_]) -> Hypotheses:
+        """Some of them."""
+        return Hypotheses(*(getattr(self, name)[kept] for name in ("scales", "shifts", "gains", "rests", "lengths")))
+
+    def moved(self, points: Array) -> Array:
+        """(J, m, dimension): where each puts points (m, dimension) in the simulator."""
+        return self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """What hypotheses (J) say of points (m) before any observation: means, deviations of δ, noises; (J, m) each."""
+
+    means: Array
+    spreads: Array
+    noises: Array
+
+
+class AveragedProcess:
+    """The real cost, averaged over hypotheses; see the module. Its `predict` is a `Surrogate`'s.
+
+    Attributes:
+        simulated: surrogate of the simulations.
+        weights: posterior weights (J + ignorant ones,); the last `len(IGNORANT_LENGTHS)` are ignorance.
+        ignorance: their sum.
+    """
+
+    def __init__(self, simulated: GaussianProcess, points: Array, costs: Array, mismatch: Mismatch) -> None:
+        """Weigh the hypotheses.
+
+        Args:
+            simulated: of the same cost.
+            points: (n, dimension), real observations, n ≥ 0.
+            costs: (n,).
+            mismatch: of the question.
+        """
+        self.simulated, self.points, self.worst = simulated, points, mismatch.worst
+        self._costs = np.clip(costs / mismatch.worst, 0.0, 1.0)
+        self._all = Hypotheses.of(mismatch)
+        informed = self._evidences(self._informed(self._all, points), self._all.lengths)
+        ignorant = self._evidences(self._ignorant(len(points), self._costs), np.array(IGNORANT_LENGTHS))
+        logs = np.concatenate(
+            [
+                informed + np.log((1.0 - mismatch.ignorance) / len(informed)),
+                ignorant + np.log(mismatch.ignorance / len(ignorant)),
+            ]
+        )
+        weights = np.exp(logs - logs.max())
+        self.weights = weights / weights.sum()
+        self.ignorance = float(self.weights[len(informed) :].sum())
+        heavy = np.argsort(-self.weights[: len(informed)], kind="stable")[:HEAVIEST]
+        self._kept = self._all.only(heavy)
+        share = self.weights[heavy] / max(self.weights[heavy].sum(), 1e-300) * (1.0 - self.ignorance)
+        self.mixture = np.concatenate([share, self.weights[len(informed) :]])
+        self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
+        self._at_data = self._prior(points, self._costs)
+        self._factors = self._factorised(self._at_data, self._lengths, points)
+
+    # -- what the hypotheses say before any observation ------------------------------------------------------------
+
+    def _informed(self, hypotheses: Hypotheses, points: Array) -> _Prior:
+        J, m = len(hypotheses.gains), len(points)
+        if m == 0:
+            return _Prior(*(np.empty((J, 0)) for _ in range(3)))
+        mean, deviation = self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
+        gain = np.exp(hypotheses.gains)[:, None] / self.worst
+        means = np.clip(gain * mean.reshape(J, m), 0.0, 1.0)
+        spreads = np.hypot(hypotheses.rests[:, None], gain * deviation.reshape(J, m))
+        return _Prior(means, spreads, NOISE + NOISE_GROWTH * means)
+
+    def _ignorant(self, count: int, seen: Array | float) -> _Prior:
+        shape = len(IGNORANT_LENGTHS), count
+        noises = np.broadcast_to(NOISE + NOISE_GROWTH * seen, shape)  # by what was seen there, if anything was
+        return _Prior(np.full(shape, IGNORANT_MEAN), np.full(shape, IGNORANT_SIGNAL), noises)
+
+    def _prior(self, points: Array, seen: Array | float = IGNORANT_MEAN) -> _Prior:
+        parts = self._informed(self._kept, points), self._ignorant(len(points), seen)
+        return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
+
+    # -- what the observations say ---------------------------------------------------------------------------------
+
+    def _evidences(self, prior: _Prior, lengths: Array) -> Array:
+        """Log marginal likelihoods (J,)."""
+        if not len(self._costs):
+            return np.zeros(len(lengths))
+        L = self._factorised(prior, lengths, self.points)
+        residuals = np.linalg.solve(L, (self._costs - prior.means)[:, :, None])[:, :, 0]
+        logs = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+        return np.asarray(-0.5 * (residuals**2).sum(axis=1) - logs)
+
+    def _factorised(self, prior: _Prior, lengths: Array, points: Array) -> Array:
+        """Lower Cholesky factors (J, n, n) of the observations' covariances."""
+        n = len(points)
+        if n == 0:
+            return np.zeros((len(lengths), 0, 0))
+        K = _correlation(points, points, lengths) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
+        K[:, np.arange(n), np.arange(n)] += prior.noises**2
+        return np.asarray(np.linalg.cholesky(K))
+
+    def components(self, points: Array) -> tuple[Array, Array, Array]:
+        """Posterior means, deviations and noises (components, m) at points (m, dimension), in units of the worst."""
+        prior = self._prior(points)
+        if not len(self.points):
+            return prior.means, prior.spreads, prior.noises
+        cross = self._cross(prior, points)
+        means, variances = np.empty_like(prior.means), np.empty_like(prior.means)
+        for j, L in enumerate(self._factors):
+            V = solve_triangular(L, cross[j].T, lower=True, check_finite=False)
+            residuals = solve_triangular(L, self._costs - self._at_data.means[j], lower=True, check_finite=False)
+            means[j] = prior.means[j] + V.T @ residuals
+            variances[j] = prior.spreads[j] ** 2 - np.einsum("ij,ij->j", V, V)
+        return means, np.sqrt(np.maximum(variances, 1e-10)), NOISE + NOISE_GROWTH * np.clip(means, 0.0, 1.0)
+
+    def differences(self, points: Array, place: Array) -> Array:
+        """Posterior deviations (components, m) of f(points) − f(place), place (dimension,)."""
+        both = np.concatenate([points, place[None, :]])
+        prior = self._prior(both)
+        own = _correlation(both, both[-1:], self._lengths)[:, :, 0] * prior.spreads * prior.spreads[:, -1:]
+        variance = prior.spreads**2
+        if len(self.points):
+            cross = self._cross(prior, both)
+            for j, L in enumerate(self._factors):
+                V = solve_triangular(L, cross[j].T, lower=True, check_finite=False)
+                own[j] -= V.T @ V[:, -1]
+                variance[j] -= np.einsum("ij,ij->j", V, V)
+        doubt = variance + variance[:, -1:] - 2.0 * own
+        return np.sqrt(np.maximum(doubt[:, :-1], 1e-12))
+
+    def _cross(self, prior: _Prior, points: Array) -> Array:
+        correlation = _correlation(points, self.points, self._lengths)
+        return np.asarray(correlation * prior.spreads[:, :, None] * self._at_data.spreads[:, None, :])
+
+    # -- what follows for the cost ---------------------------------------------------------------------------------
+
+    def predict(self, points: Array) -> tuple[Array, Array]:
+        """See `Surrogate.predict`: moments of the cost, which is between 0 and the worst."""
+        means, deviations, _ = self.components(points)
+        first, second = clipped_moments(means, deviations)
+        mean = self.mixture @ first
+        return self.worst * mean, self.worst * np.sqrt(np.maximum(self.mixture @ second - mean**2, 1e-12))
+
+    def noise_at(self, points: Array) -> Array:
+        """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
+        return self.worst * NOISE + NOISE_GROWTH * self.predict(points)[0] if len(points) else np.empty(0)
+
+    def exceedance(self, points: Array, loss: float) -> Array:
+        """Probabilities (m,) that an observation at points (m, dimension) is above a loss."""
+        means, deviations, noises = self.components(points)
+        return np.asarray(self.mixture @ ndtr((means - loss / self.worst) / np.hypot(deviations, noises)))
+
+    # -- for people and pictures -----------------------------------------------------------------------------------
+
+    @property
+    def hyperparameters(self) -> dict[str, float]:
+        """What the hypotheses are, by name."""
+        return {"noise": self.worst * NOISE, "simulated_noise": self.simulated.noise, "ignorance": self.ignorance}
+
+    def displaced(self) -> tuple[Array, Array, float]:
+        """Shift of the cube's centre (dimension,), its deviation, and the median factor on the cost."""
+        weights = self.weights[: len(self._all.gains)]
+        weights = weights / max(weights.sum(), 1e-300)
+        shifts = 0.5 * (self._all.scales - 1.0) + self._all.shifts
+        mean = weights @ shifts
+        deviation = np.sqrt(np.maximum(weights @ (shifts - mean) ** 2, 0.0))
+        order = np.argsort(self._all.gains, kind="stable")
+        median = order[np.searchsorted(np.cumsum(weights[order]), 0.5).clip(max=len(order) - 1)]
+        return np.asarray(mean), np.asarray(deviation), float(np.exp(self._all.gains[median]))
+
+    def drawn(self, count: int) -> tuple[Array, Array]:
+        """Scales and shifts (count, dimension) of displacements drawn from the posterior, evenly by their weight."""
+        weights = self.weights[: len(self._all.gains)]
+        order = np.argsort(-weights, kind="stable")
+        levels = (np.arange(count) + 0.5) / count * weights.sum()
+        chosen = order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)]
+        return self._all.scales[chosen], self._all.shifts[chosen]
+
+    @property
+    def heaviest(self) -> tuple[Hypotheses, Array]:
+        """The hypotheses that predictions come from, and their weights."""
+        return self._kept, self.mixture[: len(self._kept.gains)]
+
+
+def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:
+    """E clip(f, 0, 1) and E clip(f, 0, 1)² of normal f."""
+    low, high = -means / deviations, (1.0 - means) / deviations
+    inside = ndtr(high) - ndtr(low)
+    p, q = _density(low), _density(high)
+    above = ndtr(-high)
+    first = means * inside + deviations * (p - q) + above
+    second = (means**2 + deviations**2) * inside + deviations * (means * p - (means + 1.0) * q) + above
+    return np.clip(first, 0.0, 1.0), np.clip(second, 0.0, 1.0)
+
+
+def shortfall(level: Array | float, means: Array, deviations: Array) -> Array:
+    """E (level − f)⁺ of normal f."""
+    u = (level - means) / deviations
+    return np.asarray((level - means) * ndtr(u) + deviations * _density(u))
+
+
+def _density(u: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi))
+
+
+def _evenly(bounds: tuple[float, float], u: Array) -> Array:
+    low, high = bounds
+    return np.asarray(low * (high / low) ** u)
+
+
+def _correlation(first: Array, second: Array, lengths: Array) -> Array:
+    """Matérn 5/2 correlations (J, m, k) for each of the lengthscales (J,)."""
+    s = np.sqrt(5.0) * cdist(first, second)[None, :, :] / lengths[:, None, None]
+    return np.asarray((1.0 + s + s**2 / 3.0) * np.exp(-s))

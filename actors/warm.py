@@ -1,0 +1,101 @@
+"""Simulators that stay warm between laboratories: processes and compiled kernels are there before they are needed."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from actors.laboratory import ClosablePool
+from actors.protocols import LaboratoryError
+from actors.simulation.in_process import InProcessSimulatorPool
+from actors.simulation.job_runner import Simulator, pour_simulator
+from actors.simulation.pool import RaySimulatorPool
+from actors.simulation.shared import FairPool, Share
+from actors.spec import LaboratorySpec
+
+
+class WarmSimulators:
+    """A pool that is opened once and shared, fairly, by all laboratories of this process.
+
+    Args:
+        simulators: size of the pool; 0: one per core.
+        in_process: one simulator in this process, without Ray.
+        make: makes simulators, where they run.
+        tell: told of losses, in words for people.
+    """
+
+    def __init__(
+        self,
+        simulators: int = 0,
+        *,
+        in_process: bool = False,
+        make: Callable[[], Simulator] = pour_simulator,
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._spec = LaboratorySpec("warm", simulators=simulators, in_process=in_process)
+        self._make, self._tell = make, tell
+        self._pool: ClosablePool | None = None
+        self._fair: FairPool | None = None
+        self._opening = asyncio.Lock()
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is open."""
+        return self._fair is not None
+
+    @property
+    def size(self) -> int:
+        """Simulators; 0 before it is open."""
+        return 0 if self._pool is None else self._pool.size
+
+    async def open(self) -> None:
+        """Start them, unless that was done.
+
+        Raises:
+            LaboratoryError: Ray doesn't start.
+        """
+        async with self._opening:
+            if self._fair is not None:
+                return
+            if self._spec.in_process:
+                self._pool = InProcessSimulatorPool(make=self._make)
+            else:
+                self._pool = await self._open_ray()
+            self._fair = FairPool(self._pool)
+
+    async def _open_ray(self) -> ClosablePool:
+        from actors.ray_private import simulator_count
+        from actors.ray_runtime import keep_signals, start_ray, stop_ray
+
+        starting = asyncio.ensure_future(asyncio.to_thread(start_ray, self._spec))
+        try:
+            await asyncio.shield(starting)
+        except asyncio.CancelledError:
+            await asyncio.wait({starting})  # it can't be cut short, and must not outlive the one who wanted it
+            if starting.exception() is None:
+                await asyncio.to_thread(stop_ray)
+            raise
+        keep_signals()
+        return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=self._tell)
+
+    def share(self) -> Share:
+        """For one laboratory, for as long as it is open.
+
+        Raises:
+            LaboratoryError: it is not open.
+        """
+        if self._fair is None:
+            raise LaboratoryError("the simulators are not up yet")
+        return self._fair.share()
+
+    async def close(self) -> None:
+        """End them. May be called twice."""
+        async with self._opening:
+            pool, self._pool, self._fair = self._pool, None, None
+            if pool is None:
+                return
+            await pool.close()
+            if not self._spec.in_process:
+                from actors.ray_runtime import stop_ray
+
+                await asyncio.to_thread(stop_ray)

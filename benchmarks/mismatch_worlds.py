@@ -1,0 +1,125 @@
+"""Spill-like valleys, and simulators of them that are displaced, scaled, narrowed, or the wrong way round.
+
+Four shapes, in the units of a robot's actions, so that an error has a size in millimetres and per cent. What is lost is
+0 inside a valley, rises around it as 1 − exp(−r^1.5) and levels off at 1; see `Valley`. A seed draws place and size of
+the valley, what is wrong with the simulator, and the scatter of every pour. Written before anything was tuned on them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim_engine.action import DEG
+from sim_engine.space import Axis, Space
+
+Floats = np.ndarray[Any, np.dtype[np.float64]]
+
+SPEED, OFFSET, HEIGHT = (
+    Axis("angular_velocity", 15 * DEG, 120 * DEG),
+    Axis("x_offset", 0.08, 0.15),
+    Axis("height", 0.03, 0.1),
+)
+SHAPES: dict[str, Space] = {
+    "jet": Space((SPEED, OFFSET)),
+    "cup": Space((SPEED, OFFSET)),
+    "edge": Space((SPEED, OFFSET)),
+    "jet3": Space((SPEED, OFFSET, HEIGHT)),
+}
+"""A jet that reaches farther when it is fast; a tilted ellipse; a valley beside a cliff; a jet that falls from higher,
+too."""
+
+SIMULATED_SCATTER = 0.02
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """What is wrong with a simulator, as the size of each error; its sign is the seed's.
+
+    Attributes:
+        offset: the receiver stands elsewhere [m].
+        speed: relative error of the speed.
+        gain: natural logarithm of the factor on what is lost.
+        width: natural logarithm of the factor on the valley's width.
+        bump: height of a smooth error that nothing of the above explains.
+        inverted: it says 1 − 0.8 times the truth.
+    """
+
+    offset: float = 0.0
+    speed: float = 0.0
+    gain: float = 0.0
+    width: float = 0.0
+    bump: float = 0.0
+    inverted: bool = False
+
+
+LEVELS: dict[str, Wrong] = {
+    "none": Wrong(),
+    "small": Wrong(0.003, 0.02, 0.1, 0.1, 0.02),
+    "moderate": Wrong(0.007, 0.04, 0.25, 0.25, 0.05),
+    "large": Wrong(0.018, 0.12, 0.5, 0.5, 0.1),
+    "anti-correlated": Wrong(inverted=True),
+}
+
+
+class Valley:
+    """One seed's world: what is lost on the bench, and what its simulator says."""
+
+    def __init__(self, level: str, seed: int) -> None:
+        """Draw.
+
+        Args:
+            level: of `LEVELS`.
+            seed: its remainder by four is the shape.
+        """
+        self.shape = list(SHAPES)[seed % len(SHAPES)]
+        self.space, self._wrong = SHAPES[self.shape], LEVELS[level]
+        rng = np.random.default_rng([seed, 20261121])
+        self._speed, self._offset = rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.7)
+        self._slope, self._width = rng.uniform(0.35, 0.7), rng.uniform(0.03, 0.05)
+        self._length, self._height = rng.uniform(0.12, 0.2), rng.uniform(0.35, 0.65)
+        self._signs = rng.choice([-1.0, 1.0], 4)
+        self._bumps = rng.standard_normal((6, 4))
+        self._noise = rng.standard_normal(64)
+
+    def true(self, unit: Floats) -> float:
+        """What is lost on the bench at a point of the unit cube (dimension,), without scatter."""
+        return self._lost(np.clip(np.asarray(unit, dtype=float), 0.0, 1.0), 1.0)
+
+    def observe(self, unit: Floats, index: int) -> float:
+        """The same as the `index`-th pour shows it."""
+        lost = self.true(unit)
+        return min(max(lost + (0.01 + 0.12 * lost) * float(self._noise[index]), 0.0), 1.0)
+
+    def simulated(self, unit: Floats) -> float:
+        """What the simulator says at a point of the unit cube (dimension,), without scatter."""
+        wrong, signs = self._wrong, self._signs
+        u = np.clip(np.asarray(unit, dtype=float), 0.0, 1.0)
+        if wrong.inverted:
+            return 1.0 - 0.8 * self._lost(u, 1.0)
+        moved = u.copy()
+        factor = 1.0 + signs[0] * wrong.speed
+        moved[0] = factor * u[0] + (factor - 1.0) * SPEED.lower / (SPEED.upper - SPEED.lower)
+        moved[1] += signs[1] * wrong.offset / (OFFSET.upper - OFFSET.lower)
+        lost = math.exp(signs[2] * wrong.gain) * self._lost(moved, math.exp(signs[3] * wrong.width))
+        waves = self._bumps[:, : len(u)] @ u * 3.0 + self._bumps[:, 3] * math.pi
+        return float(np.clip(lost + wrong.bump * float(np.sin(waves).mean()) * 6**0.5, 0.0, 1.0))
+
+    def _lost(self, u: Floats, widened: float) -> float:
+        speed, offset, width = u[0] - self._speed, u[1] - self._offset, widened * self._width
+        if self.shape == "cup":
+            c, s = math.cos(self._slope), math.sin(self._slope)
+            along, across = c * speed + s * offset, c * offset - s * speed
+            distance = math.hypot(along / (widened * self._length), across / width)
+        else:
+            across = offset - self._slope * speed - 0.3 * speed * speed
+            if self.shape == "jet3":
+                across -= 0.5 * (math.sqrt(0.3 + u[2]) - math.sqrt(0.3 + self._height))
+            slow = max(-speed, 0.0) / (widened * self._length) + max(speed, 0.0) / (3.0 * widened * self._length)
+            if self.shape == "edge":  # beyond it the jet misses altogether; before it, it is lost bit by bit
+                across = across if across > 0.0 else 0.4 * across
+            distance = math.hypot(slow, across / width)
+        return 1.0 - math.exp(-((0.5 * max(distance - 1.0, 0.0)) ** 1.5))

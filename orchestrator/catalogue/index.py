@@ -1,0 +1,249 @@
+"""The index of the catalogue: one SQLite file that may be deleted at any time, for it is made anew from the runs.
+
+Before it is asked, it looks at the journals of all known runs: those that were written since it read them are read
+again. So it never lags behind, whoever died when, and nobody but the one who asks has to write it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from orchestrator.catalogue.columns import TABLES, Column
+from orchestrator.catalogue.reading import read_run
+from orchestrator.catalogue.registry import known
+from orchestrator.catalogue.remarks import REMARKS_NAME
+from orchestrator.errors import RunError
+from orchestrator.journal import JOURNAL_NAME
+from orchestrator.pour_rows import Row
+from orchestrator.state_directory import state_directory
+from orchestrator.states import RESTING
+
+INDEX_NAME = "catalogue.sqlite"
+
+FORMAT = 1
+"""Version of what is in the index; one of another version is made anew."""
+
+_SQL = {"text": "text", "texts": "text", "integer": "integer", "number": "real", "time": "real", "values": "text"}
+
+Progress = Callable[[int, int], None]
+
+
+class CatalogueError(RunError):
+    """The catalogue can't do what was asked; the text says why and what would be right."""
+
+
+@dataclass
+class Refreshed:
+    """What looking at the runs came to.
+
+    Attributes:
+        read: how many were read anew.
+        missing: known folders without a run.
+        problems: why runs, or parts of them, can't be read.
+    """
+
+    read: int = 0
+    missing: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+class Catalogue:
+    """The runs of this machine. Open it, `refresh` it, ask it."""
+
+    def __init__(self, state: Path | None = None) -> None:
+        """Open the catalogue, or begin one.
+
+        Args:
+            state: the state directory, if not the usual one.
+        """
+        self.state = state_directory() if state is None else state
+        self.warning = ""
+        """Why the index is kept in memory alone, where it can't be written; empty otherwise."""
+        path = self.state / INDEX_NAME
+        try:
+            self.state.mkdir(parents=True, exist_ok=True)
+            try:
+                self._connection = _opened(str(path))
+            except sqlite3.DatabaseError as error:
+                if isinstance(error, sqlite3.OperationalError):
+                    raise  # a folder that can't be written, a full disk: not the index's fault
+                _remove(path)  # damaged: everything in it stands in the runs
+                self._connection = _opened(str(path))
+        except (OSError, sqlite3.OperationalError) as error:
+            self.warning = f"{path}: can't be written ({error}); the runs are read anew each time"
+            self._connection = _opened(":memory:")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the file back. May be called twice."""
+        self._connection.close()
+
+    def refresh(self, progress: Progress | None = None, *, anew: bool = False) -> Refreshed:
+        """Read the runs that were written since they were read.
+
+        Args:
+            progress: called with how many are read, of how many.
+            anew: read all of them; those that are gone are forgotten.
+
+        Raises:
+            CatalogueError: the list of runs or the index can't be read or written.
+        """
+        found = Refreshed()
+        try:
+            stamps = {} if anew else dict(self._connection.execute("select path, stamp from source").fetchall())
+            folders = {str(path): _stamp(path) for path in dict.fromkeys((*known(self.state), *map(Path, stamps)))}
+            changed = [path for path, stamp in folders.items() if stamp and stamp != stamps.get(path)]
+            with self._transaction():
+                if anew:
+                    self._forget_all()
+                for path, stamp in folders.items():
+                    if not stamp and path in stamps:
+                        self._connection.execute("update source set missing = 1, stamp = '' where path = ?", [path])
+                for number, path in enumerate(changed, start=1):
+                    if progress is not None:
+                        progress(number, len(changed))
+                    self._read(path, folders[path])
+            found.read = len(changed)
+            found.missing = sum(not stamp for path, stamp in folders.items() if path in stamps)
+            query = "select problem from source where problem != '' and not missing order by path"
+            found.problems = [row[0] for row in self._connection.execute(query)]
+        except (OSError, sqlite3.Error) as error:
+            raise CatalogueError(
+                f"{self.state}: the catalogue can't be brought up to date ({error}); mend that, or name another state "
+                "directory with --state"
+            ) from None
+        return found
+
+    def rows(self, table: str, where: str = "1", values: Sequence[Any] = (), order: str = "") -> list[Row]:
+        """Rows of a table ('run' or 'pour') that a condition holds for, as declared in `columns`."""
+        columns = TABLES[table]
+        names = ", ".join(f"{table}.{column.name}" for column in columns)
+        query = f"select {names} from {table} where {where} {f'order by {order}' if order else ''}"
+        rows = self._connection.execute(query, values).fetchall()
+        found = [{c.name: _read_value(c, value) for c, value in zip(columns, row, strict=True)} for row in rows]
+        if table == "run":
+            for row in found:
+                row["state"] = _state_now(row)
+        return found
+
+    # -- inside ------------------------------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._connection.execute("begin immediate")
+        try:
+            yield
+        except BaseException:
+            self._connection.execute("rollback")
+            raise
+        self._connection.execute("commit")
+
+    def _read(self, path: str, stamp: str) -> None:
+        read = read_run(Path(path))
+        for table in ("run", "pour", "source"):
+            self._connection.execute(f"delete from {table} where path = ?", [path])
+        self._drop_former_place(read.run)
+        self._insert("run", [read.run])
+        self._insert("pour", read.pours)
+        self._connection.execute("insert into source values (?, ?, 0, ?)", [path, stamp, read.problem])
+
+    def _drop_former_place(self, run: Row) -> None:
+        """A run that was moved is known by its name and its beginning; where it was, it is no longer."""
+        query = """select path from run join source using (path) where run = ? and begun = ? and missing"""
+        for (path,) in self._connection.execute(query, [run.get("run"), run.get("begun")]).fetchall():
+            for table in ("run", "pour", "source"):
+                self._connection.execute(f"delete from {table} where path = ?", [path])
+
+    def _forget_all(self) -> None:
+        for table in ("run", "pour", "source"):
+            self._connection.execute(f"delete from {table}")
+
+    def _insert(self, table: str, rows: Sequence[Row]) -> None:
+        columns = TABLES[table]
+        query = f"insert into {table} values ({', '.join('?' * len(columns))})"
+        written = [[_written(column, row.get(column.name)) for column in columns] for row in rows]
+        self._connection.executemany(query, written)
+
+
+def _opened(path: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(path, isolation_level=None, timeout=10.0, check_same_thread=False)
+    try:
+        connection.execute("pragma journal_mode = wal")
+        if connection.execute("pragma user_version").fetchone()[0] != FORMAT:
+            _lay_out(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _lay_out(connection: sqlite3.Connection) -> None:
+    script = ["begin immediate"]
+    for table, columns in TABLES.items():
+        declared = ", ".join(f"{column.name} {_SQL[column.type]}" for column in columns)
+        script += [f"drop table if exists {table}", f"create table {table} ({declared}) strict"]
+        script.append(f"create index {table}_by_path on {table} (path)")
+    script.append("drop table if exists source")
+    script.append("create table source (path text primary key, stamp text, missing integer, problem text) strict")
+    script += [f"pragma user_version = {FORMAT}", "commit"]
+    connection.executescript("; ".join(script))
+
+
+def _remove(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+def _stamp(run: Path) -> str:
+    """Changes with everything that is written into a run; empty where there is none."""
+    marks = []
+    for name in (JOURNAL_NAME, f"{JOURNAL_NAME}-wal", REMARKS_NAME):
+        try:
+            found = (run / name).stat()
+            marks.append(f"{found.st_mtime_ns}:{found.st_size}")
+        except OSError:
+            if name == JOURNAL_NAME:
+                return ""
+            marks.append("")
+    return " ".join(marks)
+
+
+def _written(column: Column, value: Any) -> Any:
+    if column.type in ("texts", "values"):
+        return None if value is None else json.dumps(value, ensure_ascii=False)
+    return value
+
+
+def _read_value(column: Column, value: Any) -> Any:
+    if column.type in ("texts", "values"):
+        return ([] if column.type == "texts" else {}) if value is None else json.loads(value)
+    return value
+
+
+def _state_now(run: Row) -> str:
+    """The state in the journal; a run that should be busy and whose journal nobody holds was interrupted."""
+    state = str(run["state"] or "")
+    busy = state and state not in RESTING
+    return "interrupted" if busy and not _held(Path(run["path"]) / JOURNAL_NAME) else state
+
+
+def _held(journal: Path) -> bool:
+    """Whether a process holds a journal's lock, by the system's own list of locks: trying it would be in the way."""
+    try:
+        lock = journal.with_suffix(".lock").stat().st_ino
+        lines = Path("/proc/locks").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return True  # nobody can tell: the journal's word stands
+    return any(len(part := line.split()) > 5 and part[-3].rpartition(":")[2] == str(lock) for line in lines)

@@ -1,0 +1,78 @@
+"""With what a verb foretells pours: θ, draws of its posterior, and what calibration left over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError
+
+if TYPE_CHECKING:
+    from orchestrator.plan import CampaignPlan
+    from sim_engine.liquid import SimulationParameters
+
+
+@dataclass(frozen=True)
+class Foretelling:
+    """θ of a prediction.
+
+    Attributes:
+        theta: θ* of the file, or the campaign's θ.
+        drawn: draws of the posterior that simulations take turns with; empty: θ alone.
+        discrepancy: shift that the calibration left (`sim_engine.bands`); None where nobody knows.
+    """
+
+    theta: SimulationParameters
+    drawn: tuple[SimulationParameters, ...] = ()
+    discrepancy: float | None = None
+
+    @property
+    def thetas(self) -> tuple[SimulationParameters, ...]:
+        """What simulations take turns with."""
+        return self.drawn or (self.theta,)
+
+    @property
+    def said(self) -> str:
+        """What the bands hold, for people."""
+        among = f"{len(self.drawn)} θ of the posterior" if self.drawn else "one θ"
+        parts = ["seeds", among, f"{self.theta.particles} particles' resolution"]
+        if self.discrepancy is not None:
+            parts.append("what calibration left over")
+            return f"bands of {', '.join(parts[:-1])} and {parts[-1]}"
+        return f"bands of {', '.join(parts[:-1])} and {parts[-1]} alone (no calibration says what it left over)"
+
+    def as_json(self) -> dict[str, Any]:
+        """The shifts behind the bands, JSON-ready."""
+        from sim_engine.bands import resolution_shift
+
+        return {"discrepancy_shift": self.discrepancy, "resolution_shift": resolution_shift(self.theta.particles)}
+
+
+def foretelling(plan: CampaignPlan, parameters: Path | None, thetas: int | None, seeds: int) -> Foretelling:
+    """What the command line asks for.
+
+    Args:
+        plan: whose θ has what the file does not name.
+        parameters: theta.json of a calibration, or somebody's own file; None: the campaign's θ.
+        thetas: draws of the posterior; None: as many as `seeds` where the file has a posterior; 0: θ* alone.
+        seeds: simulations of a pour.
+
+    Raises:
+        RefusalError: something is wrong with the file, or it has no posterior that was asked for (exit code 2).
+    """
+    from orchestrator.config.load import has_posterior, load_discrepancy, load_parameters, load_posterior
+    from orchestrator.config.yaml.errors import ConfigError
+
+    if parameters is None:
+        if thetas:
+            raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration", BAD_INPUT)
+        return Foretelling(plan.parameters)
+    try:
+        theta = load_parameters(parameters, plan.parameters)
+        if thetas is None:
+            thetas = seeds if has_posterior(parameters) else 0
+        drawn = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
+        return Foretelling(theta, drawn, load_discrepancy(parameters))
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None

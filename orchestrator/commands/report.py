@@ -1,0 +1,125 @@
+"""`decant report`: the page about a run or a study, made again from its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from orchestrator.commands.options import Json, Quiet, call, examples
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json
+
+if TYPE_CHECKING:
+    from orchestrator.plan import CampaignPlan
+
+EXAMPLES = examples(
+    "decant report quickstart-20300131-1              # a run of the folder runs/",
+    "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
+    "decant report configs/studies/quick.yaml         # or the study's folder",
+)
+
+RUNS = Path("runs")
+"""Where a name without a folder is looked for."""
+
+
+def report(
+    what: Annotated[
+        Path,
+        typer.Argument(
+            help="A run's folder, or its name in runs/; a study's folder, or its file.",
+            metavar="RUN|STUDY",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Another file than report.html in the run's folder.", show_default=False),
+    ] = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Write every figure of a run as PDF, too, for LaTeX.")] = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make the page about a run or a study: one HTML file that needs nothing beside it and prints well.
+
+    What was asked, what was done, θ* with its region, every pour, figures, cost, and in plain words what to do from now
+    on, how far it may be missed, and what nobody knows. Also of runs that are paused, failed or unknown: it says so.
+    """
+    call(_report, what, output=output, pdf=pdf, as_json=as_json)
+
+
+def _report(what: Path, *, output: Path | None, pdf: bool, as_json: bool) -> None:
+    from orchestrator.commands.common import check_output
+    from orchestrator.journal import JOURNAL_NAME
+    from orchestrator.study.folder import SETTINGS
+
+    check_output(output, "--output", ".html")
+    folder = what if what.exists() or len(what.parts) > 1 else RUNS / what
+    if (folder / JOURNAL_NAME).is_file():
+        page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
+    elif (folder / SETTINGS).is_file() or folder.suffix in (".yaml", ".yml"):
+        if output is not None or pdf:
+            raise RefusalError(f"{folder}: is a study; its page and figures (PNG, SVG) go to its folder", BAD_INPUT)
+        page, figures = _of_study(folder), []
+    else:
+        raise RefusalError(_nothing_there(folder), BAD_INPUT)
+    mention(f"report  {page}")
+    if as_json:
+        print_json({"report": page, "figures": figures})
+
+
+def _nothing_there(folder: Path) -> str:
+    from orchestrator.journal import JOURNAL_NAME
+
+    near = sorted(path.parent.name for path in folder.absolute().parent.glob(f"*/{JOURNAL_NAME}"))
+    known = f"; runs there: {', '.join(near)}" if near else ""
+    return (
+        f"{folder}: neither a run nor a study is here; name a run's folder (with its {JOURNAL_NAME}), a study's "
+        f"folder, or a study's file{known}"
+    )
+
+
+def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
+    from orchestrator.campaign import read_result
+    from orchestrator.errors import RunError
+    from orchestrator.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.publish import FIGURES, summary_of, write_report
+    from orchestrator.report.campaign import draw_figures
+    from orchestrator.report.run_page import REPORT_NAME
+
+    plan = _plan_of(folder)
+    mention("drawing the figures …")
+    try:
+        with JournalReader(folder / JOURNAL_NAME) as journal:
+            result = read_result(journal, folder)
+        figures = draw_figures(folder / FIGURES, plan, result.results, formats)
+        page = write_report(output or folder / REPORT_NAME, plan, summary_of(plan, result, figures), folder)
+    except RunError as error:
+        raise RefusalError(str(error)) from None
+    except OSError as error:
+        raise RefusalError(f"{error.filename or folder}: {error.strerror}") from None
+    return page, list(figures.values())
+
+
+def _plan_of(folder: Path) -> CampaignPlan:
+    from orchestrator.config.load import load_campaign
+    from orchestrator.config.yaml.errors import ConfigError
+    from orchestrator.runs import RESOLVED
+
+    try:
+        return load_campaign(folder / RESOLVED)
+    except ConfigError as error:
+        raise RefusalError(f"the run's own campaign can't be read:\n{error}", BAD_INPUT) from None
+
+
+def _of_study(what: Path) -> Path:
+    from orchestrator.commands.study import read_study
+    from orchestrator.study.folder import StudyError, check_settings, file_of
+    from orchestrator.study.report.page import write_report
+
+    try:
+        plan = read_study(what if what.is_file() else file_of(what))
+        check_settings(plan)
+        return write_report(plan, plan.folder)
+    except StudyError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None

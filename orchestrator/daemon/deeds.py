@@ -1,0 +1,175 @@
+"""The part of the API that does something. Everything is written down with its doer."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Path, Request
+
+from orchestrator.daemon.arming import NotArmedError, arm, what_moves
+from orchestrator.daemon.guard import Admin, Anybody, Daemon, Operator, Stopper
+from orchestrator.daemon.looks import campaign_out, found_item, status
+from orchestrator.daemon.people import AnswerError, question_json
+from orchestrator.daemon.shapes import (
+    AnswerIn,
+    ArmIn,
+    CampaignOut,
+    MoveIn,
+    QuestionOut,
+    ReasonIn,
+    StatusOut,
+    SubmissionIn,
+    WhatMovesOut,
+)
+from orchestrator.daemon.submitting import Submission, SubmissionError, prepare
+from orchestrator.daemon.supervisor import RefusedError
+
+router = APIRouter()
+
+
+@router.post("/campaigns", status_code=201, operation_id="submit")
+async def submit(request: Request, daemon: Daemon, person: Operator, body: SubmissionIn) -> CampaignOut:
+    """Queue a campaign. It is checked as `decant run` checks one, and kept as it is now."""
+    if bool(body.text) == bool(body.path) or (body.path and body.files):
+        raise HTTPException(422, "give either 'text' (with 'files') or 'path'")
+    try:
+        daemon.refuse_new_work()
+        submission = Submission(**body.model_dump())
+        item = await asyncio.to_thread(prepare, daemon.settings, submission, daemon.new_key(), person.name)
+    except SubmissionError as error:
+        raise HTTPException(422, str(error)) from None
+    except RefusedError as error:
+        raise HTTPException(409, str(error)) from None
+    try:
+        return campaign_out(request, daemon, daemon.submit(item))
+    except RefusedError as error:
+        await asyncio.to_thread(shutil.rmtree, daemon.settings.snapshots / item.id, ignore_errors=True)
+        raise HTTPException(409, str(error)) from None
+
+
+@router.post("/campaigns/{key}/pause", operation_id="pause")
+async def pause(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
+    """Come to rest at the next checkpoint: a pour that has begun is finished and weighed."""
+    found_item(daemon, key)
+    try:
+        return campaign_out(request, daemon, daemon.pause(key, person.name))
+    except RefusedError as error:
+        raise HTTPException(409, str(error)) from None
+
+
+@router.post("/campaigns/{key}/stop", operation_id="stop")
+async def stop(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
+    """As pause; then what came of it so far is published, and it does not go on by itself."""
+    found_item(daemon, key)
+    try:
+        return campaign_out(request, daemon, daemon.stop(key, person.name))
+    except RefusedError as error:
+        raise HTTPException(409, str(error)) from None
+
+
+@router.post("/campaigns/{key}/abort", operation_id="abort")
+async def abort(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
+    """Stop the motion. What is tilted is brought upright once somebody agrees; again: it is left as it is."""
+    found_item(daemon, key)
+    try:
+        return campaign_out(request, daemon, await daemon.abort(key, person.name))
+    except RefusedError as error:
+        raise HTTPException(409, str(error)) from None
+
+
+@router.post("/campaigns/{key}/resume", operation_id="resume")
+async def resume(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
+    """Go on with a campaign that rests. About a pour whose outcome nobody knows somebody is asked first."""
+    found_item(daemon, key)
+    try:
+        return campaign_out(request, daemon, daemon.resume(key, person.name))
+    except RefusedError as error:
+        raise HTTPException(409, str(error)) from None
+
+
+@router.post("/campaigns/{key}/move", operation_id="move")
+async def move(request: Request, daemon: Daemon, person: Operator, key: str, body: MoveIn) -> CampaignOut:
+    """Another place in the queue."""
+    found_item(daemon, key)
+    if body.before:
+        found_item(daemon, body.before)
+    try:
+        item = daemon.move(key, person.name, before=body.before, priority=body.priority)
+    except RefusedError as error:
+        raise HTTPException(409, str(error)) from None
+    return campaign_out(request, daemon, item)
+
+
+@router.get("/campaigns/{key}/arming", operation_id="arming")
+async def arming(daemon: Daemon, person: Operator, key: str) -> WhatMovesOut:
+    """What hardware would do in this campaign, for somebody to read before arming it."""
+    item = found_item(daemon, key)
+    try:
+        return await asyncio.to_thread(what_moves, daemon, item)
+    except NotArmedError as error:
+        raise HTTPException(409, str(error)) from None
+
+
+@router.post("/campaigns/{key}/arm", operation_id="arm")
+async def arm_it(request: Request, daemon: Daemon, person: Operator, key: str, body: ArmIn) -> CampaignOut:
+    """Let hardware move in the coming part of this campaign's run."""
+    item = found_item(daemon, key)
+    try:
+        armed = await asyncio.to_thread(what_moves, daemon, item)
+        return campaign_out(request, daemon, arm(daemon, item, armed, body.laboratory, person.name))
+    except NotArmedError as error:
+        raise HTTPException(409, str(error)) from None
+
+
+@router.post("/questions/{number}/answer", operation_id="answer")
+async def answer(
+    daemon: Daemon, person: Operator, number: Annotated[int, Path(ge=0, lt=2**62)], body: AnswerIn
+) -> QuestionOut:
+    """Answer a question. The first answer counts."""
+    try:
+        found = daemon.asking.answer(number, body.answer, person.name)
+    except KeyError:
+        raise HTTPException(404, f"question {number} is not open") from None
+    except AnswerError as error:
+        raise HTTPException(422, str(error)) from None
+    daemon.note(person.name, "answer", found.campaign, f"{found.text} → {found.answer}")
+    return QuestionOut.model_validate(question_json(found))
+
+
+@router.post("/queue/pause", operation_id="pause_queue")
+async def pause_queue(request: Request, daemon: Daemon, person: Operator) -> StatusOut:
+    """Begin no campaign from now on. What runs goes on."""
+    daemon.pause_queue(True, person.name)
+    return await status(request, daemon, person)
+
+
+@router.post("/queue/resume", operation_id="resume_queue")
+async def resume_queue(request: Request, daemon: Daemon, person: Operator) -> StatusOut:
+    """Begin campaigns again."""
+    daemon.pause_queue(False, person.name)
+    return await status(request, daemon, person)
+
+
+@router.post("/emergency-stop", operation_id="emergency_stop")
+async def emergency_stop(request: Request, daemon: Daemon, person: Anybody, body: ReasonIn | None = None) -> StatusOut:
+    """Stop every arm, give up everything, take nothing new until it is cleared. Whoever may look may do it."""
+    await daemon.emergency_stop(person.name, "" if body is None else body.reason)
+    return await status(request, daemon, person)
+
+
+@router.post("/emergency-stop/clear", operation_id="clear")
+async def clear(request: Request, daemon: Daemon, person: Admin) -> StatusOut:
+    """Take work again. What was given up rests until somebody resumes it."""
+    daemon.clear(person.name)
+    return await status(request, daemon, person)
+
+
+@router.post("/shutdown", status_code=202, operation_id="shutdown")
+async def shutdown(request: Request, daemon: Daemon, person: Admin) -> StatusOut:
+    """End the daemon at the next safe point; again: at once."""
+    daemon.note(person.name, "shutdown")
+    found = await status(request, daemon, person)
+    request.app.state.shutdown()
+    return found

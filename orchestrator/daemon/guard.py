@@ -1,0 +1,134 @@
+"""What every request has to pass: its size, the name it calls this machine by, a token, a role."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Annotated, Any
+
+from fastapi import Depends, HTTPException, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from orchestrator.daemon.auth import Person, Role, Tokens, TooManyFailuresError
+from orchestrator.daemon.settings import LOOPBACK
+from orchestrator.daemon.supervisor import Supervisor
+
+Message = dict[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+
+BEARER = HTTPBearer(auto_error=False, description="A token of the file 'tokens' in the daemon's state directory.")
+
+
+class TooLargeError(Exception):
+    """The body of a request is larger than is read."""
+
+
+class Guard:
+    """ASGI middleware: refuses what is too large before it is read, and names that this machine does not have.
+
+    A browser that was led here under another name (DNS rebinding) would speak for a page of strangers.
+
+    Args:
+        app: what is guarded.
+        limit: largest body [bytes].
+        host: that the API listens at; names are checked on the loopback interface only.
+    """
+
+    def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]], limit: int, host: str) -> None:
+        self._app, self._limit = app, limit
+        self._names = frozenset((*LOOPBACK, "[::1]", host)) if host in LOOPBACK else None
+
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        """See the ASGI specification."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = {name.lower(): value for name, value in scope["headers"]}
+        host = headers.get(b"host", b"").decode("latin-1")
+        name = host if host.startswith("[") and host.endswith("]") else host.rpartition(":")[0] or host
+        if self._names is not None and name not in self._names:
+            await _refuse(send, 421, "this daemon is reached as 127.0.0.1 or localhost, and not by another name")
+            return
+        length = headers.get(b"content-length", b"0")
+        if length.isdigit() and int(length) > self._limit:
+            await _refuse(send, 413, self._too_large)
+            return
+        read, begun = 0, False
+
+        async def counted() -> Message:
+            nonlocal read
+            message = await receive()
+            read += len(message.get("body", b""))
+            if read > self._limit:
+                raise TooLargeError
+            return message
+
+        async def noted(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self._app(scope, counted, noted)
+        except TooLargeError:
+            if not begun:
+                await _refuse(send, 413, self._too_large)
+
+    @property
+    def _too_large(self) -> str:
+        return f"more than {self._limit / 1e6:g} MB are not read (listen: body in the daemon's settings)"
+
+
+async def _refuse(send: Send, status: int, detail: str) -> None:
+    from orchestrator.daemon.encode import text
+
+    body = text({"detail": detail}).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode()),
+               (b"connection", b"close")]  # fmt: skip
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+def needs(role: Role, *, always: bool = False) -> Callable[..., Awaitable[Person]]:
+    """A dependency: who asks, if they may.
+
+    Args:
+        role: that it takes.
+        always: for stopping, from which nobody is kept by others' wrong tokens.
+    """
+
+    async def person(
+        request: Request, shown: Annotated[HTTPAuthorizationCredentials | None, Depends(BEARER)]
+    ) -> Person:
+        tokens: Tokens = request.app.state.tokens
+        address = request.client.host if request.client is not None else ""
+        if shown is None:
+            raise HTTPException(401, "a token is needed: 'Authorization: Bearer TOKEN'", {"WWW-Authenticate": "Bearer"})
+        try:
+            found = tokens.person(shown.credentials, address, always=always)
+        except TooManyFailuresError as error:
+            raise HTTPException(429, str(error), {"Retry-After": str(int(error.wait) + 1)}) from None
+        if found is None:
+            raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
+        if found.role < role:
+            raise HTTPException(403, f"{found.name} is a {found.role.name.lower()}; this takes {role.name.lower()}")
+        return found
+
+    return person
+
+
+def the_daemon(request: Request) -> Supervisor:
+    """What the application speaks for."""
+    found: Supervisor = request.app.state.daemon
+    return found
+
+
+Daemon = Annotated[Supervisor, Depends(the_daemon)]
+Viewer = Annotated[Person, Depends(needs(Role.VIEWER))]
+Operator = Annotated[Person, Depends(needs(Role.OPERATOR))]
+Admin = Annotated[Person, Depends(needs(Role.ADMIN))]
+Stopper = Annotated[Person, Depends(needs(Role.OPERATOR, always=True))]
+"""Whoever stops a campaign: heard also where others from the same address have shown wrong tokens."""
+
+Anybody = Annotated[Person, Depends(needs(Role.VIEWER, always=True))]
+"""Whoever pulls the emergency stop."""

@@ -1,0 +1,248 @@
+"""One campaign on one rig, from its snapshot to its published results; and the ways to end it sooner."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from actors.bench.opening import needs_person
+from actors.laboratory import open_laboratory
+from actors.protocols import Laboratory, LaboratoryError, Stoppable
+from actors.warm import WarmSimulators
+from orchestrator.campaign import CampaignResult, read_result, run_campaign
+from orchestrator.daemon.feed import Feed
+from orchestrator.daemon.packing import CAMPAIGN, load_confined
+from orchestrator.daemon.people import Asking, RemoteOperator, RunQuestions
+from orchestrator.daemon.settings import DESK, Rig, Settings
+from orchestrator.daemon.store import Item, Store
+from orchestrator.daemon.watching import Watching
+from orchestrator.events import Watcher
+from orchestrator.jobs import Job, Verb, job
+from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.monitor.monitor import RerunMonitor
+from orchestrator.plan import CampaignPlan
+from orchestrator.publish import publish
+from orchestrator.runs import create_run
+from sim_engine.extras import installed
+
+MOVING = ("approach", "tilt", "hold", "return")
+"""Checkpoints of a pour during which the arm moves."""
+
+BETWEEN_CANCELS = 1.0
+"""Longest time that a run has to take note of a pause before it is told to give everything up [s]."""
+
+STOP_DEADLINE = 5.0
+"""Longest time that is waited for an arm to confirm that it was stopped [s]; everything else goes on meanwhile."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Common:
+    """What all campaigns of a daemon share."""
+
+    settings: Settings
+    store: Store
+    feed: Feed
+    asking: Asking
+    warm: WarmSimulators
+    hooks: tuple[Callable[[str, CampaignPlan, Path], Watcher | None], ...] = ()
+    """Asked for another watcher of each run: its campaign's id, plan and folder."""
+
+
+def job_of(settings: Settings, item: Item, rig: Rig) -> Job:
+    """The work of a submitted campaign, from its snapshot. Takes a moment, and no event loop.
+
+    Raises:
+        ConfigError, JobError: it can't be used.
+    """
+    folder = settings.snapshots / item.id
+    plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
+    # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
+    plan = replace(plan, on_unknown="ask", outputs=replace(plan.outputs, directory=settings.runs))
+    verb: Verb = item.verb  # type: ignore[assignment]  # written by us
+    return job(plan, verb)
+
+
+class Running:
+    """One part of a campaign's run: from now until it rests.
+
+    Args:
+        common: what it shares with others.
+        item: which campaign.
+        rig: that it has leased.
+    """
+
+    def __init__(self, common: Common, item: Item, rig: Rig) -> None:
+        self._common, self.item, self._rig = common, item, rig
+        self.watching: Watching | None = None
+        self._laboratory: Laboratory | None = None
+        self._task: asyncio.Task[CampaignResult] | None = None
+        self._aborting = self._giving_up = False
+        self._asked_to_end = False
+
+    async def run(self, checksum: str = "") -> CampaignResult:
+        """Run until it rests.
+
+        Args:
+            checksum: of the safety settings that were accepted, where hardware was armed.
+
+        Raises:
+            asyncio.CancelledError: it was paused, stopped, aborted.
+            RunError, LaboratoryError, ConfigError, OSError: it can't go on.
+        """
+        work = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
+        directory = await asyncio.to_thread(self._directory, work.plan)
+        await self._common.warm.open()
+        self.watching = Watching(work.plan)
+        monitor = self._recording(work.plan, directory)
+        watchers: list[Watcher] = [self._common.feed.watcher(self.item.id), self.watching, self._note_state]
+        if monitor is not None:
+            watchers.append(monitor)
+        for hook in self._common.hooks:
+            if (watcher := hook(self.item.id, work.plan, directory)) is not None:
+                watchers.append(watcher)
+        try:
+            result = await self._run(work, directory, watchers, checksum)
+        finally:
+            if monitor is not None:
+                await asyncio.to_thread(monitor.close)
+        await asyncio.to_thread(publish, work.plan, result, monitor)
+        return result
+
+    async def _run(self, work: Job, directory: Path, watchers: list[Watcher], checksum: str) -> CampaignResult:
+        spec = work.plan.laboratory
+        spec = replace(
+            spec, in_process=spec.in_process or self._common.settings.in_process, accepted_checksum=checksum, ray=None
+        )
+        asking, key, rig = self._common.asking, self.item.id, self._rig.name
+        operator = RemoteOperator(asking, key, rig, self._announce) if work.pours and needs_person(spec) else None
+        self._laboratory = open_laboratory(
+            spec, need_bench=work.pours, operator=operator, kept=self._common.warm.share()
+        )
+        self._task = asyncio.create_task(
+            run_campaign(
+                work.plan,
+                self._laboratory,
+                directory,
+                resume=(directory / JOURNAL_NAME).is_file(),
+                watchers=watchers,
+                ask_operator=RunQuestions(asking, self._common.store, key, rig, lambda: self._look(work.plan)),
+                stages=work.stages,
+            ),
+            name=f"campaign {key}",
+        )
+        if self._asked_to_end:
+            self._task.cancel()
+        return await self._task
+
+    def _directory(self, plan: CampaignPlan) -> Path:
+        if self.item.run is not None:
+            return self._common.settings.runs / self.item.run
+        return create_run(plan)
+
+    def note_run(self, directory: Path) -> None:
+        """Write down which folder the run has, before anything happens in it."""
+        self.item = replace(self.item, run=directory.name)
+        self._common.store.change(self.item.id, run=directory.name)
+
+    def _recording(self, plan: CampaignPlan, directory: Path) -> RerunMonitor | None:
+        if self.item.run != directory.name:
+            self.note_run(directory)
+        if not plan.outputs.rrd or not installed("rerun"):
+            return None
+        return RerunMonitor(directory / "campaign.rrd", plan)
+
+    def _note_state(self, event: Any) -> None:
+        from orchestrator.events import CampaignStateChanged
+
+        if isinstance(event, CampaignStateChanged):
+            self._common.store.change(self.item.id, state=event.after, reason=event.reason)
+
+    def _announce(self, text: str, seconds: float) -> None:
+        self._common.feed.tell("Announced", {"rig": self._rig.name, "text": text, "seconds": seconds}, self.item.id)
+
+    def _look(self, plan: CampaignPlan) -> dict[str, str]:
+        from orchestrator.daemon.looking import found_at
+
+        return found_at(plan.laboratory)
+
+    # ---- ending it sooner
+
+    def pause(self) -> None:
+        """Come to rest at the next safe point: simulations are dropped, a pour that has begun is finished, weighed."""
+        self._asked_to_end = True
+        if self._task is not None:
+            self._task.cancel()
+
+    async def abort(self) -> None:
+        """Stop the motion now. What was tilted is brought upright when somebody has agreed to it.
+
+        Where nothing moves, what is under way is given up; so it is when this is called again.
+        """
+        moving = self.watching is not None and self.watching.checkpoint in MOVING
+        if not moving or self._aborting:
+            self.pause()
+            await self.give_up()
+            return
+        self._aborting = True
+        stopping = asyncio.create_task(self.stop_arm())
+        await asyncio.sleep(0)
+        self.pause()
+        await stopping
+
+    async def emergency(self) -> None:
+        """Stop the motion now and give everything up: nobody is asked, nothing is brought upright."""
+        stopping = asyncio.create_task(self.stop_arm())
+        await asyncio.sleep(0)
+        self.pause()
+        await asyncio.gather(stopping, self.give_up())
+
+    async def stop_arm(self) -> None:
+        """Past everything that waits for it."""
+        laboratory: object = self._laboratory
+        if isinstance(laboratory, Stoppable):
+            try:
+                async with asyncio.timeout(STOP_DEADLINE):
+                    await laboratory.stop_arm()
+            except (LaboratoryError, TimeoutError) as error:
+                text = f"the arm of {self._rig.name} did not confirm that it was stopped ({error}): use its own button"
+                _log.error(text)
+                self._common.feed.tell("LogLine", {"level": "error", "text": text, "stage": ""}, self.item.id)
+
+    async def give_up(self) -> None:
+        """Told to pause already: now give up the pour as well. It is UNKNOWN if it had begun."""
+        if self._giving_up or self._task is None:
+            return
+        self._giving_up = True
+        # Two cancellations at once would count as one.
+        await asyncio.wait({self._task}, timeout=0.05)
+        if self.watching is not None:
+            noted = asyncio.ensure_future(self.watching.winding_down.wait())
+            await asyncio.wait({self._task, noted}, timeout=BETWEEN_CANCELS, return_when=asyncio.FIRST_COMPLETED)
+            noted.cancel()
+        self._task.cancel()
+
+    async def tidy(self) -> None:
+        """After a stop: what came of it so far is published as of a run that was finished."""
+
+        def work() -> None:
+            made = job_of(self._common.settings, self.item, self._rig)
+            assert self.item.run is not None
+            directory = self._common.settings.runs / self.item.run
+            if (directory / JOURNAL_NAME).is_file():
+                with JournalReader(directory / JOURNAL_NAME) as journal:
+                    result = read_result(journal, directory)
+                publish(made.plan, result)
+
+        if self.item.run is not None:
+            await asyncio.to_thread(work)
+
+    @property
+    def pours_nothing(self) -> bool:
+        """Whether it is at the desk."""
+        return self._rig.name == DESK

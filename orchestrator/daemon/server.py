@@ -1,0 +1,151 @@
+"""`decant serve`: one process that listens, runs campaigns, and ends in order when it is told to."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import uvicorn
+from pythonjsonlogger.json import JsonFormatter
+
+from orchestrator.daemon.api import serve_app
+from orchestrator.daemon.auth import Tokens
+from orchestrator.daemon.settings import Settings
+from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.errors import RunError
+
+ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+_log = logging.getLogger(__name__)
+
+
+class ServeError(RunError):
+    """The daemon can't listen; the text says why."""
+
+    exit_code = 2
+
+
+class _Server(uvicorn.Server):
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Signals are the daemon's: a pour has to be finished before anything closes."""
+        yield
+
+
+def serve(settings: Settings, ready: Callable[[str], None] = lambda url: None) -> None:
+    """Serve until told to end.
+
+    Args:
+        settings: in force.
+        ready: told the address once it is served.
+
+    Raises:
+        RunError: it can't begin: the state directory is another's, the tokens are open to others, the port is taken.
+    """
+    os.umask(0o077)
+    asyncio.run(_serve(settings, ready))
+
+
+async def _serve(settings: Settings, ready: Callable[[str], None]) -> None:
+    settings.state.mkdir(parents=True, exist_ok=True, mode=0o700)
+    tokens = Tokens(settings.tokens)
+    listening = _listen(settings)
+    try:
+        daemon = Supervisor(settings)
+    except BaseException:
+        listening.close()
+        raise
+    ending = _Ending(daemon)
+    app = serve_app(daemon, tokens, ending)
+    server = _Server(
+        uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            lifespan="off",
+            timeout_graceful_shutdown=2,
+            ssl_certfile=settings.certificate,
+            ssl_keyfile=settings.key,
+            h11_max_incomplete_event_size=65536,
+        )
+    )
+    loop = asyncio.get_running_loop()
+    for number in ENDING:
+        loop.add_signal_handler(number, ending)
+    serving = asyncio.create_task(server.serve([listening]))
+    url = _url(settings, listening)
+    settings.address.write_text(url + "\n", encoding="utf-8")
+    try:
+        await daemon.start()
+        _log.info("serving %s", url, extra={"url": url, "state": str(settings.state)})
+        ready(url)
+        await asyncio.wait({serving, asyncio.ensure_future(ending.asked.wait())}, return_when=asyncio.FIRST_COMPLETED)
+        _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
+        await daemon.close()
+    finally:
+        settings.address.unlink(missing_ok=True)
+        server.should_exit = True
+        await serving
+        for number in ENDING:
+            loop.remove_signal_handler(number)
+    _log.info("ended")
+
+
+class _Ending:
+    """Called once: end at the next safe point. Called again: give everything up."""
+
+    def __init__(self, daemon: Supervisor) -> None:
+        self._daemon = daemon
+        self.asked = asyncio.Event()
+
+    def __call__(self) -> None:
+        if self.asked.is_set():
+            self._daemon.hurry()
+        self.asked.set()
+
+
+def _listen(settings: Settings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((settings.host, settings.port))
+    except OSError as error:
+        listening.close()
+        raise ServeError(
+            f"{settings.host}:{settings.port}: can't listen there: {error.strerror}; is another daemon running? "
+            "--port names another port, 0 a free one"
+        ) from None
+    return listening
+
+
+def _url(settings: Settings, listening: socket.socket) -> str:
+    port = listening.getsockname()[1]
+    host = settings.host if settings.host not in ("0.0.0.0", "::") else socket.gethostname()
+    host = f"[{host}]" if ":" in host else host
+    return f"{'http' if settings.certificate is None else 'https'}://{host}:{port}"
+
+
+def log_lines(stream: Any = None) -> None:
+    """Structured log lines from now on: one JSON object a line, on stdout, as a service manager collects them."""
+    handler = logging.StreamHandler(stream or sys.stdout)
+    form = JsonFormatter(
+        "{asctime}{levelname}{name}{message}",
+        style="{",
+        rename_fields={"asctime": "time", "levelname": "level", "name": "from"},
+        json_ensure_ascii=False,
+    )
+    handler.setFormatter(form)
+    root = logging.getLogger()
+    root.handlers = [handler]
+    root.setLevel(logging.INFO)
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "httpx"):
+        logging.getLogger(name).setLevel(logging.WARNING)

@@ -1,0 +1,453 @@
+"""The queue and the rigs: which campaign runs where and when, and the four ways to stop.
+
+One lane a rig, and one for campaigns that need none: two never hold the same rig, and what one does keeps no other
+waiting. The simulators are shared by all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from actors.protocols import LaboratoryError
+from actors.warm import WarmSimulators
+from orchestrator.campaign import CampaignResult
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.daemon.feed import Feed
+from orchestrator.daemon.people import Asking
+from orchestrator.daemon.retention import prune_recordings
+from orchestrator.daemon.running import Common, Running
+from orchestrator.daemon.settings import DESK, Rig, Settings
+from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
+from orchestrator.errors import RunError
+from orchestrator.events import Watcher
+from orchestrator.lanes import PourUnknownError
+from orchestrator.plan import CampaignPlan
+from orchestrator.reserve import MB, free_space
+from orchestrator.unknown import OperatorNeededError
+
+RETRY = 30.0
+"""Before a lane that was kept from beginning looks again [s]."""
+
+PAUSED, EMERGENCY = "paused", "emergency"
+
+_log = logging.getLogger(__name__)
+
+Hook = Callable[[str, CampaignPlan, Path], Watcher | None]
+
+
+class RefusedError(RunError):
+    """What was asked for can't be done now; the text says why."""
+
+
+class Supervisor:
+    """Runs what was submitted.
+
+    Args:
+        settings: in force.
+        hooks: asked for another watcher of each run.
+    """
+
+    def __init__(self, settings: Settings, hooks: Sequence[Hook] = ()) -> None:
+        settings.runs.mkdir(parents=True, exist_ok=True)
+        settings.snapshots.mkdir(parents=True, exist_ok=True)
+        self.settings = settings
+        self.store = Store(settings.state / "daemon.sqlite")
+        self.feed = Feed(settings.state / "events.sqlite", settings.events, self._feed_broken)
+        self.asking = Asking(self.store, self.feed.tell)
+        self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
+        self._common = Common(settings, self.store, self.feed, self.asking, self.warm, tuple(hooks))
+        self.lanes = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
+        self.problems: dict[str, str] = {}
+        self.stopping = False
+        self.ended = asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
+        self.began = time.time()
+
+    async def start(self) -> None:
+        """Take up what was left, and begin."""
+        for item in self.store.items():
+            if item.state not in AT_REST:
+                found = f"found {item.state} after the daemon had ended without a word"
+                self.store.change(item.id, state="paused", reason=found)
+                self.feed.tell("CampaignFound", {"state": item.state, "text": found}, item.id)
+        self._tasks = [asyncio.create_task(self.feed.flushing(), name="feed")]
+        self._tasks += [asyncio.create_task(lane.work(), name=f"rig {lane.rig.name}") for lane in self.lanes.values()]
+        if self.settings.quick_start:
+            self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
+        self.feed.tell("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})
+
+    async def _warm_up(self) -> None:
+        try:
+            await self.warm.open()
+        except LaboratoryError as error:
+            self._warn(f"the simulators don't start: {error}")
+        else:
+            self.feed.tell("SimulatorsReady", {"simulators": self.warm.size})
+
+    async def close(self) -> None:
+        """Come to rest at the next safe point; cancelled or told again, at once."""
+        self.stopping = True
+        await asyncio.gather(*(lane.close() for lane in self.lanes.values()))
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.warm.close()
+        self.feed.tell("DaemonStopped", {})
+        self.feed.close()
+        self.store.close()
+
+    def hurry(self) -> None:
+        """Told to end a second time: everything is given up."""
+        for lane in self.lanes.values():
+            if lane.running is not None:
+                lane.background(lane.running.give_up())
+
+    # ---- the queue
+
+    def new_key(self) -> str:
+        """Letters that nothing else is called by."""
+        while True:
+            key = secrets.token_hex(3)
+            if not any(item.id.endswith(key) for item in self.store.items()):
+                return key
+
+    def submit(self, item: Item) -> Item:
+        """Queue a campaign whose snapshot has been checked.
+
+        Raises:
+            RefusedError: nothing new is taken.
+        """
+        self.refuse_new_work()
+        item = replace(item, place=self.store.last_place() + 1.0, created=time.time())
+        self.store.add(item)
+        self.note(item.by, "submit", item.id)
+        self.wake()
+        return item
+
+    def refuse_new_work(self) -> None:
+        """Raises RefusedError where nothing new is taken."""
+        if self.emergency is not None:
+            raise RefusedError("the emergency stop is latched; nothing is taken before somebody has cleared it")
+        if self.stopping:
+            raise RefusedError("the daemon is ending")
+
+    def item(self, key: str) -> Item:
+        """A campaign by its id, or by the beginning of one. Raises KeyError."""
+        found = self.store.item(key)
+        if found is None and len(key) >= 3:
+            similar = [one for one in self.store.items() if one.id.startswith(key)]
+            found = similar[0] if len(similar) == 1 else None
+        if found is None:
+            raise KeyError(key)
+        return found
+
+    def move(self, key: str, by: str, *, before: str | None = None, priority: int | None = None) -> Item:
+        """Give a queued campaign another place: in front of another one, at the head (''), or by its priority.
+
+        Raises:
+            KeyError: there is no such campaign.
+            RefusedError: it is not queued.
+        """
+        item = self.item(key)
+        if item.state != "queued":
+            raise RefusedError(f"{item.id} is {item.state}; only a queued campaign has a place in the queue")
+        if priority is not None:
+            self.store.change(item.id, priority=priority)
+        if before is not None:
+            queue = [one for one in self.store.items(["queued"]) if one.id != item.id]
+            at = 0 if before == "" else next((i for i, one in enumerate(queue) if one.id == self.item(before).id), None)
+            if at is None:
+                raise RefusedError(f"{before} is not in the queue")
+            level = queue[at].priority if queue else item.priority
+            behind = queue[at].place if queue else 1.0
+            ahead = queue[at - 1].place if at > 0 and queue[at - 1].priority == level else behind - 2.0
+            self.store.change(item.id, priority=level, place=0.5 * (ahead + behind))
+        self.note(by, "move", item.id)
+        self.wake()
+        return self.item(item.id)
+
+    def pause_queue(self, paused: bool, by: str) -> None:
+        """Begin no campaign from now on, or begin them again. What runs goes on."""
+        self.store.set_flag(PAUSED, {"by": by, "time": time.time()} if paused else None)
+        self.note(by, "pause queue" if paused else "resume queue")
+        self.wake()
+
+    @property
+    def queue_paused(self) -> bool:
+        """Whether no campaign is begun."""
+        return self.store.flag(PAUSED) is not None
+
+    @property
+    def emergency(self) -> dict[str, Any] | None:
+        """Who has stopped everything, and when; None: nobody."""
+        found: dict[str, Any] | None = self.store.flag(EMERGENCY)
+        return found
+
+    # ---- one campaign
+
+    def pause(self, key: str, by: str) -> Item:
+        """At the next checkpoint."""
+        return self._end(key, by, Wish.PAUSE)
+
+    def stop(self, key: str, by: str) -> Item:
+        """Finish the pour, publish what there is, and leave it at that."""
+        return self._end(key, by, Wish.STOP)
+
+    def _end(self, key: str, by: str, wish: Wish) -> Item:
+        item = self.item(key)
+        running = self._running(item)
+        if running is None and item.state in ENDED:
+            raise RefusedError(f"{item.id} is {item.state} already")
+        if running is not None:
+            running.pause()
+        self.store.change(item.id, wish=str(wish))
+        self.note(by, str(wish), item.id)
+        if running is None:
+            if item.state == "queued":
+                self.store.change(item.id, state=WITHDRAWN if wish is Wish.STOP else "paused", reason=f"by {by}")
+            elif wish is Wish.STOP:
+                self.store.change(item.id, state=STOPPED, ended=time.time(), reason=f"by {by}")
+        self.wake()
+        return self.item(item.id)
+
+    async def abort(self, key: str, by: str) -> Item:
+        """Stop the motion; see `Running.abort`."""
+        item = self.item(key)
+        running = self._running(item)
+        if running is None:
+            raise RefusedError(f"{item.id} is {item.state}: nothing of it moves")
+        stopping = asyncio.create_task(running.abort())
+        await asyncio.sleep(0)
+        self.store.change(item.id, wish=str(Wish.ABORT))
+        self.note(by, "abort", item.id)
+        await stopping
+        return self.item(item.id)
+
+    def resume(self, key: str, by: str) -> Item:
+        """Go on with a campaign that rests.
+
+        Raises:
+            RefusedError: it does not rest, or nothing new may begin.
+        """
+        item = self.item(key)
+        self.refuse_new_work()
+        if item.state in (STOPPED, WITHDRAWN) and item.run is None:
+            self.store.change(item.id, state="queued", wish=str(Wish.RUN), reason="")
+        elif self._running(item) is not None or item.state in ("queued", "finished"):
+            raise RefusedError(f"{item.id} is {item.state}; only what rests can be resumed")
+        else:
+            state = "queued" if item.run is None else "paused" if item.state == STOPPED else item.state
+            self.store.change(item.id, state=state, wish=str(Wish.RUN), ended=None)
+        self.note(by, "resume", item.id)
+        self.wake()
+        return self.item(item.id)
+
+    def _running(self, item: Item) -> Running | None:
+        lane = self.lanes.get(item.rig)
+        return lane.running if lane is not None and lane.running is not None and lane.holds(item.id) else None
+
+    def progress(self, item: Item) -> dict[str, Any] | None:
+        """Where a running campaign stands."""
+        running = self._running(item)
+        return None if running is None or running.watching is None else running.watching.progress()
+
+    # ---- all of them
+
+    async def emergency_stop(self, by: str, reason: str) -> None:
+        """Stop every arm, give up everything, and take nothing new until `clear`. The arms come first."""
+        stops = [asyncio.create_task(lane.running.emergency()) for lane in self.lanes.values() if lane.running]
+        for lane in self.lanes.values():
+            lane.latched = True
+        await asyncio.sleep(0)
+        with contextlib.suppress(RunError):  # a full disk is no reason not to stop
+            self.store.set_flag(EMERGENCY, {"by": by, "time": time.time(), "reason": reason})
+            for lane in self.lanes.values():
+                if lane.running is not None:
+                    self.store.change(lane.running.item.id, wish=str(Wish.ABORT))
+            self.note(by, "emergency stop", detail=reason)
+        await asyncio.gather(*stops, return_exceptions=True)
+
+    def clear(self, by: str) -> None:
+        """Take work again. What was given up rests until somebody resumes it."""
+        self.store.set_flag(EMERGENCY, None)
+        for lane in self.lanes.values():
+            lane.latched = False
+        self.note(by, "clear emergency stop")
+        self.wake()
+
+    # ---- small things
+
+    def wake(self) -> None:
+        """Something has changed that lanes should look at."""
+        for lane in self.lanes.values():
+            lane.wake.set()
+
+    def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
+        """Somebody did something."""
+        self.store.note(by, what, campaign, detail)
+        self.feed.tell("Deed", {"by": by, "what": what, "detail": detail}, campaign)
+        _log.info("%s: %s %s", by, what, campaign, extra={"by": by, "what": what, "campaign": campaign})
+
+    def problem(self, key: str, text: str | None) -> None:
+        """Something that people should mend, or that is mended."""
+        if text is None:
+            self.problems.pop(key, None)
+        elif self.problems.get(key) != text:
+            self.problems[key] = text
+            self._warn(text)
+
+    def _warn(self, text: str) -> None:
+        _log.warning(text)
+        self.feed.tell("LogLine", {"level": "warning", "text": text, "stage": ""})
+
+    def _feed_broken(self, text: str) -> None:
+        self.problems["events"] = text
+        _log.error(text)
+
+
+class Lane:
+    """What happens at one rig: one campaign after the other.
+
+    Args:
+        daemon: whose queue it serves.
+        rig: that campaigns lease here.
+        common: what all of them share.
+    """
+
+    def __init__(self, daemon: Supervisor, rig: Rig, common: Common) -> None:
+        self._daemon, self.rig, self._common = daemon, rig, common
+        self.running: Running | None = None
+        self.wake = asyncio.Event()
+        self.latched = daemon.emergency is not None
+        self._background: set[asyncio.Task[None]] = set()
+        self._resting = asyncio.Event()
+        self._resting.set()
+
+    def holds(self, key: str) -> bool:
+        """Whether that campaign has the rig."""
+        return self.running is not None and self.running.item.id == key
+
+    async def work(self) -> None:
+        """Until cancelled."""
+        while True:
+            self.wake.clear()
+            item = self._next()
+            if item is None:
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(RETRY):
+                        await self.wake.wait()
+                continue
+            self._resting.clear()
+            try:
+                await self._run(item)
+            finally:
+                self.running = None
+                self._resting.set()
+
+    async def close(self) -> None:
+        """Come to rest."""
+        if self.running is not None:
+            self.running.pause()
+        await self._resting.wait()
+
+    def background(self, work: Any) -> None:
+        """Do something beside."""
+        task = asyncio.ensure_future(work)
+        self._background.add(task)
+        task.add_done_callback(self._background.discard)
+
+    def _next(self) -> Item | None:
+        if self.latched or self._daemon.stopping:
+            return None
+        store = self._common.store
+        mine = [one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.wish == Wish.RUN]
+        begun = sorted(
+            (one for one in mine if one.run is not None and one.state not in ENDED), key=lambda one: one.begun or 0.0
+        )
+        queued = [one for one in mine if one.state == "queued"]
+        if self._daemon.queue_paused:
+            queued = []
+        found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.armed), None)
+        return found if found is not None and self._has_room() else None
+
+    def _has_room(self) -> bool:
+        settings = self._common.settings
+        free = free_space(settings.state)
+        text = (
+            f"{free / MB:.0f} MB are free on the disk of {settings.state}, and no campaign is begun below "
+            f"{settings.keep_free / MB:.0f} MB (keep_free): make room"
+        )
+        self._daemon.problem("disk", text if free < settings.keep_free else None)
+        return free >= settings.keep_free
+
+    async def _run(self, item: Item) -> None:
+        store, feed = self._common.store, self._common.feed
+        self.running = running = Running(self._common, item, self.rig)
+        store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), armed=False)
+        feed.tell("CampaignLeased", {"rig": self.rig.name}, item.id)
+        state, reason, wish = "failed", "", Wish.PAUSE
+        result: CampaignResult | None = None
+        try:
+            result = await running.run(self._checksum(item))
+            state, reason = "finished", ""
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise
+            state, reason, wish = self._ended_by_people(item)
+        except OperatorNeededError as error:
+            state, reason, wish = "paused", str(error), self._kept_wish(item)
+        except PourUnknownError as error:
+            state, reason, wish = "unknown", str(error), self._kept_wish(item)
+        except (RunError, LaboratoryError, ConfigError, OSError) as error:
+            needs_person = getattr(error, "exit_code", 1) == 3
+            state, reason = ("paused" if needs_person else "failed"), str(error)
+        except Exception as error:
+            state, reason = "failed", f"{type(error).__name__}: {error}"
+            _log.exception("campaign %s failed", item.id)
+        await self._leave(running, state, reason, wish)
+        if result is None and state != "finished":
+            _log.warning("campaign %s: %s: %s", item.id, state, reason, extra={"campaign": item.id})
+
+    def _checksum(self, item: Item) -> str:
+        if self.rig.source is None or self.rig.mode != "hardware":
+            return ""
+        from orchestrator.safety import accepted_checksum
+
+        return accepted_checksum(self.rig.source) or ""
+
+    def _kept_wish(self, item: Item) -> Wish:
+        """Somebody has to answer before it goes on: it goes on to ask, unless people want something else of it."""
+        found = self._common.store.item(item.id)
+        return Wish.RUN if found is None else Wish(found.wish)
+
+    def _ended_by_people(self, item: Item) -> tuple[str, str, Wish]:
+        found = self._common.store.item(item.id)
+        wish = Wish.PAUSE if found is None else Wish(found.wish)
+        state = "unknown" if found is not None and found.state == "unknown" else "paused"
+        reason = found.reason if found is not None else ""
+        return state, reason, wish
+
+    async def _leave(self, running: Running, state: str, reason: str, wish: Wish) -> None:
+        store, key = self._common.store, running.item.id
+        if wish is Wish.STOP and state != "finished":
+            state = STOPPED
+            try:
+                await running.tidy()
+            except Exception as error:  # what is in the journal is safe
+                reason = f"what came of it could not be published: {error}"
+                _log.exception("campaign %s: not published", key)
+        ended = time.time() if state in ENDED else None
+        store.change(key, state=state, reason=reason, wish=str(wish), ended=ended)
+        self._common.feed.tell("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
+        with contextlib.suppress(OSError):
+            busy = {one.running.item.run for one in self._daemon.lanes.values() if one.running is not None}
+            await asyncio.to_thread(prune_recordings, self._common.settings, {name for name in busy if name})

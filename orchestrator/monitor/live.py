@@ -1,0 +1,218 @@
+"""Campaigns watched while they run: one server for several campaigns, and any number of viewers in browsers.
+
+    with LiveView() as live:
+        print(live.url)
+        monitor = live.watcher_for(plan, directory)   # a watcher of the campaign, as any
+
+Nobody who watches can hold anything up: a campaign's events go through a bounded queue to a process that writes them
+(`monitor.RerunMonitor`), and from there to a server in a third process, which viewers are connected to.
+
+Limitations: there is no password. Who reaches the ports can look, and can send to the same server; nothing of a
+campaign can be changed through it. So it listens on this machine only, unless told otherwise.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+from urllib.parse import quote
+
+from orchestrator.errors import RunError
+from orchestrator.monitor.monitor import CAPACITY, RerunMonitor
+from orchestrator.monitor.server import environment
+from orchestrator.plan import CampaignPlan
+
+LOOPBACK = "127.0.0.1"
+
+WEB_PORT = 9090
+"""Of the viewer's page, where it is free: else the next free one."""
+
+STREAM_PORT = 9876
+"""Of the stream, likewise: Rerun's own default."""
+
+MEMORY = "512MiB"
+"""Kept for those who come late; what is older is in the recording on disk."""
+
+RECORDING = "campaign.rrd"
+"""Name of a run's recording."""
+
+_START_TIME = 40.0
+_TRIED = 100
+
+
+class LiveError(RunError):
+    """The live view can't be served; the text says why."""
+
+
+class LiveView:
+    """A Rerun server and its web viewer.
+
+    Args:
+        address: to listen on; '0.0.0.0' for all of this machine's.
+        web_port: of the viewer's page; None: `WEB_PORT`, or the next free one.
+        memory: that the server may keep, as '512MiB'.
+        shown: recordings on disk to be shown as well.
+    """
+
+    def __init__(
+        self,
+        *,
+        address: str = LOOPBACK,
+        web_port: int | None = None,
+        memory: str = MEMORY,
+        shown: tuple[Path, ...] = (),
+    ) -> None:
+        self.address, self._web_port, self._memory, self._shown = address, web_port, memory, shown
+        self._process: subprocess.Popen[bytes] | None = None
+        self._ports = (0, 0)
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def open(self) -> str:
+        """Start serving; returns when a browser may be pointed to `url`, which is also what it returns.
+
+        Raises:
+            LiveError: the port is taken, or the server does not start.
+        """
+        if self._web_port is not None and not is_free(self.address, self._web_port):
+            raise LiveError(
+                f"port {self._web_port} of {self.address} is taken, by another live view perhaps, or can't be used; "
+                "name another one, or none: then a free one is found"
+            )
+        web_port = self._web_port or free_port(self.address, WEB_PORT)
+        port = free_port(self.address, STREAM_PORT)
+        complaints = tempfile.TemporaryFile()  # noqa: SIM115 - read below, gone with this call
+        self._process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "orchestrator.monitor.server", self.address, str(port), str(web_port)),
+                *(self._memory, *(str(path.absolute()) for path in self._shown)),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=complaints,
+            env=environment(),
+            start_new_session=True,
+        )
+        self._ports = (port, web_port)
+        self._await_ports(complaints)
+        return self.url
+
+    def _await_ports(self, complaints: IO[bytes]) -> None:
+        assert self._process is not None
+        end = time.monotonic() + _START_TIME
+        wanted = list(self._ports)
+        while wanted:
+            if self._process.poll() is not None or time.monotonic() > end:
+                complaints.seek(0)
+                said = complaints.read().decode(errors="replace").strip().splitlines()
+                self.close()
+                raise LiveError(f"the live view's server does not start: {said[-1] if said else 'it says nothing'}")
+            if answers(self.host, wanted[0]):
+                wanted.pop(0)
+            else:
+                time.sleep(0.05)
+
+    @property
+    def host(self) -> str:
+        """Name of this machine for those who look from where they may: see `address`."""
+        return socket.gethostname() if self.address in ("0.0.0.0", "::") else self.address
+
+    @property
+    def stream(self) -> str:
+        """Where Rerun's own viewer connects to (`rerun --connect`), and campaigns send to."""
+        return f"rerun+http://{self.host}:{self._ports[0]}/proxy"
+
+    @property
+    def url(self) -> str:
+        """Of the viewer's page, for a browser."""
+        return f"http://{self.host}:{self._ports[1]}/?url={quote(self.stream, safe='')}"
+
+    @property
+    def server_pid(self) -> int:
+        """Of Rerun's server, whose output was not read before."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        return int(self._process.stdout.readline())
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still serves."""
+        return self._process is not None and self._process.poll() is None
+
+    def watcher_for(self, plan: CampaignPlan, run: Path, *, capacity: int = CAPACITY) -> RerunMonitor:
+        """A watcher that writes a run's recording and shows the same here. To be closed when the run has ended.
+
+        Args:
+            plan: of the campaign.
+            run: its folder.
+            capacity: events that may wait.
+
+        Raises:
+            OSError: the recording can't be written.
+        """
+        return RerunMonitor(run / RECORDING, plan, url=self.stream, capacity=capacity)
+
+    def close(self) -> None:
+        """Stop serving. Viewers keep what they have. May be called again."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with contextlib.suppress(OSError):
+            if process.stdin is not None:
+                process.stdin.close()
+        try:
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def is_free(address: str, port: int) -> bool:
+    """Whether a port can be listened on. Rerun only logs that it can't."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address, port))
+            probe.listen()
+        except (OSError, OverflowError):
+            return False
+    return True
+
+
+def free_port(address: str, first: int) -> int:
+    """The first free port from one on.
+
+    Raises:
+        LiveError: there is none near by, or the address is not this machine's.
+    """
+    for port in range(first, first + _TRIED):
+        if is_free(address, port):
+            return port
+    raise LiveError(
+        f"no port from {first} to {first + _TRIED - 1} can be listened on at {address}; is that an address of this "
+        "machine?"
+    )
+
+
+def answers(host: str, port: int) -> bool:
+    """Whether somebody listens there."""
+    try:
+        with socket.create_connection((host, port), timeout=1.0):
+            return True
+    except OSError:
+        return False

@@ -1,0 +1,95 @@
+"""Rerun's own server and web viewer, in a process that ends with the one that started it.
+
+`python -m orchestrator.monitor.server ADDRESS PORT WEB_PORT MEMORY` runs it until its input ends. It is Rerun's own
+program and not its Python package, which serves the viewer's page on all addresses, asked or not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+OPTIMISING_TIME = 120.0
+
+
+def rerun_program() -> str:
+    """Rerun's program, which its Python package brings.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    import rerun_cli  # type: ignore[import-untyped]
+
+    folder = Path(rerun_cli.__file__).parent
+    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
+    return str(bundled if bundled.exists() else folder / "rerun")
+
+
+def environment() -> dict[str, str]:
+    """For Rerun's program: a laboratory talks to nobody unasked."""
+    return os.environ | {"RERUN_ANALYTICS": "off", "RUST_LOG": "warn"}
+
+
+def run_rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run one of its commands to its end.
+
+    Raises:
+        OSError: it doesn't start, or takes longer than two minutes.
+    """
+    try:
+        return subprocess.run(
+            [rerun_program(), *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=OPTIMISING_TIME,
+            env=environment(),
+            stdin=subprocess.DEVNULL,
+        )
+    except (subprocess.TimeoutExpired, ModuleNotFoundError) as error:
+        raise OSError(str(error)) from error
+
+
+def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence[str] = ()) -> list[str]:
+    """The command that serves.
+
+    Args:
+        address: to bind to.
+        port: for streams.
+        web_port: for the viewer's page.
+        memory: that the server may keep for those who come late, as '512MiB'.
+        shown: recordings that are opened from files.
+    """
+    return [
+        *(rerun_program(), "--serve-web", "--bind", address, "--port", str(port), "--web-viewer-port", str(web_port)),
+        *("--server-memory-limit", memory, "--newest-first", *shown),
+    ]
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Serve until stdin ends."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the end of the input says when to end
+    with contextlib.suppress(OSError):
+        os.nice(5)
+    address, port, web_port, memory, *shown = arguments
+    command = serving(address, int(port), int(web_port), memory, shown)
+    process = subprocess.Popen(
+        command, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
+    )
+    print(process.pid, flush=True)
+    try:
+        while sys.stdin.buffer.read(1024):
+            pass
+    finally:
+        process.kill()
+        process.wait()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

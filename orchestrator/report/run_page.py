@@ -1,0 +1,244 @@
+"""The report of a run, finished or not: one HTML page that needs nothing beside it, `report.html`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
+from orchestrator.report.asked import what_was_asked
+from orchestrator.report.names import receiver_names
+from orchestrator.report.page import Picture, Row, Table, render
+from orchestrator.report.posterior import posterior_lines
+from orchestrator.report.record import Record
+from orchestrator.report.results import SPLITS
+from orchestrator.report.run_tables import cost_table, pour_tables, question_table, receiver_table, stage_table
+from orchestrator.report.summary import RunSummary
+from orchestrator.report.units import DISCREPANCY, deployment_unit, is_calibration, loss_of_pour
+from orchestrator.report.words import advice, standing, unknown_of_all
+from orchestrator.states import State
+
+REPORT_NAME = "report.html"
+
+MODES = {"virtual": "VIRTUAL", "hardware": "REAL", "none": "SIMULATION ONLY"}
+"""What the badge says by the bench's mode."""
+
+MOST_DECISIONS = 300
+
+_THETA_FIGURES = ("discrepancy", "posterior", "test discrepancy")
+
+_NARROW = ("test discrepancy", "spillage", "posterior")
+"""Figures that may stand side by side."""
+
+_FIGURES: dict[str, tuple[str, str]] = {
+    "discrepancy map": (
+        "Map of the discrepancy between simulated and weighed spillage over the parameters θ, with the θ that were "
+        "tried as dots and θ* as a star.",
+        "How far simulations are from the weighed pours, over θ. The star is θ*.",
+    ),
+    "discrepancy trials": (
+        "Discrepancy of every tried θ against each searched parameter.",
+        "Every θ that was tried, against each parameter.",
+    ),
+    "posterior": (
+        "Histograms of each parameter and clouds of each pair of parameters, of θ that fit the weighed pours.",
+        "θ that fit the pours. Where a cloud fills its panel, the pours say little.",
+    ),
+    "test discrepancy": (
+        "Bars: mean difference of simulated and weighed spillage for θ*, for uncalibrated and random θ, and for "
+        "regressions, on pours used for calibration and on others.",
+        "What calibration was worth: θ* beside its rivals, on pours that it was made with and on others.",
+    ),
+    "spillage": (
+        "Loss of every pour in the order made, with what was predicted of it and the best so far.",
+        "What every pour came to (dots), what was expected of it (bars, ± 2 σ), and the best so far (line).",
+    ),
+    "loss map": (
+        "Map of the expected loss over the searched actions with the pours as numbered dots and the recommended action "
+        "as a star.",
+        "What is expected of actions. Numbers are pours in their order, the star is the recommended action.",
+    ),
+    "safe window": (
+        "Loss along each dimension of the action, with the recommended action, the tolerance and the range inside "
+        "which it is kept.",
+        "How far the action may be missed before too much is spilled.",
+    ),
+    "trust": (
+        "First pours beside what simulations said of their actions.",
+        "Whether the first pours bear out the simulator.",
+    ),
+}
+"""Alt text and caption of a figure, by how its name begins."""
+
+
+def run_page(
+    plan: CampaignPlan, summary: RunSummary, record: Record, directory: Path, *, versions: Mapping[str, Any]
+) -> str:
+    """The page of a run.
+
+    Args:
+        plan: of the campaign.
+        summary: of what its closed stages learnt.
+        record: what its journal says was done.
+        directory: its folder.
+        versions: as `versions.json` has them; empty where that is missing.
+
+    Returns:
+        HTML.
+    """
+    names = receiver_names(plan)
+    said = advice(plan, summary)
+    pictures = {name: _picture(name, file) for name, file in summary.figures.items() if file.is_file()}
+    mode = plan.laboratory.mode if record.pours or plan.laboratory.pours else "none"
+    ended = _date(record.ended)
+    return render(
+        "run.html.j2",
+        title=f"{plan.name}: {directory.name}",
+        kicker=f"Report of a pouring campaign · run {directory.name}",
+        heading=plan.name,
+        mode=MODES[mode],
+        mode_look=mode,
+        state=str(record.state),
+        finished=record.state is State.FINISHED,
+        lead=f"Begun {_date(record.created)}, last entry {ended}. Seed {plan.seed}.",
+        standing=standing(record, directory.name),
+        advice=said,
+        no_advice=[] if said else _without_advice(plan, summary, record),
+        open=unknown_of_all(plan, summary, record),
+        asked=what_was_asked(plan),
+        stages=stage_table(record),
+        cost=cost_table(plan, summary, record),
+        questions=question_table(record),
+        theta=_theta_table(plan, summary),
+        theta_lines=_theta_lines(plan, summary),
+        scores=_score_table(summary),
+        theta_figures=[one for name, one in pictures.items() if name.startswith(_THETA_FIGURES)],
+        receivers=receiver_table(plan, summary),
+        figures=[one for name, one in pictures.items() if not name.startswith(_THETA_FIGURES)],
+        pours=pour_tables(plan, record, names),
+        no_pours="No pour was asked for." if not record.pours else "",
+        not_simulated=_not_simulated(summary, names),
+        settings=_settings(plan, summary, directory, versions),
+        decisions=record.decisions[-MOST_DECISIONS:],
+        notes=[(_date(when), text) for when, text in record.notes],
+        resolved=_resolved(plan),
+        footer=f"Made by Decant {dict(versions.get('packages', {})).get('decant', '')} from the run's journal.",
+    )
+
+
+def _resolved(plan: CampaignPlan) -> str:
+    """The campaign's file with everything filled in; where its runs are kept is nobody's business on a page."""
+    kept = {key: value for key, value in plan.resolved.items() if key != "outputs"}
+    return json.dumps(kept, indent=2, ensure_ascii=False) if kept else ""
+
+
+def _date(seconds: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(seconds))
+
+
+def _picture(name: str, file: Path) -> Picture:
+    alt, caption = next((texts for start, texts in _FIGURES.items() if name.startswith(start)), (name, ""))
+    return Picture.of(file, f"{name}: {alt}", caption or name, wide=not name.startswith(_NARROW))
+
+
+def _without_advice(plan: CampaignPlan, summary: RunSummary, record: Record) -> list[str]:
+    poured = [pour for pour in record.weighed if not is_calibration(plan, pour.request)]
+    if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
+        said = ["No action is recommended yet: what deployment has learnt is written down when its stage is closed."]
+        losses = {loss_of_pour(plan, p.request, m): p for p in poured if (m := p.measured) is not None}
+        known = [loss for loss in losses if loss is not None]
+        if known:
+            action = losses[min(known)].request.action.values()
+            best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
+            unit = deployment_unit(plan.deployment)
+            said.append(f"The best of {len(known)} pours so far came to {unit.text(min(known))}, with {best}.")
+        return said
+    if summary.theta is not None:
+        return [
+            "This run calibrated the simulator; it recommends no action. θ* is in theta.json, which "
+            "'decant plan CAMPAIGN --parameters' reads."
+        ]
+    return ["This run recommends no action."]
+
+
+def _theta_table(plan: CampaignPlan, summary: RunSummary) -> Table | None:
+    if summary.theta is None:
+        return None
+    calibration, posterior = plan.calibration, summary.posterior
+    axes = {} if calibration is None else {axis.name: axis for axis in calibration.parameters.axes}
+    rows = []
+    for name, value in summary.theta.model_dump().items():
+        axis = axes.get(name)
+        searched = "not searched" if axis is None else f"{style.number(axis.lower)} … {style.number(axis.upper)}"
+        region = "—"
+        if posterior is not None and name in posterior.region:
+            low, high = posterior.region[name]
+            region = f"{low:.3g} … {high:.3g}"
+            region += ", not determined" if name in posterior.open else ""
+        words = style.PARAMETER_NAMES.get(name, name.replace("_", " "))
+        rows.append(Row([words, style.display_value(name, value), region, searched]))
+    level = "" if posterior is None else f"{100 * posterior.level:.0f} % of the θ that fit"
+    return Table("θ* with its region", ["parameter", "θ*", level or "region", "searched"], rows).filled()
+
+
+def _theta_lines(plan: CampaignPlan, summary: RunSummary) -> list[str]:
+    lines = []
+    if summary.predicted_discrepancy is not None:
+        expected = DISCREPANCY.text(max(summary.predicted_discrepancy, 0.0), summary.predicted_deviation or 0.0)
+        lines.append(f"Expected {DISCREPANCY.label.rsplit(' [', 1)[0]} of θ*: {expected}.")
+    if summary.posterior is not None and plan.calibration is not None:
+        found = posterior_lines(summary.posterior, plan.calibration.parameters)
+        lines += [f"{line[:1].upper()}{line[1:]}." for line in found]
+    return lines
+
+
+def _score_table(summary: RunSummary) -> Table:
+    columns = {
+        "calibrated": "θ*",
+        "uncalibrated": "uncalibrated θ",
+        "random_theta": "random θ (median)",
+        "mean_predictor": "mean of training pours",
+        "regression": "GP regression of training pours",
+    }
+    rows = [
+        Row([SPLITS[split], *("—" if (v := row.get(name)) is None else f"{100 * v:.2f}" for name in columns)])
+        for split, row in summary.discrepancy.items()
+        if any(value is not None for value in row.values())
+    ]
+    caption = "Mean |measured − predicted| spillage [% of what was poured]: less is better"
+    return Table(caption, ["pours", *columns.values()], rows, frozenset(range(1, 6))).filled()
+
+
+def _not_simulated(summary: RunSummary, names: Mapping[str, str]) -> Table:
+    rows = [
+        Row([names.get(scene, scene), one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
+        for scene, several in summary.not_covered.items()
+        for one in several
+    ]
+    return Table("At the middle and the corners of the ranges", ["into", "what", "actions", "meaning"], rows)
+
+
+def _settings(
+    plan: CampaignPlan, summary: RunSummary, directory: Path, versions: Mapping[str, Any]
+) -> list[tuple[str, str]]:
+    packages = dict(versions.get("packages", {}))
+    found = [
+        ("campaign", Path(versions.get("campaign", plan.source)).name),
+        ("seed", str(plan.seed)),
+        ("laboratory", f"{plan.laboratory.name} ({MODES.get(plan.laboratory.mode, plan.laboratory.mode)})"),
+        ("simulations side by side", str(plan.parallel_simulations)),
+        (
+            "Python",
+            f"{versions['python']} on {versions.get('platform', '')}" if "python" in versions else "not recorded",
+        ),
+        ("packages", ", ".join(f"{k} {v}" for k, v in packages.items() if v != "not installed") or "not recorded"),
+        ("recording", "campaign.rrd, beside this page" if (directory / "campaign.rrd").is_file() else "none"),
+        ("every number", "summary.json, resolved.json, versions.json and journal.sqlite, beside this page"),
+    ]
+    if plan.deployment is not None:
+        found.insert(2, ("minimised", deployment_unit(plan.deployment).label))
+    return found if summary.figures else [*found, ("figures", "none were drawn; 'decant report' draws them")]

@@ -1,0 +1,211 @@
+"""What a run came to in plain sentences: what to do from now on, how far one may miss it, and what nobody knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from orchestrator.plan import CampaignPlan, DeploymentPlan
+from orchestrator.report import style
+from orchestrator.report.record import Record
+from orchestrator.report.results import SPLITS
+from orchestrator.report.risk import risk_line, window_line
+from orchestrator.report.summary import ReceiverSummary, RunSummary
+from orchestrator.report.trust import trust_line
+from orchestrator.report.units import DISCREPANCY, LossUnit, deployment_unit
+from orchestrator.states import State
+from orchestrator.strategies.deployment.trust import Compared
+from sim_engine.task import Scene
+
+FEW = 5
+"""Pours of an action below which their mean says little."""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What a run says about one receiver.
+
+    Attributes:
+        title: the receiver.
+        action: the dimensions that were searched, as people read them; empty where nothing is recommended.
+        fixed: the others, as the campaign has them.
+        sentences: what to do and what to expect of it.
+        window: how far the action may be missed, or that nobody knows.
+        open: what nobody knows.
+    """
+
+    title: str
+    action: dict[str, str]
+    fixed: dict[str, str]
+    sentences: list[str]
+    window: str
+    open: list[str]
+
+
+def advice(plan: CampaignPlan, summary: RunSummary) -> list[Advice]:
+    """One for each receiver that a deployment learnt about."""
+    if plan.deployment is None:
+        return []
+    scenes = {scene.name: scene for scene in plan.deployment.scenes}
+    unit = deployment_unit(plan.deployment)
+    return [_of(plan.deployment, scenes.get(name), row, unit) for name, row in summary.receivers.items()]
+
+
+def _of(deployment: DeploymentPlan, scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice:
+    if row.best_action_si is None:
+        why = row.gave_up or "nothing was learnt that an action could be chosen by"
+        return Advice(row.receiver, {}, {}, [f"No action is recommended: {why}."], "", _open(row, unit))
+    chosen: dict[str, float | None] = dict(row.best_action_si)
+    action, fixed = _shown(chosen), {} if scene is None else _shown(scene.fixed)
+    window, open_points = "", _open(row, unit)
+    if row.window is not None:
+        window = _sentence(window_line(row.window, unit))
+    else:
+        window = (
+            "No safe window was looked for: nobody has checked how far this action may be missed. D1 looks for one "
+            "where the campaign has 'window: {tolerance: …}'."
+        )
+    if ends := style.at_ends(chosen, deployment.actions.axes):
+        open_points.insert(0, f"Better actions may lie beyond what was searched: {', '.join(ends)}.")
+    return Advice(row.receiver, action, fixed, _sentences(scene, row, unit), window, open_points)
+
+
+def _shown(values: Mapping[str, float | None]) -> dict[str, str]:
+    return {name.replace("_", " "): style.display_value(name, v).replace("_", " ") for name, v in values.items()}
+
+
+def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> list[str]:
+    load = "" if scene is None else f" {1e3 * scene.liquid.mass:.0f} g of {scene.liquid.name}"
+    cup = "" if scene is None else f" from {scene.pourer.name}"
+    said = [f"To pour{load}{cup} into {row.receiver}, use the action below."]
+    measure = unit.label.rsplit(" [", 1)[0]
+    if row.predicted_loss is not None:
+        mean = unit.text(max(row.predicted_loss, 0.0), row.predicted_deviation)
+        scatter = unit.scatter(row.predicted_scatter).removeprefix(", a pour ")
+        said.append(f"Expect {measure} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
+    if row.prediction is not None and "spillage" in row.prediction:
+        seeds = row.prediction["spillage"]
+        said.append(
+            f"Simulated again with {seeds.count} fresh seeds, {seeds.percent(2)} of what left the pourer was spilled."
+        )
+    if row.confirmed is not None and row.confirmed.loss is not None:
+        loss = row.confirmed.loss
+        times = "once more" if loss.count == 1 else f"{loss.count} more times"
+        said.append(f"Poured {times} after it was chosen, it came to {unit.text(loss.mean, loss.deviation)}.")
+    if row.best_loss is not None:
+        best = f"The best of {row.pours} weighed pours came to {unit.text(row.best_loss)} (pour {row.best_pour})"
+        said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
+    if row.risk is not None:
+        said.append(_sentence(risk_line(row.risk, unit)))
+    return said
+
+
+def _open(row: ReceiverSummary, unit: LossUnit) -> list[str]:
+    said = []
+    if (alarm := trust_line(row.trust)) is not None:
+        said.append(_sentence(alarm))
+    if isinstance(row.trust, Compared) and row.trust.better:
+        said.append(
+            "The first pours came out better than simulated, by more than the simulations' scatter explains: the "
+            "simulator is wrong here, if on the safe side."
+        )
+    poured_again = 0 if row.confirmed is None or row.confirmed.loss is None else row.confirmed.loss.count
+    if not row.pours and not poured_again:
+        said.append("Nothing was poured into this receiver: what is expected of the action is simulated, not weighed.")
+    elif not poured_again:
+        said.append(
+            "The recommended action was not poured again after it was chosen ('confirm' in the campaign does that): "
+            "what is expected of it is a model's word."
+        )
+    elif poured_again < FEW:
+        pours = "one pour" if poured_again == 1 else f"{poured_again} pours"
+        said.append(f"What it comes to is known from {pours} of it; that many say little about how much pours differ.")
+    if row.failed_pours:
+        why = "; ".join(row.failures)
+        said.append(f"{row.failed_pours} of its pours failed{f' ({why})' if why else ''}: nobody weighed them.")
+    if row.risk is None:
+        said.append("Errors of grip, placement and speed entered only as far as they happened in these pours.")
+    said += [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
+    return said
+
+
+def unknown_of_all(plan: CampaignPlan, summary: RunSummary, record: Record) -> list[str]:
+    """What nobody knows after this run, whatever the receiver."""
+    said = []
+    if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
+        said.append(
+            "The bench was VIRTUAL: no robot moved and no liquid was weighed. What the hidden liquid of that bench did "
+            "is another simulation's word, and a real cup may behave otherwise."
+        )
+    if summary.theta is not None:
+        said += _about_theta(summary)
+    elif plan.calibration is None:
+        said.append("The simulator was not calibrated in this run: its parameters were taken as the campaign has them.")
+    liquids = {scene.liquid.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
+    if liquids:
+        said.append(
+            f"All of this holds for {', '.join(sorted(liquids))}, this load, these vessels and what the campaign "
+            "fixes of the motion. For other ones, plan anew."
+        )
+    if summary.dropped_events:
+        said.append(f"The recording lacks {summary.dropped_events} events, because it could not keep up.")
+    return said
+
+
+def _about_theta(summary: RunSummary) -> list[str]:
+    said = []
+    if summary.posterior is None:
+        said.append("Which other θ fit the weighed pours as well was not asked: θ* may be one of many.")
+    elif summary.posterior.open:
+        names = ", ".join(name.replace("_", " ") for name in summary.posterior.open)
+        said.append(f"The pours don't determine {names}: nearly all of what was searched fits them as well as θ*.")
+    unseen = [
+        f"{DISCREPANCY.text(own)} on {SPLITS[split]}"
+        for split, row in summary.discrepancy.items()
+        if split != "train" and (own := row.get("calibrated")) is not None
+    ]
+    if unseen:
+        said.append(
+            f"On pours that calibration did not see, the simulator's spillage was off by {' and '.join(unseen)} in the "
+            "mean."
+        )
+    elif summary.discrepancy:
+        said.append("The calibrated simulator was not scored on pours that calibration did not see.")
+    return said
+
+
+def standing(record: Record, run: str) -> list[str]:
+    """Where an unfinished run stands, and what to do about it; empty for a finished one.
+
+    Args:
+        run: its folder's name.
+    """
+    state = record.state
+    if state is State.FINISHED:
+        return []
+    again = f"the command that began it, with '--resume --run {run}' added"
+    said = [f"This run is not finished. Its state is '{state}'{f': {record.reason}' if record.reason else ''}."]
+    unknown = [f"pour {pour.request.number} of {pour.stage}" for pour in record.unknown_pours]
+    if unknown:
+        said.append(
+            f"{' and '.join(unknown).capitalize()} had begun, and nobody has said what came of it. It is not repeated "
+            "by software. Whoever can, weighs what was spilled and what is left in the pourer, and answers on resuming."
+        )
+    said += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
+    match state:
+        case State.FAILED:
+            said.append(f"What is done is kept. Mend what is named above, then go on by {again}.")
+        case State.PAUSED | State.UNKNOWN:
+            said.append(f"What is done is kept. Go on by {again}.")
+        case State.QUEUED:
+            said.append("Nothing was started yet.")
+        case _:
+            said.append(
+                "When this page was made a process had the run, or had died with it without a word: the page shows "
+                f"what the journal held at that moment. If nothing runs any more, go on by {again}."
+            )
+    return said
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."

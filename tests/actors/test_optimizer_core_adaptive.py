@@ -1,0 +1,157 @@
+"""Averaging over the ways in which a simulator can be wrong, and pours chosen by what they lose on the way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from actors.optimizer.core.mismatch import Displacement, Limit, Mismatch, Play
+from actors.optimizer.core.problem import Data, SuggestProblem
+from actors.optimizer.core.propose import propose
+from orchestrator.codec import canonical, from_json, to_json
+from sim_engine.space import Axis, Space
+
+PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
+PLAY = (Play(shift=0.14), Play(factor=0.05, origin=0.2))
+ASK = tuple((x, y) for x in (0.15, 0.4, 0.65, 0.9) for y in (0.1, 0.35, 0.6, 0.85))
+MOVED = (0.12, 0.0)
+
+
+def data_of(points, costs) -> Data:
+    return Data(tuple(tuple(map(float, p)) for p in points), tuple(map(float, costs)))
+
+
+def cup(points):
+    """Nothing lost in a valley, all far from it."""
+    radius = np.linalg.norm(np.atleast_2d(points) - (0.35, 0.6), axis=1)
+    return 1.0 - np.exp(-((6.0 * np.maximum(radius - 0.08, 0.0)) ** 1.5))
+
+
+def displaced(points):
+    """What a simulator says that sees the receiver elsewhere."""
+    return cup(np.atleast_2d(points) - MOVED)
+
+
+def asked(simulator, poured, mean="adaptive", **changes):
+    """A question after 60 simulations and some pours."""
+    simulated = np.random.default_rng(1).random((60, 2))
+    problem = SuggestProblem(
+        PLANE,
+        data_of(poured, cup(poured)) if len(poured) else Data(),
+        mean=mean,
+        simulated=data_of(simulated, simulator(simulated)),
+        mismatch=Mismatch(PLAY, left=10) if mean == "adaptive" else None,
+    )
+    return replace(problem, **changes)
+
+
+def error(answer):
+    return float(np.sqrt(np.mean((np.array(answer.predictions) - cup(ASK)) ** 2)))
+
+
+POURED = [(0.47, 0.6), (0.3, 0.75), (0.42, 0.45), (0.2, 0.5)]
+
+
+def test_pours_tell_by_how_much_the_receiver_is_displaced():
+    answer = propose(asked(displaced, POURED, count=0, predict_at=ASK))
+    found = answer.mismatch
+    assert found.shifts[0] == pytest.approx(MOVED[0], abs=2.5 * found.deviations[0])
+    assert found.deviations[0] < 0.5 * PLAY[0].shift
+    scaled = propose(asked(displaced, POURED, "scaled", count=0, predict_at=ASK))
+    assert error(answer) < 0.6 * error(scaled)
+
+
+def test_ignorance_grows_by_pours_that_no_displacement_explains_and_shrinks_by_those_that_are_as_simulated():
+    poured = [(0.9, 0.1), (0.1, 0.1), (0.35, 0.6), (0.9, 0.9), (0.6, 0.3)]
+    right = propose(asked(cup, poured, count=0)).mismatch
+    wrong = propose(asked(lambda x: 1.0 - 0.8 * cup(x), poured, count=0)).mismatch
+    before = propose(asked(cup, [], count=0)).mismatch
+    assert before.ignorance == pytest.approx(0.08)
+    assert right.ignorance < 0.02
+    assert wrong.ignorance > 0.9
+
+
+def test_with_something_good_in_hand_no_unknown_corner_is_tried():
+    poured = [*POURED, (0.35, 0.6)]
+    careful = propose(asked(cup, poured, acquisition="least_loss"))
+    daring = propose(asked(cup, poured, "constant", acquisition="lcb", plain=True))
+    assert cup(careful.points[0])[0] < 0.02 < cup(daring.points[0])[0]
+    assert careful.mismatch.gain < 0.02
+
+
+def test_with_nothing_in_hand_the_pours_that_follow_make_it_worth_looking_elsewhere():
+    poured = [(0.1, 0.1), (0.9, 0.1)]
+    wrong = asked(lambda x: 1.0 - 0.8 * cup(x), poured, acquisition="least_loss")
+    last = propose(replace(wrong, mismatch=replace(wrong.mismatch, left=0)))
+    first = propose(wrong)
+    assert first.mismatch.gain > 0.1
+    assert first.deviations[0] > last.deviations[0]
+
+
+def test_a_limit_is_kept_where_any_action_keeps_it_and_told_where_none_does():
+    limit = Limit(0.1, 0.05)
+    question = asked(displaced, [*POURED, (0.35, 0.6)], acquisition="least_loss")
+    kept = propose(replace(question, mismatch=replace(question.mismatch, limit=limit))).mismatch
+    assert kept.least_exceedance <= kept.exceedances[0] <= limit.probability
+    hopeless = asked(lambda x: 1.0 - 0.8 * cup(x), [(0.1, 0.1)], acquisition="least_loss")
+    told = propose(replace(hopeless, mismatch=replace(hopeless.mismatch, limit=limit))).mismatch
+    assert told.least_exceedance > limit.probability
+
+
+def test_simulations_beside_a_pour_are_made_around_what_is_in_doubt():
+    answer = propose(asked(displaced, POURED, acquisition="least_loss", count=4))
+    beside = np.array(answer.points[1:])
+    assert len({tuple(p) for p in beside}) == 3
+    assert np.all((beside >= 0.0) & (beside <= 1.0))
+
+
+def test_what_was_learnt_with_one_receiver_makes_the_first_prediction_for_the_next_better():
+    learnt = propose(asked(displaced, POURED, count=0)).mismatch.drawn
+    assert len(learnt) == 64
+    assert isinstance(learnt[0], Displacement)
+    fresh = asked(displaced, [], count=0, predict_at=ASK)
+    told = replace(fresh, mismatch=replace(fresh.mismatch, drawn=learnt))
+    assert error(propose(told)) < 0.9 * error(propose(fresh))
+
+
+def test_the_order_of_what_is_known_changes_no_bit():
+    question = asked(displaced, POURED, acquisition="least_loss", count=3)
+    turned = replace(
+        question,
+        data=Data(question.data.points[::-1], question.data.costs[::-1]),
+        simulated=Data(question.simulated.points[::-1], question.simulated.costs[::-1]),
+    )
+    first, second = propose(question), propose(turned)
+    assert replace(first, seconds=0.0) == replace(second, seconds=0.0)
+
+
+def test_question_and_answer_survive_the_journal():
+    question = asked(displaced, POURED, acquisition="least_loss", count=2)
+    assert from_json(to_json(question, SuggestProblem), SuggestProblem) == question
+    answer = propose(question)
+    text = canonical(to_json(answer, type(answer)))
+    assert canonical(to_json(from_json(to_json(answer, type(answer)), type(answer)), type(answer))) == text
+
+
+def test_a_cost_in_another_unit_is_the_same_question():
+    question = asked(displaced, POURED, acquisition="least_loss", count=1, seed=3)
+    grams = replace(
+        question,
+        data=Data(question.data.points, tuple(200.0 * c for c in question.data.costs)),
+        simulated=Data(question.simulated.points, tuple(200.0 * c for c in question.simulated.costs)),
+        mismatch=replace(question.mismatch, worst=200.0),
+    )
+    assert propose(grams).means[0] == pytest.approx(200.0 * propose(question).means[0], rel=0.05, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"mismatch": None}, "needs a mismatch"),
+        ({"mismatch": Mismatch(PLAY[:1])}, "axes"),
+        ({"mean": "scaled", "mismatch": Mismatch(PLAY)}, "no other mean"),
+    ],
+)
+def test_a_question_that_makes_no_sense_is_refused(changes, text):
+    with pytest.raises(ValueError, match=text):
+        propose(asked(displaced, POURED, **changes))

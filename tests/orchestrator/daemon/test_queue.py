@@ -1,0 +1,122 @@
+"""The queue of a running daemon: order, priorities, pauses, several rigs, and what was submitted staying as it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from orchestrator.config.load import load_laboratory
+from orchestrator.daemon.settings import Rig
+from tests.orchestrator.daemon.served import HeldLaboratory, campaign_in, held, run, serving
+
+
+def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            first, second = await served.submit(), await served.submit()
+            found = await served.until(second, "finished")
+            assert found["summary"]["pours"] == 3
+            assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
+            before = await served.get(f"/campaigns/{first}")
+            assert before["state"] == "finished"
+            assert before["ended"] <= found["begun"]
+            assert before["run"] != found["run"]
+
+    run(work())
+
+
+def test_higher_priorities_come_first_and_people_may_change_the_order(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            await served.post("/queue/pause")
+            a, b, c = [await served.submit() for _ in range(3)]
+            d = await served.submit(priority=5)
+
+            async def order() -> list[str]:
+                return [one["id"] for one in await served.get("/campaigns", state="queued")]
+
+            assert await order() == [d, a, b, c]
+            await served.post(f"/campaigns/{c}/move", {"before": b})
+            assert await order() == [d, a, c, b]
+            await served.post(f"/campaigns/{b}/move", {"before": ""})
+            assert await order() == [b, d, a, c]
+            await served.post(f"/campaigns/{a}/move", {"priority": 9})
+            assert await order() == [a, b, d, c]
+            assert not served.laboratories
+            await served.post(f"/campaigns/{d}/stop")
+            await served.post("/queue/resume")
+            for one in (a, b, c):
+                await served.until(one, "finished")
+            begun = [(await served.get(f"/campaigns/{one}"))["begun"] for one in (a, b, c)]
+            assert begun[0] < begun[1] < begun[2]
+            assert (await served.get(f"/campaigns/{d}"))["state"] == "withdrawn"
+
+    run(work())
+
+
+def test_a_queued_campaign_is_what_it_was_when_it_was_submitted(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            await served.post("/queue/pause")
+            key = await served.submit()
+            for path in tmp_path.glob("*.yaml"):
+                path.write_text("changed: later\n")
+            await served.post("/queue/resume")
+            assert (await served.until(key, "finished", "failed"))["state"] == "finished"
+
+    run(work())
+
+
+def test_the_queue_outlives_the_daemon(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            await served.post("/queue/pause")
+            keys = [await served.submit(), await served.submit(priority=1)]
+        async with serving(tmp_path) as served:
+            assert (await served.get("/status"))["queue_paused"]
+            assert [one["id"] for one in await served.get("/campaigns")] == [keys[1], keys[0]]
+            await served.post("/queue/resume")
+            for key in keys:
+                await served.until(key, "finished")
+
+    run(work())
+
+
+def test_two_campaigns_never_hold_the_same_rig_and_two_rigs_pour_at_once(tmp_path: Path) -> None:
+    laboratory = tmp_path / "numbers.yaml"
+    laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
+    spec = load_laboratory(laboratory)
+    rigs = (Rig("left", laboratory, spec), Rig("right", laboratory, spec))
+
+    async def work() -> None:
+        async with serving(tmp_path, held, rigs=rigs) as served:
+            keys = [await served.submit(rig=rig) for rig in ("left", "left", "right")]
+            await served.until(keys[2], "running")
+            await served.until(keys[0], "running")
+            assert (await served.get(f"/campaigns/{keys[1]}"))["state"] == "queued"
+            holders = {rig["name"]: rig["campaign"] for rig in await served.get("/rigs")}
+            assert holders == {"left": keys[0], "right": keys[2], "desk": None}
+            assert len(served.laboratories) == 2
+            for one in served.laboratories:
+                one.bench.go.set()
+            await served.until(keys[1], "running")
+            served.laboratories[-1].bench.go.set()
+            for key in keys:
+                await served.until(key, "finished")
+
+    run(work())
+
+
+def test_a_campaign_for_no_rig_there_is_is_refused_with_those_there_are(tmp_path: Path) -> None:
+    campaign_in(tmp_path)
+
+    async def work() -> None:
+        async with serving(tmp_path, HeldLaboratory) as served:
+            from orchestrator.config.load import load_campaign
+            from orchestrator.daemon.packing import pack
+
+            text, files = pack(load_campaign(served.campaign))
+            told = await served.post("/campaigns", {"text": text, "files": files, "rig": "lefft"}, status=422)
+            assert told["detail"] == "there is no rig 'lefft'; there are virtual"
+            assert not list((tmp_path / "state/campaigns").iterdir())
+
+    run(work())

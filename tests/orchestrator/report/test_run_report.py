@@ -1,0 +1,269 @@
+"""The report of a run: everything on one page, nothing beside it, honest about what is not finished or not known."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import shlex
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from typer.testing import CliRunner
+
+from actors.optimizer.actor import Proposer
+from actors.protocols import LaboratoryError
+from orchestrator.campaign import CampaignResult, run_campaign
+from orchestrator.cli import app
+from orchestrator.commands.interrupted import report_of_what_stands
+from orchestrator.config.load import load_campaign
+from orchestrator.errors import RunError
+from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.plan import CampaignPlan
+from orchestrator.publish import Published, publish, summary_of
+from orchestrator.report import style
+from orchestrator.report.record import read_record
+from orchestrator.report.run_page import run_page
+from orchestrator.runs import create_run
+from tests.end_to_end.small import CAMPAIGN, write_campaign
+from tests.orchestrator.toy import ToyBench, ToyLaboratory
+
+SCRIPT = "<script>alert(1)</script>"
+
+
+class Made(NamedTuple):
+    """A campaign that was run in a world whose spillage is a formula."""
+
+    plan: CampaignPlan
+    result: CampaignResult
+    published: Published
+
+    @property
+    def page(self) -> str:
+        assert self.published.report is not None
+        return self.published.report.read_text(encoding="utf-8")
+
+
+class Asked:
+    """The optimiser itself, in this process, until it is broken."""
+
+    def __init__(self, broken: Callable[[], bool] = lambda: False) -> None:
+        self.broken = broken
+
+    async def suggest(self, problem: Any) -> Any:
+        if self.broken():
+            raise LaboratoryError("a cable came off <b>")
+        return Proposer().suggest(problem)
+
+
+def laboratory(bench: ToyBench | None = None, optimizer: Asked | None = None) -> ToyLaboratory:
+    return ToyLaboratory(bench=bench or ToyBench(), optimizer=optimizer or Asked())  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    plan = load_campaign(write_campaign(tmp_path_factory.mktemp("report")))
+    result = asyncio.run(run_campaign(plan, laboratory(), create_run(plan)))
+    return Made(plan, result, publish(plan, result))
+
+
+def texts(page: str) -> str:
+    """What a reader sees."""
+    import html
+
+    body = re.sub(r"<(style|pre)>.*?</\1>", "", page, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
+
+
+def decant(command: str) -> Any:
+    return CliRunner().invoke(app, shlex.split(command))
+
+
+def test_the_page_needs_nothing_beside_it(made: Made) -> None:
+    assert made.page.startswith("<!doctype html>")
+    assert not re.search(r'(?:src|href)="(?!data:)', made.page)
+    assert not re.search(r"url\(|@import|<script|<link", made.page)
+    assert made.page.count('src="data:image/svg+xml') == len(made.published.figures) > 3
+
+
+def test_every_figure_is_there_as_lines_for_print(made: Made) -> None:
+    assert all(
+        path.with_suffix(".svg").read_text("utf-8").count("<path") > 10 for path in made.published.figures.values()
+    )
+
+
+def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
+    def drawn(folder: Path) -> bytes:
+        figure, axes = style.new_figure(size=(3.0, 2.0))
+        axes.plot([0, 1], [1, 0], "o")
+        with style.also_as(".svg", ".pdf"):
+            style.save(figure, folder / "line.png")
+        return b"".join((folder / f"line.{kind}").read_bytes() for kind in ("png", "svg", "pdf"))
+
+    assert drawn(tmp_path / "first") == drawn(tmp_path / "second")
+
+
+def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> None:
+    said, row = texts(made.page), next(iter(made.published.summary.receivers.values()))
+    assert row.best_action_si is not None
+    assert f"{row.best_action_si['x_offset'] * 1e3:.3g} mm" in said
+    assert "To pour 100 g of water from beaker into narrow, use the action below." in said
+    assert "No safe window was looked for" in said
+    assert "The recommended action was not poured again" in said
+    assert "The bench was VIRTUAL: no robot moved and no liquid was weighed." in said
+    assert "θ* with its region" in said
+    assert "5 begun, 5 weighed" in said
+
+
+def test_every_pour_stands_in_a_table_with_its_grams(made: Made) -> None:
+    with JournalReader(made.result.directory / JOURNAL_NAME) as journal:
+        pours = read_record(journal).pours
+    assert len(pours) == 5
+    said = texts(made.page)
+    for pour in pours:
+        assert pour.measured is not None
+        assert f" {1e3 * pour.measured.loaded:.1f} {1e3 * pour.measured.spilled:.1f} " in said
+    grams = sum(1e3 * pour.measured.spilled for pour in pours if pour.measured is not None)
+    assert f"{grams:.1f} g spilled" in said
+
+
+def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
+    plan = replace(made.plan, name=SCRIPT, resolved={"name": SCRIPT})
+    assert plan.deployment is not None
+    named = {"name": SCRIPT}
+    scenes = [
+        replace(one, receiver=one.receiver.model_copy(update=named), liquid=one.liquid.model_copy(update=named))
+        for one in plan.deployment.scenes
+    ]
+    plan = replace(plan, deployment=replace(plan.deployment, scenes=tuple(scenes)))
+    with JournalReader(made.result.directory / JOURNAL_NAME) as journal:
+        record = read_record(journal)
+    record.pours[0].came, record.pours[0].reason = "failed", SCRIPT
+    record.notes.append((0.0, SCRIPT))
+    record.decisions.append((SCRIPT, SCRIPT))
+    summary = summary_of(plan, made.result, {f"loss map {SCRIPT}": made.published.figures["discrepancy map"]})
+    page = run_page(plan, summary, record, Path(SCRIPT), versions={"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}})
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;") > 10
+
+
+class Outline(HTMLParser):
+    """Headings, pictures and tables as a screen reader meets them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.levels: list[int] = []
+        self.missing: list[str] = []
+        self.tables = self.captions = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if re.fullmatch(r"h[1-6]", tag):
+            self.levels.append(int(tag[1]))
+        if tag == "img" and len(given.get("alt") or "") < 20:
+            self.missing.append(f"an alt text: {given.get('alt')}")
+        if tag == "html" and given.get("lang") != "en":
+            self.missing.append("the language")
+        if tag == "th" and given.get("scope") not in ("col", "row"):
+            self.missing.append("a scope")
+        self.tables += tag == "table"
+        self.captions += tag == "caption"
+
+
+def test_a_screen_reader_finds_its_way(made: Made) -> None:
+    outline = Outline()
+    outline.feed(made.page)
+    assert outline.missing == []
+    assert outline.levels[0] == 1
+    assert outline.levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in zip(outline.levels, outline.levels[1:], strict=False))
+    assert outline.tables == outline.captions > 5
+
+
+def stopped(folder: Path, bench: ToyBench, when: Callable[[], bool]) -> Path:
+    """Folder of a run that was asked to stop twice, as soon as something is so: what is under way is given up."""
+    plan = load_campaign(write_campaign(folder))
+    directory = create_run(plan)
+
+    async def run() -> None:
+        task = asyncio.ensure_future(run_campaign(plan, laboratory(bench), directory))
+        while not when() and not task.done():
+            await asyncio.sleep(0.01)
+        for _ in range(2):
+            task.cancel()
+            await asyncio.sleep(0.05)
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(run())
+    return directory
+
+
+def test_a_pour_that_nobody_knows_of_is_called_so_and_its_liquid_is_not_made_up(tmp_path: Path) -> None:
+    begun: list[float] = []
+
+    def pause() -> float:
+        begun.append(60.0 if begun else 0.0)
+        return begun[-1]
+
+    directory = stopped(tmp_path, ToyBench(pause), lambda: len(begun) == 2)
+    done = decant(f"report {directory}")
+    assert done.exit_code == 0, done.output
+    said = texts((directory / "report.html").read_text(encoding="utf-8"))
+    assert "This run is not finished. Its state is 'unknown'" in said
+    assert "Pour 2 of pours had begun, and nobody has said what came of it." in said
+    assert "2 begun, 1 weighed, 1 of unknown outcome" in said
+    assert f"--resume --run {directory.name}" in said
+    assert "It is not repeated by software" in said
+
+
+def test_a_failed_run_says_why_and_what_stands(tmp_path: Path) -> None:
+    plan = load_campaign(write_campaign(tmp_path))
+    bench, directory = ToyBench(), create_run(plan)
+    calls = iter(range(1, 100))
+    bench.fails = lambda seed: LaboratoryError("the hose came off") if next(calls) == 4 else None
+    with pytest.raises(RunError, match="cable"):
+        asyncio.run(run_campaign(plan, laboratory(bench, Asked(lambda: len(bench.poured) == 4)), directory))
+    page = report_of_what_stands(plan, directory)
+    assert page is not None
+    said = texts(page.read_text(encoding="utf-8"))
+    assert "Its state is 'failed'" in said
+    assert "a cable came off <b>" in said
+    assert "failed: the hose came off" in said
+    assert "The best of 1 pours so far came to" in said
+    assert "θ* with its region" in said, "calibration was closed before"
+
+
+def test_a_run_of_another_campaign_is_not_reported_as_this_one(made: Made, tmp_path: Path) -> None:
+    other = load_campaign(write_campaign(tmp_path, CAMPAIGN.replace("100 g", "90 g")))
+    assert report_of_what_stands(other, made.result.directory) is None
+    assert report_of_what_stands(made.plan, tmp_path) is None
+
+
+def test_the_verb_writes_where_it_is_told_and_figures_for_latex(made: Made, tmp_path: Path) -> None:
+    page = tmp_path / "meeting.html"
+    done = decant(f"report {made.result.directory} --pdf -o {page} --json")
+    assert done.exit_code == 0, done.output
+    assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
+    for file in made.published.figures.values():
+        assert file.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [("nothing", "runs/nothing: neither a run nor a study is here"), ("{run} -o page.txt", "should end in .html")],
+)
+def test_the_verb_refuses_what_it_can_not_report_on(made: Made, argument: str, said: str) -> None:
+    done = decant(f"report {argument.format(run=made.result.directory)}")
+    assert done.exit_code == 2
+    assert said in done.output
+
+
+def test_the_library_writes_it_too(made: Made, tmp_path: Path) -> None:
+    import decant as library
+
+    page = library.open_run(made.result.directory).report(tmp_path / "page.html")
+    assert texts(page.read_text(encoding="utf-8")) == texts(made.page)

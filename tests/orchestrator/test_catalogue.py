@@ -1,0 +1,276 @@
+"""The catalogue of runs: what is found in it, and that it is right whatever happened to the runs or to itself."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import os
+import shlex
+import shutil
+import signal
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from orchestrator.catalogue import registry
+from orchestrator.catalogue.columns import POURS, RUNS
+from orchestrator.catalogue.index import INDEX_NAME, Catalogue
+from orchestrator.catalogue.search import Search, find_pours, find_runs, moment
+from orchestrator.cli import app
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.runs import create_run
+from orchestrator.state_directory import VARIABLE, state_directory
+from tests.orchestrator.killed import die_at, run
+from tests.orchestrator.toy import ToyLaboratory, ToySimulators, toy_plan
+
+
+@pytest.fixture
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A state directory of its own; runs are made beside it."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "state"))
+    monkeypatch.setattr(registry, "_said", False)
+    return tmp_path / "state"
+
+
+def made(tmp_path: Path, **changes: Any) -> Path:
+    """A run of the toy campaign, from beginning to end."""
+    plan = toy_plan(tmp_path / "runs", **changes)
+    directory = create_run(plan)
+    run(directory, plan=plan)
+    return directory
+
+
+def killed(tmp_path: Path, at: Kind) -> Path:
+    """A run whose process died right after an entry of that kind was written."""
+    for point in range(10, 60):
+        directory = create_run(toy_plan(tmp_path / "runs"))
+        if (child := os.fork()) == 0:
+            die_at(point, after_commit=True)
+            run(directory)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+        assert os.WTERMSIG(status) == signal.SIGKILL
+        with JournalReader(directory / JOURNAL_NAME) as journal:
+            *_, last = journal.entries()
+        if last.kind == at:
+            return directory
+        shutil.rmtree(directory)
+    raise AssertionError(f"no run ended in {at}")
+
+
+def asked(table: str = "run", **conditions: Any) -> list[dict[str, Any]]:
+    with Catalogue() as catalogue:
+        catalogue.refresh()
+        return (find_runs if table == "run" else find_pours)(catalogue, Search(**conditions))
+
+
+def invoke(command: str) -> Any:
+    return CliRunner().invoke(app, shlex.split(command), env={"COLUMNS": "200"})
+
+
+def test_a_run_and_its_pours_are_found_as_they_were_weighed(tmp_path: Path, state: Path) -> None:
+    directory = made(tmp_path)
+    (found,) = asked(receiver="CUP", liquid="water", strategy="D3", mode="virtual")
+    assert (found["run"], found["state"], found["pours"]) == (directory.name, "finished", 4)
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        weighed = [e.body["outcome"]["measurement"]["spilled"] for e in journal.entries(kinds=[Kind.POUR_FINISHED])]
+    pours = asked("pour", receiver="c?p", pourer="beaker")
+    assert [pour["spilled_g"] for pour in pours] == pytest.approx([1e3 * mass for mass in weighed])
+    assert all(15 <= pour["angular_velocity_deg_s"] <= 120 and pour["height_mm"] == 30 for pour in pours)
+    assert pours[0]["loss"] == pytest.approx((weighed[0] + 0.001) / 0.2)  # (spilled + retained) / loaded
+    assert not asked("pour", receiver="bowl")
+
+
+def test_runs_are_found_by_when_they_were_made(tmp_path: Path, state: Path) -> None:
+    made(tmp_path)
+    now = time.time()
+    assert asked(since=now - 60, until=now + 60)
+    assert not asked(until=now - 60)
+    assert not asked("pour", since=now + 60)
+
+
+@pytest.mark.parametrize(
+    ("text", "end", "means"),
+    [
+        ("2030-03-01", False, datetime(2030, 3, 1)),
+        ("2030-03-01", True, datetime(2030, 3, 2)),
+        ("2030-12", True, datetime(2031, 1, 1)),
+        ("2030", True, datetime(2031, 1, 1)),
+        ("2030-03-01 14:30", True, datetime(2030, 3, 1, 14, 31)),
+        ("2d", False, datetime(2030, 3, 8, 12)),
+    ],
+)
+def test_dates_are_read_as_people_mean_them(text: str, end: bool, means: datetime) -> None:
+    assert moment(text, end=end, now=datetime(2030, 3, 10, 12)) == means.timestamp()
+
+
+def test_an_index_that_is_lost_damaged_or_of_another_version_is_made_anew(tmp_path: Path, state: Path) -> None:
+    made(tmp_path)
+    before = asked()
+    index = state / INDEX_NAME
+    for harm in (index.unlink, lambda: index.write_bytes(b"not a database" * 400)):
+        harm()
+        assert asked() == before
+    with Catalogue() as catalogue:
+        catalogue._connection.execute("pragma user_version = 77")
+        catalogue._connection.execute("alter table run drop column seed")
+    assert asked() == before
+
+
+def test_a_run_that_goes_on_is_read_again(tmp_path: Path, state: Path) -> None:
+    directory = killed(tmp_path, Kind.FINISHED)
+    before = asked()[0]
+    assert before["state"] == "interrupted"
+    run(directory, plan=toy_plan(tmp_path / "runs"), resume=True)
+    after = asked()[0]
+    assert (after["state"], after["pours"]) == ("finished", 4)
+    assert asked(state="finished")
+    assert not asked(state="interrupted")
+
+
+def test_a_pour_without_outcome_is_in_the_catalogue_too(tmp_path: Path, state: Path) -> None:
+    killed(tmp_path, Kind.POUR_STARTED)
+    *_, last = asked("pour")
+    assert (last["outcome"], last["spilled_g"]) == ("open", None)
+    assert asked()[0]["open_pours"] == 1
+
+
+def test_a_run_is_running_while_its_process_lives(tmp_path: Path, state: Path) -> None:
+    seen: list[str] = []
+
+    def pause() -> float:
+        seen.append(asked()[0]["state"])
+        return 0.0
+
+    plan = toy_plan(tmp_path / "runs")
+    run(create_run(plan), ToyLaboratory(ToySimulators(pause)), plan=plan)
+    assert set(seen) == {"running"}
+
+
+def test_a_state_directory_that_cannot_be_written_is_said_once_and_stops_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, state: Path
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "state"))
+    with caplog.at_level(logging.WARNING):
+        first, second = made(tmp_path), made(tmp_path)
+    assert (first / JOURNAL_NAME).is_file()
+    assert (second / JOURNAL_NAME).is_file()
+    (line,) = [record.getMessage() for record in caplog.records if "catalogue" in record.getMessage()]
+    assert f"decant runs add {first}" in line
+    result = invoke("runs")
+    assert (result.exit_code, "the runs are read anew each time" in result.stderr) == (0, True)
+    assert invoke(f"runs add {first}").exit_code == 2
+
+
+def test_runs_of_elsewhere_are_entered_and_a_moved_one_is_known_once_with_its_remarks(
+    tmp_path: Path, state: Path
+) -> None:
+    directory = made(tmp_path)
+    assert invoke(f"runs tag {directory.name} good").exit_code == 0
+    assert "1 note" in invoke(f"runs note {directory.name} 'the tray was wet'").stdout
+    shutil.move(tmp_path / "runs", tmp_path / "elsewhere")
+    gone = invoke("runs list")
+    assert directory.name in gone.stdout
+    assert "not where it was" in gone.stderr
+    result = invoke(f"runs add {tmp_path / 'elsewhere'}")
+    assert (result.exit_code, result.stdout) == (0, "1 run entered, or known already\n")
+    (found,) = asked(words=("WET",), tag="good")
+    assert found["path"] == str(tmp_path / "elsewhere" / directory.name)
+
+
+def test_what_cannot_be_read_is_said_and_hides_nothing_else(tmp_path: Path, state: Path) -> None:
+    bad, good = made(tmp_path), made(tmp_path)
+    for file in bad.glob("journal.sqlite*"):
+        file.write_bytes(b"rubbish" * 1000)
+    result = invoke("runs list")
+    assert good.name in result.stdout
+    assert f"{bad / JOURNAL_NAME}: not a journal of Decant" in result.stderr
+    shutil.rmtree(bad)
+    assert invoke("runs rebuild").stdout == "1 run in the catalogue\n"
+
+
+def test_one_command_says_which_action_was_used_for_a_vessel_and_what_it_spilled(tmp_path: Path, state: Path) -> None:
+    directory = made(tmp_path)
+    today = datetime.now().strftime("%Y-%m-%d")
+    shown = invoke(f"runs pours --receiver cup --since {today} --until {today}").stdout
+    for pour in asked("pour"):
+        (line,) = [
+            x for x in shown.splitlines() if f"{pour['angular_velocity_deg_s']:.4g} " in x and directory.name in x
+        ]
+        assert f"{pour['x_offset_mm']:.4g} " in line
+        assert f"{pour['spilled_g']:.1f} " in line
+        assert "VIRTUAL" in line
+    told = json.loads(invoke("runs pours --receiver cup --json").stdout)
+    assert [pour["spilled_g"] for pour in told["pours"]] == [pour["spilled_g"] for pour in asked("pour")]
+
+
+def test_runs_side_by_side_differ_in_what_was_asked_differently(tmp_path: Path, state: Path) -> None:
+    one, other = made(tmp_path), made(tmp_path, seed=8)
+    result = json.loads(invoke(f"runs compare {one.name} {other.name} --json").stdout)
+    assert result["settings"] == {"seed": [7, 8]}
+    assert [outcome["pours"] for outcome in result["outcomes"]] == [4, 4]
+    assert "seed" in invoke(f"runs compare {one.name} {other.name}").stdout
+
+
+def test_exports_hold_everything_and_say_what_it_means(tmp_path: Path, state: Path) -> None:
+    made(tmp_path)
+    folder = tmp_path / "table"
+    assert invoke(f"runs export {folder}").exit_code == 0
+    parquet = pq.read_table(folder / "pours.parquet")
+    with (folder / "pours.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert parquet["spilled_g"].to_pylist() == [float(line["spilled_g"]) for line in lines]
+    assert parquet["time"].to_pylist()[0].isoformat(timespec="milliseconds") == lines[0]["time"]
+    assert parquet.schema.field("spilled_g").metadata[b"unit"] == b"g"
+    with (folder / "dictionary.csv").open() as file:
+        explained = {(line["table"], line["column"]): line["meaning"] for line in csv.DictReader(file)}
+    assert set(explained) == {("runs", c.name) for c in RUNS} | {("pours", c.name) for c in POURS}
+    assert all(explained.values())
+    assert pq.read_table(folder / "runs.parquet")["receiver"].to_pylist() == [["cup"]]
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("runs list --since yesterday", "'yesterday' is not a date: write 2030-03-01"),
+        ("runs list --mode maybe", "mode 'maybe' is not one of virtual, real, hardware"),
+        ("runs show nothing", "nothing: no such run in the catalogue"),
+        ("runs add nowhere", "nowhere: is not a folder"),
+        ("runs compare one", "comparing takes two runs or more"),
+        ("runs export x --format xls", "--format xls: should be csv or parquet"),
+    ],
+)
+def test_bad_input_is_one_clear_error(command: str, says: str, state: Path) -> None:
+    result = invoke(command)
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_run_is_named_by_as_much_as_makes_it_clear(tmp_path: Path, state: Path) -> None:
+    one, other = made(tmp_path), made(tmp_path)
+    unclear = invoke("runs show toy")
+    assert unclear.exit_code == 2
+    assert str(one) in unclear.stderr
+    assert str(other) in unclear.stderr
+    assert str(one) in invoke(f"runs show {one}").stdout
+
+
+def test_the_state_directory_is_where_its_variables_say(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in (VARIABLE, "STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert state_directory() == tmp_path / ".local/state/decant"
+    monkeypatch.setenv("XDG_STATE_HOME", "/xdg")
+    assert state_directory() == Path("/xdg/decant")
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/decant:/other")
+    assert state_directory() == Path("/var/lib/decant")
+    monkeypatch.setenv(VARIABLE, "/mine")
+    assert state_directory() == Path("/mine")

@@ -1,0 +1,128 @@
+"""A live view shows everything to everybody who looks, early or late, and nobody who looks is in anybody's way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from orchestrator.commands.live import live_view, parsed
+from orchestrator.commands.speaking import RefusalError
+from orchestrator.events import LogLine
+from orchestrator.monitor.live import LiveError, LiveView, answers
+from orchestrator.monitor.monitor import RerunMonitor
+from tests.orchestrator import watched
+from tests.orchestrator.late_viewer import seen, viewer
+from tests.orchestrator.recorded import Contents
+from tests.patience import PATIENCE
+
+
+def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
+    plan = watched.campaign()
+    with LiveView() as live:
+        with urllib.request.urlopen(live.url, timeout=60.0) as page:
+            assert b"<html" in page.read().lower()
+        monitor = live.watcher_for(plan, tmp_path)
+        for event in watched.events(plan):
+            monitor(event)
+        with viewer(live.stream, tmp_path / "seen.rrd"):
+            contents = seen(tmp_path / "seen.rrd", lambda c: c.rows("/pours/narrow_cup/measured") == 3)
+        assert contents.values("/scene/receiver/mesh", "Mesh3D:vertex_positions")
+        assert monitor.close(PATIENCE)
+        with viewer(live.stream, tmp_path / "after.rrd"):
+            seen(tmp_path / "after.rrd", lambda c: ["ended: finished"] in c.values("/events/campaign", "TextLog:text"))
+    assert (monitor.failed, monitor.dropped) == (0, 0)
+    # what is on disk is complete, whoever looked
+    assert Contents(monitor.path).rows("/pours/narrow_cup/measured") == 3
+
+
+def test_two_campaigns_are_served_side_by_side(tmp_path: Path) -> None:
+    plan = watched.campaign(pours=1)
+    with LiveView() as live:
+        monitors = [live.watcher_for(plan, tmp_path / name) for name in ("first", "second")]
+        for monitor in monitors:
+            for event in watched.events(plan):
+                monitor(event)
+        with viewer(live.stream, tmp_path / "seen.rrd"):
+            seen(tmp_path / "seen.rrd", lambda c: c.rows("/pours/narrow_cup/measured") == 2)
+        assert all(monitor.close(PATIENCE) for monitor in monitors)
+
+
+def test_live_view_listens_on_this_machine_only() -> None:
+    with LiveView() as live:
+        listening = {
+            line.split()[1]
+            for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
+            if line.split()[3] == "0A" and int(line.split()[1].split(":")[1], 16) in live._ports
+        }
+        assert len(listening) == 2
+        assert all(address.startswith("0100007F:") for address in listening)
+
+
+def test_taken_port_is_refused_where_it_was_asked_for_and_passed_over_otherwise() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(LiveError, match=f"port {port} of 127.0.0.1 is taken"):
+            LiveView(web_port=port).open()
+        with pytest.raises(RefusalError, match=f"port {port} is taken"):
+            live_view(watched.campaign(), live=False, at=f"127.0.0.1:{port}")
+    with LiveView() as one, LiveView() as other:
+        assert not {*one._ports} & {*other._ports}
+
+
+def test_address_that_is_not_one_is_refused_with_what_would_be_right() -> None:
+    assert parsed("0.0.0.0") == ("0.0.0.0", None)
+    assert parsed("[::1]:9000") == ("::1", 9000)
+    for wrong in ("9090:", "a b", "127.0.0.1:99999"):
+        with pytest.raises(RefusalError, match="write ADDRESS or ADDRESS:PORT"):
+            parsed(wrong)
+
+
+@pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGSTOP])
+def test_server_that_dies_or_hangs_costs_the_recording_nothing(tmp_path: Path, death: signal.Signals) -> None:
+    plan = watched.campaign(pours=1)
+    with LiveView() as live:
+        monitor = live.watcher_for(plan, tmp_path)
+        monitor(LogLine(level="info", text="before"))
+        pid = live.server_pid
+        os.kill(pid, death)
+        for event in watched.events(plan):
+            monitor(event)
+        assert monitor.close(PATIENCE)
+        if death == signal.SIGSTOP:
+            os.kill(pid, signal.SIGCONT)
+    assert Contents(monitor.path).rows("/pours/narrow_cup/measured") == 1
+
+
+@pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGSTOP])
+def test_writer_that_dies_or_hangs_never_holds_up_the_campaign(tmp_path: Path, death: signal.Signals) -> None:
+    plan = watched.campaign(pours=1)
+    monitor = RerunMonitor(tmp_path / "campaign.rrd", plan, capacity=50)
+    os.kill(monitor.pid, death)
+    told = list(watched.events(plan))
+    begin = time.monotonic()
+    for _ in range(200):
+        for event in told:
+            monitor(event)
+    assert time.monotonic() - begin < 5.0
+    assert monitor.dropped + monitor.failed > 100, "what is missing is counted"
+    assert not monitor.close(2.0)
+
+
+def test_nothing_is_left_behind_when_a_live_view_ends() -> None:
+    live = LiveView()
+    live.open()
+    ports, host = live._ports, live.host
+    live.close()
+    live.close()
+    end = time.monotonic() + PATIENCE
+    while any(answers(host, port) for port in ports):
+        assert time.monotonic() < end
+        time.sleep(0.1)
