@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb, vessel_verb
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -339,6 +339,7 @@ def physics(
 
 
 daemon_verbs.register(app)
+vessel_verb.register(app)
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ SMALLEST, LARGEST = 0.030, 0.400
 CRUMB = 0.02
 """Share of the surface below which a loose part is a crumb."""
 
-HOLE = 0.25
+HOLE = 0.6
 """Share of the longest boundary below which an edge is a hole to be closed, where the mesh is a sheet."""
 
 
@@ -76,7 +76,7 @@ def mended(path: Path, *, unit: LengthUnit | None, wall: float | None) -> Mended
     if len(mesh.faces) > MOST_FACES:
         raise VesselError(f"{path.name}: {len(mesh.faces):,} triangles; simplify it to at most {MOST_FACES:,}")
     notes: list[str] = []
-    found = unit or _unit(float(np.max(mesh.extents)), path)
+    found = unit or likely_unit(float(np.max(mesh.extents)), path)
     if unit is None:
         notes.append(
             f"its numbers are taken for {found}: it is {1e3 * UNITS[found] * np.max(mesh.extents):.0f} mm large"
@@ -96,7 +96,16 @@ def mended(path: Path, *, unit: LengthUnit | None, wall: float | None) -> Mended
     return Mended(vertices, faces, found, tuple(notes))
 
 
-def _unit(extent: float, path: Path) -> LengthUnit:
+def likely_unit(extent: float, path: Path) -> LengthUnit:
+    """The unit in which a vessel's numbers make sense.
+
+    Args:
+        extent: largest extent of it, in that unit.
+        path: of its file, for messages.
+
+    Raises:
+        VesselError: none does, or several do.
+    """
     fitting: list[LengthUnit] = [u for u in ("mm", "cm", "m", "in") if SMALLEST <= extent * UNITS[u] <= LARGEST]
     if len(fitting) == 1:
         return fitting[0]
@@ -226,7 +235,7 @@ def _thickened(mesh: Any, wall: float) -> Any:
     faces = [np.asarray(mesh.faces)[:, ::-1], np.asarray(mesh.faces) + count]
     for loop in _boundaries(mesh):
         after = np.roll(loop, -1)
-        faces += [np.column_stack([loop, after, after + count]), np.column_stack([loop, after + count, loop + count])]
+        faces += [np.column_stack([after, loop, loop + count]), np.column_stack([after, loop + count, after + count])]
     return trimesh.Trimesh(np.vstack([inner, outer]), np.vstack(faces), process=False)
 
 

@@ -97,6 +97,7 @@ class Outline:
         covariance: of the radii, shape (k, k) [m²].
         wall, floor: thickness [m].
         fits: of all evidence.
+        height_deviation: standard deviation of the height of the rim [m].
     """
 
     heights: Floats
@@ -105,6 +106,7 @@ class Outline:
     wall: float
     floor: float
     fits: tuple[Fit, ...]
+    height_deviation: float = 0.0
 
     @property
     def deviations(self) -> Floats:
@@ -121,7 +123,8 @@ class Outline:
     def capacity_deviation(self) -> float:
         """Standard deviation of the brimful volume [m³]."""
         slope = _jacobian(lambda radii: volume_below(self.heights, radii, self.heights[-1:]), self.radii)[0]
-        return float(np.sqrt(slope @ self.covariance @ slope))
+        rim = np.pi * self.radii[-1] ** 2 * self.height_deviation
+        return float(np.sqrt(slope @ self.covariance @ slope + rim**2))
 
     @property
     def radius_deviation(self) -> float:
@@ -137,7 +140,9 @@ class Outline:
         return ProfileShape(inner=tuple((float(r), float(z)) for r, z in points), wall=self.wall, floor=self.floor)
 
 
-def find_outline(height: float, evidence: Sequence[Evidence], wall: float, floor: float) -> Outline:
+def find_outline(
+    height: float, evidence: Sequence[Evidence], wall: float, floor: float, *, height_deviation: float = 3e-4
+) -> Outline:
     """The most likely profile given everything that was measured.
 
     Where the measurements scatter more than they were said to, the uncertainty grows accordingly.
@@ -147,6 +152,7 @@ def find_outline(height: float, evidence: Sequence[Evidence], wall: float, floor
         evidence: at least one piece.
         wall: thickness of the wall [m].
         floor: thickness of the floor [m].
+        height_deviation: standard deviation of the height [m].
 
     Raises:
         VesselError: nothing was measured, or nothing fits it.
@@ -169,7 +175,7 @@ def find_outline(height: float, evidence: Sequence[Evidence], wall: float, floor
     )
     excess = float(found.residual @ found.residual) / max(len(observed) - found.determined, 1.0)
     fits = tuple(_fits(evidence, found.residual))
-    return Outline(heights, found.radii, found.covariance * max(excess, 1.0), wall, floor, fits)
+    return Outline(heights, found.radii, found.covariance * max(excess, 1.0), wall, floor, fits, height_deviation)
 
 
 @dataclass(frozen=True)

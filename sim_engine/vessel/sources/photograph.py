@@ -25,6 +25,9 @@ Floats = NDArray[np.float64]
 LOPSIDED = 0.02
 """Largest difference of a row's two halves from those of the mean row, as a share of the width: more is a handle."""
 
+UPRIGHT = 5e-4
+"""Slope of an axis that passes for upright."""
+
 LEAST_ROWS = 60
 """Rows that a silhouette needs."""
 
@@ -45,19 +48,16 @@ class Silhouette:
     Attributes:
         heights: above the underside, ascending, shape (n,) [m].
         radii: outer, shape (n,) [m].
+        height: from the underside to the rim [m].
         pixel: its size [m].
         lean: of the axis from the picture's vertical [rad].
     """
 
     heights: Floats
     radii: Floats
+    height: float
     pixel: float
     lean: float
-
-    @property
-    def height(self) -> float:
-        """From the underside to the rim [m]."""
-        return float(self.heights[-1])
 
 
 def silhouette(grey: Floats, known: Literal["height", "width"], length: float) -> Silhouette:
@@ -72,12 +72,52 @@ def silhouette(grey: Floats, known: Literal["height", "width"], length: float) -
         VesselError: there is no single turned vessel that stands out.
     """
     from scipy import ndimage
+
+    left, right = _cut_out(grey)
+    rows = np.arange(len(left))
+    within = slice(len(rows) // 8, -(len(rows) // 8))
+    lean = float(np.polyfit(rows[within], ((left + right) / 2.0)[within], 1)[0])
+    if abs(lean) > UPRIGHT:  # corners of a leaning silhouette belong to rows that they should not be in
+        turned = ndimage.rotate(grey, -np.degrees(np.arctan(lean)), reshape=False, order=1, mode="nearest")
+        left, right = _cut_out(turned)
+        rows = np.arange(len(left))
+    middle = float(np.median((left + right) / 2.0))
+    halves = np.column_stack([middle - left, right - middle])
+    _check_turned(halves)
+    radii: Floats = np.asarray(halves.mean(axis=1)[::-1], dtype=np.float64)
+    heights: Floats = np.asarray(rows + 0.5, dtype=np.float64)
+    pixel = length / (len(rows) if known == "height" else 2.0 * radii.max())
+    return Silhouette(heights * pixel, radii * pixel, len(rows) * pixel, float(pixel), float(np.arctan(lean)))
+
+
+def _check_turned(halves: Floats) -> None:
+    """Refuse a silhouette with a handle or a spout.
+
+    Args:
+        halves: widths to the left and right of the axis, rows from the top, shape (n, 2) [pixels].
+    """
+    from scipy import ndimage
+
+    margin = len(halves) // 20
+    crooked = ndimage.median_filter(np.abs(halves[:, 1] - halves[:, 0]) / 2.0, 5)[margin : len(halves) - margin]
+    worst = int(np.argmax(crooked))
+    if crooked[worst] > max(LOPSIDED * 2.0 * halves.mean(axis=1).max(), 2.0 * PIXEL):
+        share = 1.0 - (worst + margin) / len(halves)
+        raise VesselError(
+            f"the silhouette is not the same on both sides, most at {share:.0%} of its height: this is for turned "
+            "vessels. Turn a handle or a spout out of sight, or use a mesh or points of all sides"
+        )
+
+
+def _cut_out(grey: Floats) -> tuple[Floats, Floats]:
+    """Columns of a silhouette's left and right edges, rows from the top, (n,) each."""
+    from scipy import ndimage
     from skimage.filters import threshold_otsu
 
     border = np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]])
     if np.ptp(grey) < 1e-6:
         raise VesselError("the photograph shows nothing: it has one brightness all over")
-    level = float(threshold_otsu(grey))  # type: ignore[no-untyped-call]
+    level = float(threshold_otsu(grey))
     dark = float(np.median(border)) > level
     inside = grey < level if dark else grey > level
     labels, count = ndimage.label(inside)
@@ -94,22 +134,7 @@ def silhouette(grey: Floats, known: Literal["height", "width"], length: float) -
             f"the vessel is only {len(rows)} pixels high; at least {LEAST_ROWS} are needed: go nearer, or use a larger "
             "picture"
         )
-    left, right = _edges(grey, body, rows, level)
-    lean, middle = np.polyfit(rows, (left + right) / 2.0, 1)
-    halves = np.column_stack([middle + lean * rows - left, right - middle - lean * rows])
-    crooked = np.abs(halves[:, 1] - halves[:, 0]) / 2.0
-    worst = int(np.argmax(ndimage.median_filter(crooked, 5)))
-    if crooked[worst] > max(LOPSIDED * 2.0 * halves.mean(axis=1).max(), 2.0 * PIXEL):
-        share = 1.0 - (rows[worst] - rows[0]) / (rows[-1] - rows[0])
-        raise VesselError(
-            f"the silhouette is not the same on both sides, most at {share:.0%} of its height: this is for turned "
-            "vessels. Turn a handle or a spout out of sight, or use a mesh or points of all sides"
-        )
-    upright = float(np.cos(np.arctan(lean)))
-    heights = (rows[-1] + 0.5 - rows[::-1]) / upright
-    radii = halves.mean(axis=1)[::-1] * upright
-    pixel = length / (heights[-1] + 0.5 if known == "height" else 2.0 * radii.max())
-    return Silhouette(heights * pixel, radii * pixel, float(pixel), float(np.arctan(lean)))
+    return _edges(grey, body, rows, level)
 
 
 def _edges(grey: Floats, body: NDArray[np.bool_], rows: NDArray[np.int64], level: float) -> tuple[Floats, Floats]:

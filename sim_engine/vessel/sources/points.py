@@ -9,7 +9,6 @@ vessel stands roughly upright. Points of the table have to be cut away beforehan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -111,9 +110,9 @@ def scan_of(points: Floats, surface: Literal["auto", "inner", "outer"] = "auto")
         """Mean scatter of the layers' radii, in shares of the size, after a shift and a lean."""
         return _scatter(_moved(of, values, size)) / size
 
-    def sought(start: Sequence[float], of: Floats, step: float) -> Any:
+    def sought(start: Any, of: Floats, step: float) -> Any:
         simplex = np.vstack([start, np.asarray(start) + step * np.eye(4)])
-        options = {"xatol": 1e-5, "fatol": 1e-8, "initial_simplex": simplex}
+        options: Any = {"xatol": 1e-5, "fatol": 1e-8, "initial_simplex": simplex}
         return minimize(spread, start, args=(of,), method="Nelder-Mead", options=options)
 
     # a cloud from one side has its axis behind it: begin at several places
@@ -128,6 +127,11 @@ def scan_of(points: Floats, surface: Literal["auto", "inner", "outer"] = "auto")
     layers, seen = _layers(moved, surface)
     if len(layers) < LAYERS // 4:
         raise VesselError("the points don't lie around an axis; is the vessel upright in them, and alone?")
+    if len(layers) < 0.75 * LAYERS and seen == "both":
+        raise VesselError(
+            f"inner and outer surface can be told apart at only {len(layers)} of {LAYERS} heights: cut a handle away, "
+            "or give the points of one surface"
+        )
     scatter = float(np.median([layer.scatter for layer in layers]))
     return Scan(moved, high - low, tuple(layers), scatter, _out_of_round(moved, layers), seen)
 
@@ -228,7 +232,7 @@ def _out_of_round(points: Floats, layers: list[Layer]) -> float:
         if len(part) >= 12:
             means.append(float(part.mean()))
             errors.append(float(part.var()) / len(part))
-    return float(np.sqrt(max(np.var(means) - np.mean(errors), 0.0))) if len(means) >= 4 else 0.0
+    return float(np.sqrt(max(float(np.var(means) - np.mean(errors)), 0.0))) if len(means) >= 4 else 0.0
 
 
 def radii_of(scan: Scan, wall: float, floor: float) -> Radii:
