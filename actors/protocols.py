@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from sim_engine.outcome import PourMeasurement
-from sim_engine.simulated import SimulatedPour
+from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.task import PourTask, Scene
 
 
@@ -84,12 +84,20 @@ class PourProgress:
         fraction: 0 … 1 of the whole pour.
         tilt: of the pourer [rad], if known.
         balance: last reading [kg], if known.
+        stable: whether the balance says that it is at rest, if known.
+        joints: of the arm as last measured [rad]; empty where it doesn't tell.
+        pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; empty likewise.
+        liquid: particles of this pour, told once by a virtual bench. Nobody who learns sees them.
     """
 
     checkpoint: str
     fraction: float
     tilt: float | None = None
     balance: float | None = None
+    stable: bool | None = None
+    joints: tuple[float, ...] = ()
+    pourer: tuple[float, ...] = ()
+    liquid: RecordedFrames | None = None
 
 
 ProgressCallback = Callable[[PourProgress], None]

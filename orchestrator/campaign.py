@@ -110,31 +110,24 @@ def _patience(plan: CampaignPlan) -> Deadlines:
     return replace(usual, pour_grace=max(usual.pour_grace, laboratory.operator.deadline))
 
 
+@dataclass
 class _Run:
     """One process' part of a campaign's run."""
 
-    def __init__(
-        self,
-        plan: CampaignPlan,
-        laboratory: Laboratory,
-        directory: Path,
-        watchers: Watchers,
-        ask_operator: AskOperator | None,
-        stages: tuple[StageDefinition, ...],
-        deadlines: Deadlines,
-    ) -> None:
-        self._plan = plan
-        self._laboratory = laboratory
-        self._directory = directory
-        self._watchers = watchers
-        self._ask_operator = ask_operator
-        self._stages = stages
-        self._deadlines = deadlines
-        self._scenes = scenes_of(plan)
+    _plan: CampaignPlan
+    _laboratory: Laboratory
+    _directory: Path
+    _watchers: Watchers
+    _ask_operator: AskOperator | None
+    _stages: tuple[StageDefinition, ...]
+    _deadlines: Deadlines
+
+    def __post_init__(self) -> None:
+        self._scenes = scenes_of(self._plan)
         self._state = State.QUEUED
         self._unknown_pours = False
         self._begin = time.monotonic()
-        names = [stage.name for stage in stages]
+        names = [stage.name for stage in self._stages]
         if not names or len(set(names)) != len(names):
             raise RunError(f"a campaign needs stages with different names, got: {', '.join(names) or 'none'}")
 

@@ -61,93 +61,62 @@ def decant(
     """What stands before the verbs."""
 
 
-@app.command(
-    epilog=examples(
-        "decant run configs/campaigns/quickstart.yaml",
-        "decant run configs/campaigns/quickstart.yaml --live   # open the printed address in a browser",
-        "decant run my.yaml --resume   # after a stop, a crash or a power cut; nothing finished is done again",
-    )
-)
-def run(
-    campaign: Campaign,
-    resume: Resume = False,
-    run_id: RunId = None,
-    answer: Answer = None,
-    in_process: InProcess = False,
-    arm: Arm = False,
-    live: Live = False,
-    live_at: LiveAt = None,
-    laboratory: OtherLaboratory = None,
-    seed: Seed = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> None:
+def _campaign_verb(name: str, text: str, *lines: str) -> None:
+    """Add a verb that runs a campaign, or a part of one: all have the same options."""
+
+    def verb(
+        campaign: Campaign,
+        resume: Resume = False,
+        run_id: RunId = None,
+        answer: Answer = None,
+        in_process: InProcess = False,
+        arm: Arm = False,
+        live: Live = False,
+        live_at: LiveAt = None,
+        laboratory: OtherLaboratory = None,
+        seed: Seed = None,
+        as_json: Json = False,
+        quiet: Quiet = False,
+    ) -> None:
+        from orchestrator.commands import campaigns
+
+        options = campaigns.RunOptions(
+            resume=resume,
+            run_id=run_id,
+            answer=answer,
+            in_process=in_process,
+            laboratory=laboratory,
+            seed=seed,
+            as_json=as_json,
+            armed=arm,
+            live=live,
+            live_at=live_at,
+        )
+        call(getattr(campaigns, name), campaign, options)
+
+    app.command(name, help=text, epilog=examples(*lines))(verb)
+
+
+_campaign_verb(
+    "run",
     """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/.
 
-    Ctrl-C pauses: a pour that has begun is finished and weighed first. `--resume` goes on where it stopped.
-    """
-    from orchestrator.commands import campaigns
-
-    call(
-        campaigns.run,
-        campaign,
-        campaigns.RunOptions(
-            resume=resume,
-            run_id=run_id,
-            answer=answer,
-            in_process=in_process,
-            laboratory=laboratory,
-            seed=seed,
-            as_json=as_json,
-            armed=arm,
-            live=live,
-            live_at=live_at,
-        ),
-    )
-
-
-@app.command(
-    epilog=examples(
-        "decant calibrate configs/campaigns/recorded.yaml --json",
-        "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",
-    )
+Ctrl-C pauses: a pour that has begun is finished and weighed first. `--resume` goes on where it stopped.
+""",
+    "decant run configs/campaigns/quickstart.yaml",
+    "decant run configs/campaigns/quickstart.yaml --live   # open the printed address in a browser",
+    "decant run my.yaml --resume   # after a stop, a crash or a power cut; nothing finished is done again",
 )
-def calibrate(
-    campaign: Campaign,
-    resume: Resume = False,
-    run_id: RunId = None,
-    answer: Answer = None,
-    in_process: InProcess = False,
-    arm: Arm = False,
-    live: Live = False,
-    live_at: LiveAt = None,
-    laboratory: OtherLaboratory = None,
-    seed: Seed = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> None:
+
+_campaign_verb(
+    "calibrate",
     """Only calibrate: find the θ whose simulated spills match the weighed ones (C1 to C4), scored on unseen pours.
 
-    θ* goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
-    """
-    from orchestrator.commands import campaigns
-
-    call(
-        campaigns.calibrate,
-        campaign,
-        campaigns.RunOptions(
-            resume=resume,
-            run_id=run_id,
-            answer=answer,
-            in_process=in_process,
-            laboratory=laboratory,
-            seed=seed,
-            as_json=as_json,
-            armed=arm,
-            live=live,
-            live_at=live_at,
-        ),
-    )
+θ* goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
+""",
+    "decant calibrate configs/campaigns/recorded.yaml --json",
+    "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",
+)
 
 
 @app.command(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
 from orchestrator.strategies.deployment.objectives import Objectives
-from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings
+from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings, StrategySettings
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, Loss
@@ -101,11 +101,30 @@ class NormalPrior:
 
 
 @dataclass(frozen=True)
-class CalibrationPlan:
-    """Which θ_s reproduces the weighed spills.
+class StagePlan:
+    """What all plans for one strategy have in common.
 
     Attributes:
         settings: which strategy, and its own settings.
+    """
+
+    settings: StrategySettings
+
+    @property
+    def strategy(self) -> str:
+        """Name of the strategy."""
+        return self.settings.strategy
+
+    def with_settings(self, **changes: Any) -> Self:
+        """The plan with other settings of the same strategy."""
+        return replace(self, settings=self.settings.model_copy(update=changes))
+
+
+@dataclass(frozen=True)
+class CalibrationPlan(StagePlan):
+    """Which θ_s reproduces the weighed spills.
+
+    Attributes:
         actions: space in which calibration pours are designed and the prior g draws.
         parameters: searched θ_s.
         fixed_parameters: θ_s values that are not searched.
@@ -134,15 +153,6 @@ class CalibrationPlan:
     parameter_prior: tuple[NormalPrior, ...] = ()
 
     @property
-    def strategy(self) -> str:
-        """Name of the strategy."""
-        return self.settings.strategy
-
-    def with_settings(self, **changes: Any) -> Self:
-        """The plan with other settings of the same strategy."""
-        return replace(self, settings=self.settings.model_copy(update=changes))
-
-    @property
     def simulations(self) -> int:
         """Single simulated pours that the strategy may spend; of pours still to be made some may be lost."""
         records = self.records
@@ -152,11 +162,10 @@ class CalibrationPlan:
 
 
 @dataclass(frozen=True)
-class DeploymentPlan:
+class DeploymentPlan(StagePlan):
     """How to pour into vessels that calibration never saw.
 
     Attributes:
-        settings: which strategy, and its own settings.
         scenes: one per receiver.
         actions: searched action space.
         data: pours of before the campaign.
@@ -176,15 +185,6 @@ class DeploymentPlan:
     constraints: tuple[Linear, ...] = ()
     confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
-
-    @property
-    def strategy(self) -> str:
-        """Name of the strategy."""
-        return self.settings.strategy
-
-    def with_settings(self, **changes: Any) -> Self:
-        """The plan with other settings of the same strategy."""
-        return replace(self, settings=self.settings.model_copy(update=changes))
 
     @property
     def pours(self) -> int:

@@ -32,6 +32,9 @@ DISCHARGE = 0.6
 FLOW_LIMIT = 1e-7
 """Flow below which a pour counts as over: 0.1 mL/s, about two drips a second [m³/s]."""
 
+BINS = 4096
+"""In which points of a pool are counted by their height: 0.03 mm each."""
+
 TIME_STEP = 0.01
 """Time step of the outflow equation [s]."""
 
@@ -160,14 +163,27 @@ def _table(vessel: Vessel) -> _Table:
         volumes = np.linspace(0.0, vessel.capacity, 129)
         levels = np.empty((len(tilts), len(volumes)))
         for row, tilt in enumerate(tilts):
-            heights, each = _heights(vessel, float(tilt))
-            heights = np.sort(heights)
-            levels[row] = np.interp(volumes, (np.arange(len(heights)) + 0.5) * each, heights)
+            levels[row] = _surfaces(*_heights(vessel, float(tilt)), volumes)
         head = max(float(levels.max()), 1e-6)
         heads = head * np.linspace(0.0, 1.0, 97) ** 2
         flows = np.stack([_lip_flow(vessel.opening_radius, heads, float(tilt)) for tilt in tilts])
         _tables[vessel] = _Table(tilts, volumes, levels, head, flows)
     return _tables[vessel]
+
+
+def _surfaces(heights: Floats, each: float, volumes: Floats) -> Floats:
+    """Heights below which points make up some volumes, to a `BINS`th of their extent: a tenth of the price of sorting.
+
+    Args:
+        heights: of points [m].
+        each: volume of a point [m³].
+        volumes: (K,) [m³].
+    """
+    lowest, extent = float(heights.min()), float(np.ptp(heights)) or 1e-9
+    places = np.minimum((BINS / extent) * (heights - lowest), BINS - 1).astype(np.int64)
+    below = np.concatenate([[0.0], each * np.cumsum(np.bincount(places, minlength=BINS))])
+    surfaces: Floats = np.interp(volumes, below, lowest + extent * np.linspace(0.0, 1.0, BINS + 1))
+    return surfaces
 
 
 def _lip_flow(radius: float, heads: Floats, tilt: float) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 
 from actors.arm.errors import ArmError
 from actors.arm.protocol import ArmFacts, ArmState, Executed, PlannedPour
@@ -22,6 +22,10 @@ LOOK_INTERVAL = 0.1
 """Between two looks at a moving arm [s]."""
 
 Follow = Callable[[ArmState], None]
+
+
+def _nobody(state: ArmState) -> None:
+    """Whoever is told where an arm is that nobody follows."""
 
 
 class DeviceArm:
@@ -52,9 +56,10 @@ class DeviceArm:
         """A person has said that it may move."""
         await self.device.call("release", deadline=PATIENCE, urgent=True)
 
-    async def move_to_start(self, path: PlannedPour) -> None:
-        """From home to the pour's start."""
-        await self.device.call("move_to_start", path, deadline=self._deadline(path.approach_time))
+    async def move_to_start(self, path: PlannedPour, follow: Follow = _nobody) -> None:
+        """From home to the pour's start; `follow` is told now and then where it is."""
+        async with self._followed(follow):
+            await self.device.call("move_to_start", path, deadline=self._deadline(path.approach_time))
 
     async def execute(self, path: PlannedPour, follow: Follow) -> Executed:
         """Tilt, hold, return.
@@ -63,18 +68,15 @@ class DeviceArm:
             path: whose start it stands at.
             follow: told now and then where it is.
         """
-        watching = asyncio.create_task(self._watch(follow))
-        try:
+        async with self._followed(follow):
             deadline = self._deadline(path.pour_time)
             executed: Executed = await self.device.call("execute", path, deadline=deadline)
             return executed
-        finally:
-            watching.cancel()
-            await asyncio.gather(watching, return_exceptions=True)
 
-    async def retreat(self, path: PlannedPour) -> None:
-        """Home, from wherever on the ways to and from the pour it stands upright."""
-        await self.device.call("retreat", path, deadline=self._deadline(3.0 * path.retreat_time))
+    async def retreat(self, path: PlannedPour, follow: Follow = _nobody) -> None:
+        """Home, from wherever on the ways to and from the pour it stands upright; `follow` as in `move_to_start`."""
+        async with self._followed(follow):
+            await self.device.call("retreat", path, deadline=self._deadline(3.0 * path.retreat_time))
 
     async def untilt(self, path: PlannedPour) -> None:
         """Slowly upright again, after that pour was stopped."""
@@ -103,6 +105,19 @@ class DeviceArm:
     def _deadline(self, seconds: float) -> float:
         """For something that takes so long on the controller [s]: twice that, for a lost arm must be noticed."""
         return PATIENCE + 2.0 * self._spec.on_clock(seconds)
+
+    @contextlib.asynccontextmanager
+    async def _followed(self, follow: Follow) -> AsyncIterator[None]:
+        """Somebody is told where the arm is, meanwhile."""
+        if follow is _nobody:
+            yield
+            return
+        watching = asyncio.create_task(self._watch(follow))
+        try:
+            yield
+        finally:
+            watching.cancel()
+            await asyncio.gather(watching, return_exceptions=True)
 
     async def _watch(self, follow: Follow) -> None:
         while True:

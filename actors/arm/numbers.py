@@ -143,8 +143,8 @@ class NumbersArm:
 
     def move_to_start(self, path: MotionPath) -> None:
         """See `Arm.move_to_start`."""
-        tilt = float(path.motion.tilt(np.zeros(1))[0])
-        self._way("approach", path.approach_time, lambda t: tilt)
+        tilt, pose = float(path.motion.tilt(np.zeros(1))[0]), _seven(path.motion.sample(np.zeros(1))[0])
+        self._way("approach", path.approach_time, lambda t: tilt, lambda t: pose)
 
     def execute(self, path: MotionPath) -> ExecutedMotion:
         """See `Arm.execute`.
@@ -152,7 +152,7 @@ class NumbersArm:
         The grip's speed factor stretches or shrinks the tilting phase; hold and return keep their times.
         """
         executed = _Executed(path.motion, self._grip.speed_factor, path.factor)
-        reached = self._travel(executed.duration, executed.where)
+        reached = self._travel(executed.duration, executed.where, executed.pose)
         done = self._read_back(path.motion, executed, reached)
         if reached < executed.duration:
             phase, tilt = executed.where(reached)
@@ -203,20 +203,32 @@ class NumbersArm:
         if not self._released or self._pace.interrupted:
             raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
 
-    def _way(self, name: str, duration: float, tilt: Callable[[float], float]) -> None:
-        reached = self._travel(duration, lambda t: (name, tilt(t)))
+    def _way(
+        self,
+        name: str,
+        duration: float,
+        tilt: Callable[[float], float],
+        pose: Callable[[float], tuple[float, ...]] = lambda t: (),
+    ) -> None:
+        reached = self._travel(duration, lambda t: (name, tilt(t)), pose)
         if reached < duration:
             raise ArmStoppedError(
                 f"the arm was stopped during {name}, {reached:.1f} s after its begin",
                 *("operator", name, reached, tilt(reached)),
             )
 
-    def _travel(self, duration: float, where: Callable[[float], tuple[str, float]]) -> float:
+    def _travel(
+        self,
+        duration: float,
+        where: Callable[[float], tuple[str, float]],
+        pose: Callable[[float], tuple[float, ...]] = lambda t: (),
+    ) -> float:
         """Let bench time pass on a way.
 
         Args:
             duration: of the way [s].
             where: phase and tilt [rad] at a time on the way.
+            pose: of the pourer then, see `ArmState.pourer`.
 
         Returns:
             Time reached [s]: `duration`, or less if the arm was stopped.
@@ -229,7 +241,7 @@ class NumbersArm:
             reached = 0.0
             while reached < duration:
                 phase, tilt = where(reached)
-                self._tell(ArmState(True, False, reached, reached / duration, phase, tilt))
+                self._tell(ArmState(True, False, reached, reached / duration, phase, tilt, pourer=pose(reached)))
                 going_on = self._pace.nap(_STEP)
                 reached = min(self._pace.now, duration)
                 if not going_on:
@@ -279,3 +291,11 @@ class _Executed:
         commanded = self.commanded(np.array([moment]))
         begun = [phase.name for phase in self._motion.phases if phase.start <= commanded[0] + 1e-9]
         return begun[-1], float(self._motion.tilt(commanded)[0])
+
+    def pose(self, moment: float) -> tuple[float, ...]:
+        """Pose of the pourer at a time [s], see `ArmState.pourer`."""
+        return _seven(self._motion.sample(self.commanded(np.array([moment])))[0])
+
+
+def _seven(pose: FloatArray) -> tuple[float, ...]:
+    return tuple(float(value) for value in pose)

@@ -29,6 +29,8 @@ class ArmState:
         fraction: of the motion, 0 … 1.
         phase: 'announced', 'approach', the pour's 'tilt', 'hold', 'return', then 'retreat'; 'untilt', 'jog'; 'idle'.
         tilt: of the pourer [rad].
+        joints: as last measured [rad]; empty for an arm that doesn't tell.
+        pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; empty likewise.
     """
 
     moving: bool = False
@@ -37,6 +39,8 @@ class ArmState:
     fraction: float = 0.0
     phase: str = "idle"
     tilt: float = 0.0
+    joints: tuple[float, ...] = ()
+    pourer: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

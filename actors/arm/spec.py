@@ -17,6 +17,7 @@ from sim_engine.marks import FREE
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
+    from actors.arm.figure import ArmFigure
     from actors.arm.joint_path import PourPath
     from actors.arm.protocol import PlannedPour
 
@@ -78,6 +79,10 @@ class ArmSpec(ABC):
     def on_clock(self, seconds: float) -> float:
         """Bench time on the clock [s]; none where nothing is waited for."""
         return seconds / self.time_scale if self.time_scale > 0.0 else 0.0
+
+    def figure(self) -> ArmFigure | None:
+        """What it looks like, for those who watch; None: nobody says, and only the vessel in its hand is shown."""
+        return None
 
     def missing(self) -> str | None:
         """What its driver needs that isn't installed, in words; None if nothing is missing."""
@@ -169,6 +174,12 @@ class UrArmSpec(ArmSpec):
         from actors.bench.planning import plan_pour, vessel
 
         return plan_path(plan_pour(scene, action), self, vessel(scene.pourer), vessel(scene.receiver))
+
+    def figure(self) -> ArmFigure:
+        """See `ArmSpec.figure`."""
+        from actors.arm.figure import LinkFigure
+
+        return LinkFigure(self)
 
     def missing(self) -> str | None:
         """See `ArmSpec.missing`."""

@@ -38,11 +38,6 @@ class Conversation:
         self._asked_at = -math.inf
 
     @property
-    def is_open(self) -> bool:
-        """Whether the port is open."""
-        return self._wire is not None
-
-    @property
     def dialect(self) -> Dialect:
         """The dialect.
 

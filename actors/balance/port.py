@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from actors.balance.wire import ports
+from actors.balance.wire import port_advice, ports
 from actors.checks import Check
 
 
@@ -26,6 +26,8 @@ def look_at_port(name: str) -> Check:
     if not os.access(port, os.R_OK | os.W_OK):
         todo = f"add the user to the group '{_group(port)}' and log in anew"
         return Check("balance port", "fail", f"this user may not open {port}", todo)
+    if (advice := port_advice(name)) is not None:
+        return Check("balance port", "warn", str(port), advice)
     return Check("balance port", "ok", str(port))
 
 

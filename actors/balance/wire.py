@@ -220,4 +220,4 @@ def port_advice(port: str) -> str | None:
         return None
     same = [link for link in Path("/dev/serial/by-id").glob("*") if link.resolve() == path]
     better = str(same[0]) if same else "its name under /dev/serial/by-id/"
-    return f"{port} may be another device once something is plugged in anew; use {better}"
+    return f"it may be another device once something is plugged in anew; use {better}"

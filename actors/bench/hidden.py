@@ -15,6 +15,7 @@ from actors.bench.spec import VirtualBenchSpec
 from actors.protocols import InvalidActionError, LaboratoryError, SimulatorPool
 from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome
+from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.task import PoseError, PourTask, Scene
 
 ATTEMPTS = 3
@@ -67,15 +68,17 @@ class Spill:
         spilled_curve: mass beside the receiver at those times [kg].
         spilled: at last [kg].
         retained: left in the pourer [kg].
+        frames: particles, where somebody watches.
     """
 
     times: tuple[float, ...]
     spilled_curve: tuple[float, ...]
     spilled: float
     retained: float
+    frames: RecordedFrames | None = None
 
 
-async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: PourTask, seed: int) -> PourOutcome:
+async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: PourTask, seed: int) -> SimulatedPour:
     """What becomes of the 'real' liquid in one pour; same seed, same answer.
 
     Args:
@@ -91,17 +94,22 @@ async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: P
     reason = None
     for liquid_seed in np.random.default_rng(stream(seed, "liquid")).integers(0, 2**31, ATTEMPTS):
         try:
-            outcome = (await simulators.simulate(replace(task, parameters=spec.liquid, seed=int(liquid_seed)))).outcome
+            simulated = await simulators.simulate(replace(task, parameters=spec.liquid, seed=int(liquid_seed)))
         except InvalidActionError as touching:
             raise TouchingError(f"the vessels as they truly stand: {touching}") from touching
-        if outcome.invalid is None:
-            return outcome
-        reason = outcome.invalid
+        if simulated.outcome.invalid is None:
+            return simulated
+        reason = simulated.outcome.invalid
     raise LaboratoryError(f"the virtual bench's liquid could not be simulated: {reason}")
 
 
 async def hidden_spill(
-    spec: VirtualBenchSpec, simulators: SimulatorPool, scene: Scene, action: Action, seed: int
+    spec: VirtualBenchSpec,
+    simulators: SimulatorPool,
+    scene: Scene,
+    action: Action,
+    seed: int,
+    record_rate: float = 0.0,
 ) -> Spill:
     """What becomes of the liquid if the arm does what it is told, with this pour's errors; raises as `hidden_pour`.
 
@@ -111,9 +119,11 @@ async def hidden_spill(
         scene: as intended.
         action: as commanded.
         seed: of the pour.
+        record_rate: of the particles that are kept for those who watch [1/s].
     """
-    task = PourTask(scene, action, spec.liquid, 0, pose_error=draw_pose_error(spec, seed))
-    return spill_of(await hidden_pour(spec, simulators, task, seed), scene.liquid.mass)
+    task = PourTask(scene, action, spec.liquid, 0, record_rate=record_rate, pose_error=draw_pose_error(spec, seed))
+    simulated = await hidden_pour(spec, simulators, task, seed)
+    return replace(spill_of(simulated.outcome, scene.liquid.mass), frames=simulated.frames)
 
 
 def spill_of(outcome: PourOutcome, mass: float) -> Spill:

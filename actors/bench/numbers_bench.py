@@ -66,7 +66,7 @@ class NumbersBench(Nature):
         """See `Nature.prepare`: the liquid is poured from here on."""
         self._pour = pour
         self._liquid = asyncio.create_task(
-            hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed)
+            hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed, pour.record_rate)
         )
         await self._balance.prepare(stream(pour.seed, "balance"))
         error = draw_pose_error(self._spec, pour.seed)
@@ -82,6 +82,8 @@ class NumbersBench(Nature):
             spill = await self._spill()
         except TouchingError as error:
             raise PourFailedError(str(error)) from error
+        assert self._pour is not None
+        self._pour.shown(spill.frames)
         await self._balance.put(Load(spill.times, spill.spilled_curve))
 
     async def lands(self, executed: Executed | None, broken: Exception | None) -> None:

@@ -163,7 +163,8 @@ class OnePour:
         if setup.balance is not None:
             await setup.balance.device.revive()
             await setup.balance.resume()
-        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed))
+        show = self._report.pour if self._report.watched else None
+        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
         await self._weighings.before()
 
     async def _move(self) -> None:
@@ -177,7 +178,7 @@ class OnePour:
         setup, path = self._setup, self._path
         self._report.enter("approach")
         try:
-            await setup.nature.lasting(setup.arm.move_to_start(path), path.approach_time)
+            await setup.nature.lasting(setup.arm.move_to_start(path, self._seen), path.approach_time)
         except _STUCK as error:
             await self._bring_home(error)
             raise
@@ -198,7 +199,7 @@ class OnePour:
         try:
             if self._broken is not None:
                 await setup.arm.release()  # agreed to with the un-tilting
-            await setup.arm.retreat(path)
+            await setup.arm.retreat(path, self._seen)
         except _STUCK as error:
             await self._bring_home(error)
         await self._let_it_land()
@@ -375,6 +376,10 @@ class OnePour:
 
     def _follow(self, state: ArmState) -> None:
         self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
+        self._seen(state)
+
+    def _seen(self, state: ArmState) -> None:
+        self._report.stand(state.joints, state.pourer)
 
     async def _watch(self) -> None:
         """Give the balance's display to those who watch; it can't hold the pour up."""
@@ -385,7 +390,7 @@ class OnePour:
             with contextlib.suppress(LaboratoryError):
                 weight = await balance.read()
                 if math.isfinite(weight.mass):
-                    self._report.show(weight.mass)
+                    self._report.show(weight.mass, weight.stable)
             await asyncio.sleep(LOOK_INTERVAL)
 
 

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Mapping
 
 from actors.protocols import PourProgress, ProgressCallback
+from sim_engine.simulated import RecordedFrames
 
 
 class PourReport:
@@ -23,6 +24,9 @@ class PourReport:
         self._fraction = 0.0
         self._tilt: float | None = None
         self._balance: float | None = None
+        self._stable: bool | None = None
+        self._joints: tuple[float, ...] = ()
+        self._pourer: tuple[float, ...] = ()
 
     def enter(self, checkpoint: str, done: float = 0.0) -> None:
         """A checkpoint is reached, or `done` (0 … 1) of it."""
@@ -53,12 +57,36 @@ class PourReport:
         self._fraction = max(self._fraction, (start + fraction * self._motion_time) / sum(self._parts.values()))
         self._tell()
 
-    def show(self, balance: float) -> None:
-        """The balance's display [kg]."""
-        self._balance = balance
+    def stand(self, joints: tuple[float, ...], pourer: tuple[float, ...]) -> None:
+        """Where the arm is, see `PourProgress`; as far as it tells."""
+        self._joints, self._pourer = joints or self._joints, pourer or self._pourer
         self._tell()
 
-    def _tell(self) -> None:
+    def show(self, balance: float, stable: bool | None = None) -> None:
+        """The balance's display [kg], and whether it says that it is at rest."""
+        self._balance, self._stable = balance, stable
+        self._tell()
+
+    @property
+    def watched(self) -> bool:
+        """Whether anybody is told."""
+        return self._progress is not None
+
+    def pour(self, liquid: RecordedFrames) -> None:
+        """What the liquid of a virtual bench does in this pour."""
+        self._tell(liquid)
+
+    def _tell(self, liquid: RecordedFrames | None = None) -> None:
         if self._progress is not None:
+            told = PourProgress(
+                self._checkpoint,
+                self._fraction,
+                self._tilt,
+                self._balance,
+                self._stable,
+                self._joints,
+                self._pourer,
+                liquid,
+            )
             with contextlib.suppress(Exception):
-                self._progress(PourProgress(self._checkpoint, self._fraction, self._tilt, self._balance))
+                self._progress(told)

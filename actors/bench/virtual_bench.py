@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -28,6 +28,7 @@ from actors.protocols import LaboratoryError, SimulatorPool
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.sampled_motion import SampledMotion
+from sim_engine.simulated import RecordedFrames
 from sim_engine.task import PoseError, PourTask, Scene
 
 FloatArray = NDArray[np.float64]
@@ -48,18 +49,36 @@ LONGEST_REST = 6.0
 NOTING_INTERVAL = 40.0
 """Between two looks at what the arm did [s of its time]; a virtual controller remembers two minutes."""
 
+WATCHED_RATE = 10.0
+"""Looks at the hidden liquid's particles per second of its time, for those who watch [1/s]."""
+
 LONGEST_GAP = 0.1
 """Between two samples of a history without a gap [s of controller time]; it is sampled at 125 Hz."""
 
 
 @dataclass(frozen=True)
 class PourAsk:
-    """The pour that is under way; `seed` is that of all its chance."""
+    """The pour that is under way; `seed` is that of all its chance.
+
+    Attributes:
+        show: takes what its liquid does, where anybody watches.
+    """
 
     scene: Scene
     action: Action
     path: PlannedPour
     seed: int
+    show: Callable[[RecordedFrames], None] | None = None
+
+    @property
+    def record_rate(self) -> float:
+        """Of the hidden liquid's particles [1/s]; 0 where nobody watches. Changes nothing about where they go."""
+        return 0.0 if self.show is None else WATCHED_RATE
+
+    def shown(self, frames: RecordedFrames | None) -> None:
+        """What its liquid does is known."""
+        if self.show is not None and frames is not None:
+            self.show(frames)
 
 
 class Nature:
@@ -183,7 +202,10 @@ class VirtualBench(Nature):
         scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))
         shift = PoseError(x=error.x, y=error.y, z=error.z)
         task = PourTask(scene, pour.action, SimulationParameters(), 0, pose_error=shift, motion=motion)
-        spill = spill_of(await hidden_pour(self._spec, self._simulators, task, pour.seed), mass)
+        task = replace(task, record_rate=pour.record_rate)
+        simulated = await hidden_pour(self._spec, self._simulators, task, pour.seed)
+        pour.shown(simulated.frames)
+        spill = spill_of(simulated.outcome, mass)
         return spill.spilled, spill.retained
 
 

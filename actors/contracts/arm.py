@@ -62,8 +62,8 @@ class ArmBench:
     mend: Callable[[], object] = lambda: None
 
 
-class _Call(threading.Thread):
-    """Something that moves, going on in a thread."""
+class Call(threading.Thread):
+    """A blocking call that goes on in a thread."""
 
     def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
         super().__init__(daemon=True)
@@ -73,12 +73,14 @@ class _Call(threading.Thread):
         self.start()
 
     def run(self) -> None:
+        """See `threading.Thread.run`."""
         try:
             self.value = self._call(*self._arguments)
         except Exception as error:
             self.error = error
 
     def ended(self) -> Exception | None:
+        """Wait for its end; what it raised."""
         self.join(PATIENCE)
         assert not self.is_alive(), "the motion does not come back"
         return self.error
@@ -143,7 +145,7 @@ class ArmContract:
     def test_it_tells_where_it_is_while_it_pours(self, bench: ArmBench) -> None:
         """At once, in the plan's own words."""
         self._to_start(bench)
-        pouring = _Call(bench.arm.execute, bench.path)
+        pouring = Call(bench.arm.execute, bench.path)
         self._await(bench, lambda: bench.arm.state().moving, "it never moves")
         seen = []
         while pouring.is_alive():
@@ -160,7 +162,7 @@ class ArmContract:
     def test_it_does_one_thing_at_a_time(self, bench: ArmBench) -> None:
         """A second motion is refused, and the first one goes on."""
         self._to_start(bench)
-        pouring = _Call(bench.arm.execute, bench.path)
+        pouring = Call(bench.arm.execute, bench.path)
         self._await(bench, lambda: bench.arm.state().moving, "it never moves")
         with pytest.raises(ArmRefusedError):
             bench.arm.move_to_start(bench.path)
@@ -266,9 +268,9 @@ class ArmContract:
         bench.arm.hands_in()
         return self._cycle(bench)
 
-    def _tilting(self, bench: ArmBench) -> _Call:
+    def _tilting(self, bench: ArmBench) -> Call:
         self._to_start(bench)
-        pouring = _Call(bench.arm.execute, bench.path)
+        pouring = Call(bench.arm.execute, bench.path)
         least = 0.1 * bench.path.report.tilt
         self._await(bench, lambda: bench.arm.state().moving and bench.arm.state().tilt > least, "it never tilts")
         return pouring

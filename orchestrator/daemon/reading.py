@@ -11,10 +11,11 @@ from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_name
+from orchestrator.report.run_page import REPORT_NAME as REPORT
 from orchestrator.report.units import is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured
 
-REPORT = "report.html"
+__all__ = ["REPORT", "pours_of", "summary_of"]
 
 
 def pours_of(plan: CampaignPlan, directory: Path) -> list[dict[str, Any]]:

@@ -1,26 +1,118 @@
-"""What a viewer shows when it opens a recording: which views, where."""
+"""What a viewer shows: one arrangement for each moment of a campaign, each with what matters then in the middle."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from orchestrator.report.style import safe_name
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
+Moment = Literal["calibrating", "deploying", "replaying"]
 
-def _scene() -> Any:
+BACKGROUND = [246, 247, 249]
+
+
+def simulation_blueprint() -> rrb.Blueprint:
+    """For one simulated pour: the scene above the shares of the liquid."""
     import rerun.blueprint as rrb
 
+    return _blueprint(rrb.Vertical(_simulation(), _shares(), row_shares=[3, 1]), "replaying")
+
+
+def campaign_blueprint(moment: Moment, receivers: Mapping[str, str], loss_label: str) -> rrb.Blueprint:
+    """For a campaign.
+
+    Args:
+        moment: 'calibrating', 'deploying', or 'replaying' once it is over.
+        receivers: what people call each deployment scene, by its name.
+        loss_label: of the pours' loss.
+    """
+    import rerun.blueprint as rrb
+
+    told = rrb.Vertical(_status(), _log(), row_shares=[3, 2])
+    losses = [_loss(safe_name(scene), f"{name}: {loss_label}") for scene, name in receivers.items()]
+    maps = [
+        _picture(f"/learning/{safe_name(scene)}/surrogate", f"{name}: expected loss")
+        for scene, name in receivers.items()
+    ]
+    calibration = [
+        _picture("/learning/calibration/surrogate", "Discrepancy over θ"),
+        _picture("/learning/calibration/theta", "θ* and which θ fit the pours"),
+    ]
+    match moment:
+        case "calibrating":
+            stage = rrb.Vertical(
+                rrb.Horizontal(_cell(), _simulation()),
+                rrb.Horizontal(_loss("calibration", "Calibration pours: spilled / poured [%]"), _shares()),
+                _lanes(),
+                row_shares=[5, 3, 2],
+            )
+            middle = rrb.Vertical(*calibration, row_shares=[1, 1])
+            shares = [5, 4, 2]
+        case "deploying":
+            stage = rrb.Vertical(
+                rrb.Horizontal(_cell(), _simulation()),
+                _weight(),
+                _lanes(),
+                row_shares=[5, 3, 2],
+            )
+            middle = rrb.Vertical(rrb.Tabs(*losses), rrb.Tabs(*maps, *calibration), row_shares=[1, 1])
+            shares = [5, 4, 2]
+        case "replaying":
+            stage = rrb.Vertical(
+                rrb.Horizontal(_cell(), _simulation()),
+                rrb.Horizontal(_weighed_pour(), _shares()),
+                row_shares=[3, 2],
+            )
+            results = rrb.Tabs(*losses, _loss("calibration", "Calibration pours: spilled / poured [%]"), _machine())
+            middle = rrb.Vertical(rrb.Tabs(*maps, *calibration), results, row_shares=[1, 1])
+            shares = [5, 4, 2]
+    return _blueprint(rrb.Horizontal(stage, middle, told, column_shares=shares), moment)
+
+
+def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
+    import rerun.blueprint as rrb
+
+    # The wall clock of a campaign that is over gives minutes to thought and an instant to a pour: films are watched on
+    # the timeline of simulated time, again and again.
+    time = (
+        rrb.TimePanel(timeline="sim_time", play_state="playing", loop_mode="all", state="collapsed")
+        if moment == "replaying"
+        else rrb.TimePanel(timeline="wall", play_state="following", state="collapsed")
+    )
+    return rrb.Blueprint(
+        root, time, rrb.SelectionPanel(state="collapsed"), rrb.BlueprintPanel(state="collapsed"), auto_views=False
+    )
+
+
+def _cell() -> Any:
+    import rerun.blueprint as rrb
+
+    eye = rrb.EyeControls3D(position=(0.55, -1.25, 0.75), look_target=(0.1, 0.15, 0.2), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
-        origin="/scene",
-        contents=["/scene/pourer/**", "/scene/receiver/**", "/scene/liquid"],
-        name="Pour",
-        background=[250, 250, 250],
-        # From the side, a little above: the picture in docs/frames.md.
-        eye_controls=rrb.EyeControls3D(position=(-0.05, -0.55, 0.3), look_target=(-0.03, 0.0, 0.12), eye_up=(0, 0, 1)),
+        origin="/cell",
+        name="The cell: what was planned (orange), what was done (blue)",
+        background=BACKGROUND,
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+
+
+def _simulation() -> Any:
+    import rerun.blueprint as rrb
+
+    # From the side, a little above: the picture in docs/frames.md.
+    eye = rrb.EyeControls3D(position=(-0.05, -0.5, 0.26), look_target=(-0.03, 0.0, 0.1), eye_up=(0, 0, 1))
+    return rrb.Spatial3DView(
+        origin="/simulation",
+        contents=["/simulation/pourer/**", "/simulation/receiver/**", "/simulation/liquid"],
+        name="Simulated pour: in the pourer, falling, received, spilled",
+        background=BACKGROUND,
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=False),
     )
 
 
@@ -28,80 +120,68 @@ def _shares() -> Any:
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
-        origin="/scene/share",
-        name="Where the liquid is [%]",
+        origin="/simulation/share",
+        name="Simulated: where the liquid is [%]",
         axis_y=rrb.ScalarAxis(range=(0.0, 100.0)),
-        plot_legend=rrb.Corner2D.RightTop,
+        plot_legend=rrb.Corner2D.LeftTop,
     )
 
 
-def simulation_blueprint() -> rrb.Blueprint:
-    """For one simulated pour: the scene above the shares of the liquid."""
+def _weight() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.Blueprint(
-        rrb.Vertical(_scene(), _shares(), row_shares=[3, 1]),
-        rrb.TimePanel(timeline="sim_time"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        auto_views=False,
+    return rrb.TimeSeriesView(
+        origin="/balance",
+        contents=["/balance/shown", "/balance/stable", "/balance/verdict", "/balance/expected/**"],
+        name="Balance: spilled [g], and what nearby simulations expect",
+        plot_legend=rrb.Corner2D.LeftTop,
     )
 
 
-def campaign_blueprint(receivers: Mapping[str, str], loss_label: str) -> rrb.Blueprint:
-    """For a campaign: scene and pool to the left, losses and maps in the middle, events and state to the right.
-
-    Args:
-        receivers: what people call each deployment scene, by its name.
-        loss_label: of the pours' loss.
-    """
+def _weighed_pour() -> Any:
     import rerun.blueprint as rrb
 
-    losses = [
-        rrb.TimeSeriesView(
-            origin=f"/pours/{safe_name(scene)}", name=f"{name}: {loss_label}", plot_legend=rrb.Corner2D.RightTop
-        )
-        for scene, name in receivers.items()
-    ]
-    losses.append(rrb.TimeSeriesView(origin="/calibration/loss", name="Calibration pours: spilled / poured [%]"))
-    maps = []
-    for place, title in (
-        ("/maps/calibration", "Discrepancy"),
-        *((f"/maps/{safe_name(scene)}", name) for scene, name in receivers.items()),
-    ):
-        for which, meaning in (("mean", "mean"), ("deviation", "± 1 σ")):
-            maps.append(
-                rrb.Spatial2DView(
-                    origin=f"{place}/{which}",
-                    contents=["$origin/picture", "$origin/observed"],
-                    name=f"{title}: {meaning}",
-                )
-            )
-    numbers = [
-        rrb.TensorView(origin=f"{place}/mean/values", name=f"{title}: numbers")
-        for place, title in (
-            ("/maps/calibration", "Discrepancy"),
-            *((f"/maps/{safe_name(scene)}", name) for scene, name in receivers.items()),
-        )
-    ]
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(
-                _scene(),
-                _shares(),
-                rrb.TimeSeriesView(origin="/laboratory", name="Laboratory", plot_legend=rrb.Corner2D.RightTop),
-                row_shares=[3, 1, 1],
-            ),
-            rrb.Vertical(rrb.Tabs(*losses), rrb.Tabs(rrb.Grid(*maps, name="Surrogates"), *numbers), row_shares=[2, 3]),
-            rrb.Vertical(
-                rrb.TextDocumentView(origin="/state", name="State"),
-                rrb.TextLogView(origin="/events", name="Events and decisions"),
-                row_shares=[2, 3],
-            ),
-            column_shares=[3, 3, 2],
-        ),
-        rrb.TimePanel(timeline="wall"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        auto_views=False,
+    return rrb.TimeSeriesView(
+        origin="/balance/pour", name="Pour: spilled [g], weighed and simulated", plot_legend=rrb.Corner2D.LeftTop
     )
+
+
+def _loss(place: str, name: str) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(origin=f"/learning/{place}/loss", name=name, plot_legend=rrb.Corner2D.RightTop)
+
+
+def _picture(entity: str, name: str) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial2DView(origin=entity, name=name)
+
+
+def _lanes() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Tabs(rrb.StateTimelineView(origin="/machine/lanes", name="Who works at what"), _machine())
+
+
+def _machine() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        origin="/machine",
+        contents=["/machine/load/**", "/machine/seconds", "/machine/wait", "/machine/dropped"],
+        name="Queue, seconds, waits, drops",
+        plot_legend=rrb.Corner2D.LeftTop,
+    )
+
+
+def _status() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(origin="/status", name="What is going on")
+
+
+def _log() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TextLogView(origin="/log", name="Events and decisions")

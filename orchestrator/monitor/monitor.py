@@ -14,7 +14,7 @@ from typing import Any
 
 from orchestrator.events import Event
 from orchestrator.monitor.worker import QueueThread
-from orchestrator.monitor.writer import Closing, Opening
+from orchestrator.monitor.writer import Closing, Missed, Opening
 from orchestrator.plan import CampaignPlan
 
 CAPACITY = 4_000
@@ -53,6 +53,7 @@ class RerunMonitor:
         self.path.open("wb").close()
         self._process = _start_writer()
         self._report: dict[str, Any] = {"failed": 0}
+        self._told = 0
         self._worker: QueueThread[Event | Opening] = QueueThread(
             self._send, self._finish, capacity=capacity, name=f"recording {self.path.name}"
         )
@@ -88,7 +89,10 @@ class RerunMonitor:
             self._process.wait(5.0)
         return self._report.get("complete", False) is True
 
-    def _send(self, item: Event | Opening | Closing) -> None:
+    def _send(self, item: Event | Opening | Missed | Closing) -> None:
+        if (dropped := self._worker.dropped if isinstance(item, Event) else 0) > self._told:
+            self._told = dropped
+            self._send(Missed(dropped))
         assert self._process.stdin is not None
         self._process.stdin.write(pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL))
         self._process.stdin.flush()

@@ -18,6 +18,9 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
+FLUSHING = 0.3
+"""Rows are kept together for so long [s]."""
+
 LAST_WORDS = 5.0
 """How long a server may take for the last of it [s]."""
 
@@ -42,11 +45,14 @@ class Outlet:
         # FileSink only logs that it can't write; find out while somebody still listens.
         path.open("wb").close()
         recording_id = uuid.uuid4().hex
-        self._file = rr.RecordingStream(application, recording_id=recording_id)
+        # Some rows at a time: a viewer chokes on many small pieces long before their bytes are many.
+        batches = rr.ChunkBatcherConfig()
+        batches.flush_tick = FLUSHING
+        self._file = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
         self._file.set_sinks(rr.FileSink(str(path)))
         self._streams = [self._file]
         if url:
-            live = rr.RecordingStream(application, recording_id=recording_id)
+            live = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
             live.set_sinks(rr.GrpcSink(url))
             self._streams.append(live)
         for stream in self._streams:

@@ -1,10 +1,12 @@
-"""A campaign's recording: events in, Rerun rows out."""
+"""A campaign's recording: events in, Rerun rows out.
+
+Three timelines: `wall`, when something was known; `step`, how many requests had been answered; `sim_time`, on which the
+films of simulations and pours lie one behind the other.
+"""
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from orchestrator.events import (
     CampaignClosed,
@@ -20,34 +22,20 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.monitor.streams import Streams
+from orchestrator.monitor.balance import BalanceStage
+from orchestrator.monitor.blueprint import Moment, campaign_blueprint
+from orchestrator.monitor.cell import Cell
+from orchestrator.monitor.films import Films
+from orchestrator.monitor.learning import LearningStage
+from orchestrator.monitor.machine import Machine
+from orchestrator.monitor.outlet import Outlet
+from orchestrator.monitor.simulated import SimulatedStage
+from orchestrator.monitor.status import Status
 from orchestrator.plan import CampaignPlan
-from orchestrator.report import style
 from orchestrator.report.names import receiver_names
-from orchestrator.report.style import safe_name
-from orchestrator.report.units import (
-    DISCREPANCY,
-    at_least_nothing,
-    deployment_unit,
-    is_calibration,
-    loss_of_pour,
-    unit_of_pour,
-)
-from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated, Suggest, Suggested
-from sim_engine.action import ACTION_DIMENSIONS
+from orchestrator.report.units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
+from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
 from sim_engine.task import Scene
-
-if TYPE_CHECKING:
-    from orchestrator.report.section import Solid
-    from sim_engine.vessel.spec import VesselSpec
-
-
-@functools.lru_cache(maxsize=16)
-def solid(spec: VesselSpec) -> Solid:
-    """The surface of a vessel, built once."""
-    from sim_engine.vessel.build import build_vessel
-
-    return build_vessel(spec)
 
 
 class CampaignRecording:
@@ -57,111 +45,126 @@ class CampaignRecording:
         path: `.rrd` to write.
         plan: of the campaign.
         url: of a Rerun server that gets the same; '' for none.
+
+    Raises:
+        OSError: the file can't be written.
     """
 
     def __init__(self, path: Path, plan: CampaignPlan, *, url: str = "") -> None:
-        scenes = plan.deployment.scenes if plan.deployment is not None else ()
-        unit = deployment_unit(plan.deployment) if plan.deployment is not None else DISCREPANCY
-        names = receiver_names(plan)
-        receivers = {scene.name: names[scene.name] for scene in scenes}
+        import rerun as rr
+
         self.path, self._plan = path, plan
-        self.streams = Streams(path, name=plan.name, receivers=receivers, loss_label=unit.label, url=url)
-        self._scenes: dict[str, Scene] = {}
-        if plan.calibration is not None:
-            for records in (plan.calibration.records, plan.calibration.transfer):
-                if records is not None:
-                    self._scenes[records.scene.name] = records.scene
-            self._scenes[plan.calibration.scene.name] = plan.calibration.scene
-        if plan.deployment is not None:
-            self._scenes.update({scene.name: scene for scene in plan.deployment.scenes})
-        self._names = receiver_names(plan)
-        self._scene_of_stage: dict[str, str] = {}
-        self._best: dict[str, float] = {}
-        self._running: set[int] = set()
-        self._pours = self._simulations = 0
-        self._about: dict[str, str] = {"campaign": plan.name}
+        self._scenes = scenes_of(plan)
+        self.status = Status(plan)
+        outlet = self._outlet = Outlet(
+            path, application=f"decant {plan.name}", name=f"{plan.name} · {self.status.reality}", url=url
+        )
+        self._moment: Moment | None = None
+        self._show("calibrating" if plan.calibration is not None else "deploying")
+        outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        outlet.times(step=0, sim_time=0.0)
+        self._films = Films(outlet)
+        self._simulated = SimulatedStage(outlet, self._films)
+        self._cell = Cell(outlet, self._films, plan)
+        self._balance = BalanceStage(outlet, self._cell.time_scale)
+        self._learning = LearningStage(outlet, plan)
+        self._machine = Machine(outlet)
+        self._step = 0
 
     @property
     def next_due(self) -> float | None:
         """When `play` has something to do next [s since 1970]; None: nothing is planned."""
-        return None
+        return self._films.next_due
 
     def play(self, now: float) -> None:
         """Write what is due by now."""
+        self._films.play(now)
 
     def close(self, dropped: int = 0) -> None:
         """Complete the recording; `dropped` events never came."""
+        self._films.play(float("inf"))
         if dropped:
-            self._say(f"{dropped} events are missing: the recording could not keep up", "warning", "recording")
-        self.streams.close()
+            self.missed(dropped)
+            self._machine.line(f"{dropped} events are missing: the recording could not keep up", "warning", "recording")
+        self._outlet.close()
+
+    def missed(self, dropped: int) -> None:
+        """So many events never came until now."""
+        self._machine.dropped(dropped)
 
     def handle(self, event: Event) -> None:
         """Take note of an event."""
-        self.streams.at(wall=event.time, pour=self._pours)
+        if isinstance(event, RequestFinished):
+            self._step += 1
+        self._outlet.times(wall=event.time, step=self._step, sim_time=self._films.end)
+        self.status.take(event)
         match event:
             case CampaignOpened():
-                self._about["mode"] = event.mode
-                self._about["stages"] = ", ".join(event.stages)
-                self._about["simulators"] = str(event.simulators)
+                self._machine.opened(event.simulators)
                 self._say(f"{event.name}: {'goes on' if event.resumed else 'begins'}, mode {event.mode}")
-                self._page()
             case CampaignStateChanged():
-                self._about["state"] = event.after
                 self._say(f"{event.before} → {event.after}{': ' + event.reason if event.reason else ''}")
-                self._page()
             case CampaignClosed():
-                self._about["state"] = event.state
+                self._learning.flush(event.time)
                 self._say(f"ended: {event.state}")
-                self._page()
+                self._show("replaying")
             case StageOpened():
-                self._about["stage"] = f"{event.stage} ({event.index}/{event.count})"
                 self._say(f"stage {event.stage} begins", source=event.stage)
-                self._page()
             case StageClosed():
-                self._say(f"stage {event.stage} done", source=event.stage)
+                self._learning.learnt(event.result, event.time)
+                self._learning.flush(event.time)
+                self._say(f"stage {event.stage} is done", source=event.stage)
             case RequestStarted():
                 self._started(event)
             case RequestFinished():
                 self._finished(event)
             case PourProgressed():
-                progress = event.progress
-                if progress.tilt is not None:
-                    tilt = progress.tilt / ACTION_DIMENSIONS["max_angle"].factor
-                    self.streams.number("/laboratory/tilt", tilt, name="tilt [deg]", colour=style.POURER)
-                if progress.balance is not None:
-                    self.streams.number(
-                        "/laboratory/balance", progress.balance * 1e3, name="balance [g]", colour=style.SPILLED
-                    )
-                if self._about.get("pour") != (now := f"{event.number}: {progress.checkpoint}"):
-                    self._about["pour"] = now
-                    self._page()
+                self._cell.progress(event.progress)
+                if (doing := self._balance.progress(event.progress, event.time)) is not None:
+                    self._machine.lane("arm", doing)
             case StrategyProgressed():
-                self._about[f"progress of {event.stage}"] = str(event.progress)
-                self._page()
+                self._learning.learnt(event.result, event.time)
+                self.status.best, self.status.trust = self._learning.best, self._learning.trust
             case DecisionMade():
                 self._say(event.decision.text, source=event.stage)
             case LogLine():
                 self._say(event.text, event.level, event.stage)
+        self._machine.status(self.status.page())
 
     def _say(self, text: str, level: str = "info", source: str = "") -> None:
-        self.streams.line(text, level, safe_name(source or "campaign"))
+        self._machine.line(text, level, source or "campaign")
 
-    def _page(self) -> None:
-        cells = [(name, value.replace("|", "\\|")) for name, value in self._about.items()]  # |Δ| is not a border
-        rows = "\n".join(f"| {name} | {value} |" for name, value in cells)
-        self.streams.page("/state", f"| | |\n|---|---|\n{rows}\n")
+    def _show(self, moment: Moment) -> None:
+        """Arrange the views for a moment; not anew for one that is shown already, since people move views about."""
+        if self._moment == moment:
+            return
+        self._moment = moment
+        deployment = self._plan.deployment
+        names = receiver_names(self._plan)
+        receivers = {s.name: names[s.name] for s in deployment.scenes} if deployment is not None else {}
+        unit = deployment_unit(deployment) if deployment is not None else DISCREPANCY
+        self._outlet.show(campaign_blueprint(moment, receivers, unit.label))
 
-    def _pool(self) -> None:
-        self.streams.number(
-            "/laboratory/simulators_busy", len(self._running), name="simulators busy", colour=style.FALLING
-        )
+    def _follow(self, request: Request) -> None:
+        """The views follow what is asked for."""
+        if isinstance(request, Simulate | Pour) and self._moment != "replaying":
+            deployed = self._plan.deployment is not None and request.scene in {
+                scene.name for scene in self._plan.deployment.scenes
+            }
+            self._show("deploying" if deployed and request.purpose != "calibration" else "calibrating")
 
     def _started(self, event: RequestStarted) -> None:
+        self._follow(event.request)
         match event.request:
-            case Simulate():
-                self._running.add(event.id)
-                self._pool()
+            case Simulate() as request:
+                self._machine.simulation_started(event.id, request.purpose)
+            case Suggest():
+                self._machine.lane("optimiser", "suggest")
             case Pour() as pour:
+                self._machine.pour_started(event.time)
+                scene = self._scenes[pour.scene]
+                self._cell.begin(pour, scene)
+                self._balance.begin(pour, scene)
                 expected = ""
                 if pour.predicted is not None:
                     unit = unit_of_pour(self._plan, pour)
@@ -169,94 +172,62 @@ class CampaignRecording:
                 self._say(f"pour {pour.number}: {self._action(pour)}{expected}", source=event.stage)
 
     def _finished(self, event: RequestFinished) -> None:
+        match event.request:
+            case Simulate():
+                self._machine.simulation_finished(event.id, event.seconds)
+            case Suggest():
+                self._machine.lane("optimiser", None)
+            case Pour():
+                self._machine.pour_finished(event.time)
         if isinstance(event.outcome, Failed):
-            self._running.discard(event.id)
             self._say(f"{event.outcome.kind}: {event.outcome.reason}", "warning", event.stage)
             return
         match event.request, event.outcome:
             case Simulate() as request, Simulated() as outcome:
-                self._running.discard(event.id)
-                self._simulations += 1
-                self._scene_of_stage[event.stage] = request.scene
-                self._about["simulations"] = str(self._simulations)
-                self._pool()
-                self._simulated(event, request, outcome)
+                self._learning.about(event.stage, request.scene)
+                self._simulation(event, request, outcome)
             case Pour() as request, Poured() as outcome:
-                self._scene_of_stage[event.stage] = request.scene
-                self._poured(event, request, outcome)
+                self._learning.about(event.stage, request.scene)
+                self._say(self._learning.poured(request, outcome), source=event.stage)
+                self.status.best = self._learning.best
+                measured, shown = outcome.measurement, self._balance.finish(outcome.measurement)
+                self._cell.finish(
+                    self._scenes[request.scene],
+                    measured,
+                    now=event.time,
+                    step=self._step,
+                    beside=lambda time: self._balance.beside(shown, time),
+                )
             case Suggest() as request, Suggested() as outcome:
-                self._suggested(event, request, outcome)
+                self._learning.suggested(event, request, outcome)
 
-    def _simulated(self, event: RequestFinished, request: Simulate, outcome: Simulated) -> None:
+    def _simulation(self, event: RequestFinished, request: Simulate, outcome: Simulated) -> None:
         result = outcome.outcome
+        self._balance.simulated(request.scene, request.action, result)
         if result.invalid is not None:
             self._say(f"simulation {event.id} is not valid: {result.invalid}", "warning", event.stage)
         if event.frames is None:
             return
-        scene = self._scenes[request.scene]
-        self._say(
-            f"recorded simulation {event.id} ({request.purpose}): {request.action.display('angular_velocity')}, "
-            f"{100 * result.spilled:.1f} % spilled, {result.particles} particles",
-            source=event.stage,
+        title = (
+            f"simulation {event.id} ({request.purpose}): {request.action.display('angular_velocity')}, "
+            f"{100 * result.spilled:.1f} % spilled, {result.particles} particles"
         )
-        self.streams.film(
-            event.frames,
-            (scene.pourer, solid(scene.pourer)),
-            (scene.receiver, solid(scene.receiver)),
-            radius=0.5 * result.spacing,
-        )
-
-    def _poured(self, event: RequestFinished, request: Pour, outcome: Poured) -> None:
-        self._pours += 1
-        self.streams.at(wall=event.time, pour=self._pours)
-        measured = outcome.measurement
-        unit = unit_of_pour(self._plan, request)
-        value = loss_of_pour(self._plan, request, measured)
-        calibrating = is_calibration(self._plan, request)
-        place = "/calibration/loss" if calibrating else f"/pours/{safe_name(request.scene)}"
-        if value is None:
-            self._say(f"pour {request.number}: too little was poured for a loss", "warning", event.stage)
-            return
-        shown = unit.factor * value
-        self.streams.number(f"{place}/measured", shown, name="measured", colour=style.MEASURED, points=True)
-        if request.predicted is not None:
-            mean = unit.factor * at_least_nothing(request.predicted.mean)
-            sigma = unit.factor * request.predicted.deviation
-            self.streams.number(f"{place}/predicted", mean, name="predicted", colour=style.PREDICTED)
-            self.streams.number(
-                f"{place}/predicted_low", max(mean - 2 * sigma, 0.0), name="predicted − 2 σ", colour=style.PALE
-            )
-            self.streams.number(f"{place}/predicted_high", mean + 2 * sigma, name="predicted + 2 σ", colour=style.PALE)
-        if not calibrating:
-            best = min(shown, self._best.get(request.scene, shown))
-            self._best[request.scene] = best
-            self.streams.number(f"{place}/best", best, name="best so far", colour=style.BEST)
-            self._about[f"best of {self._name(request.scene)}"] = f"{best:.2f} {unit.unit}"
-        self._say(
-            f"pour {request.number} of {self._name(request.scene)}: {shown:.2f} {unit.unit} "
-            f"({1e3 * measured.spilled:.1f} g spilled, {1e3 * measured.retained:.1f} g retained)",
-            source=event.stage,
-        )
-        self._page()
-
-    def _suggested(self, event: RequestFinished, request: Suggest, outcome: Suggested) -> None:
-        problem, suggestion = request.problem, outcome.suggestion
-        if suggestion.surrogate is None:
-            return
-        # A space of actions belongs to the receiver in question, one of simulation parameters to the calibration.
-        acting = problem.space.names[0] in ACTION_DIMENSIONS
-        scene = self._scene_of_stage.get(event.stage)
-        place = f"/maps/{safe_name(scene)}" if acting and scene is not None else "/maps/calibration"
-        unit = deployment_unit(self._plan.deployment) if acting and self._plan.deployment else DISCREPANCY
-        said = self.streams.surrogate(place, problem.space, suggestion.surrogate, problem.data.points, unit.factor)
-        self._about[f"map {self._name(scene) if acting and scene is not None else 'calibration'}"] = (
-            f"{unit.label}: {said}"
-        )
-        self._page()
-
-    def _name(self, scene: str) -> str:
-        return self._names.get(scene, scene)
+        self._say(f"recorded {title}", source=event.stage)
+        self._simulated.film(event.frames, self._scenes[request.scene], title, now=event.time, step=self._step)
 
     def _action(self, pour: Pour) -> str:
         plan = self._plan.calibration if is_calibration(self._plan, pour) else self._plan.deployment
         return pour.action.display(*(plan.actions.names if plan is not None else ()))
+
+
+def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
+    """All scenes of a campaign, by name."""
+    scenes: dict[str, Scene] = {}
+    if plan.calibration is not None:
+        for records in (plan.calibration.records, plan.calibration.transfer):
+            if records is not None:
+                scenes[records.scene.name] = records.scene
+        scenes[plan.calibration.scene.name] = plan.calibration.scene
+    if plan.deployment is not None:
+        scenes.update({scene.name: scene for scene in plan.deployment.scenes})
+    return scenes

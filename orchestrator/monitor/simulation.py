@@ -5,20 +5,23 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from orchestrator.monitor.recording import solid
-from orchestrator.monitor.streams import Streams
+from orchestrator.monitor.blueprint import simulation_blueprint
+from orchestrator.monitor.films import Films
+from orchestrator.monitor.outlet import Outlet
+from orchestrator.monitor.simulated import SimulatedStage
 from orchestrator.report import style
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
 
 
-def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour) -> Path:
+def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str = "") -> Path:
     """Write a recording of one simulated pour.
 
     Args:
         path: `.rrd` to write; replaced if it exists.
         task: what was simulated, with `record_rate` > 0.
         result: what came of it.
+        title: of the recording; what is poured into what if not given.
 
     Returns:
         `path`.
@@ -27,24 +30,30 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour) -> Path:
         ValueError: the result has no frames.
         OSError: the file can't be written.
     """
+    import rerun as rr
+
     if result.frames is None:
         raise ValueError("this simulation kept no frames to record; simulate it with a record rate above 0")
     scene, outcome = task.scene, result.outcome
-    streams = Streams(path, name=f"{scene.pourer.name} into {scene.receiver.name}, seed {task.seed}")
-    streams.at(wall=time.time(), pour=0)
-    streams.film(
-        result.frames,
-        (scene.pourer, solid(scene.pourer)),
-        (scene.receiver, solid(scene.receiver)),
-        radius=0.5 * outcome.spacing,
-    )
-    streams.line(f"action: {style.display_values(task.action.values())}", source="action")
-    streams.line(f"simulation parameters: {style.display_values(task.parameters.model_dump())}", source="parameters")
-    streams.line(
-        f"received {100 * outcome.received:.2f} %, spilled {100 * outcome.spilled:.2f} %, "
-        f"retained {100 * outcome.retained:.2f} %, in flight {100 * outcome.in_flight:.2f} %",
-        level="info" if outcome.invalid is None else "warning",
-        source="outcome",
-    )
-    streams.close()
+    title = title or f"{scene.pourer.name} into {scene.receiver.name}, seed {task.seed}"
+    outlet = Outlet(path, application="decant simulation", name=title)
+    outlet.show(simulation_blueprint())
+    outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    films = Films(outlet)
+    now = time.time()
+    outlet.times(wall=now, step=0, sim_time=0.0)
+    SimulatedStage(outlet, films).film(result.frames, scene, title, now=now, step=0)
+    films.play(float("inf"))
+    for source, text in (
+        ("action", style.display_values(task.action.values())),
+        ("parameters", style.display_values(task.parameters.model_dump())),
+        (
+            "outcome",
+            f"received {100 * outcome.received:.2f} %, spilled {100 * outcome.spilled:.2f} %, "
+            f"retained {100 * outcome.retained:.2f} %, in flight {100 * outcome.in_flight:.2f} %",
+        ),
+    ):
+        level = rr.TextLogLevel.WARN if source == "outcome" and outcome.invalid is not None else rr.TextLogLevel.INFO
+        outlet.log(f"/log/{source}", rr.TextLog(text, level=level))
+    outlet.close()
     return path

@@ -47,6 +47,13 @@ class Opening:
 
 
 @dataclass(frozen=True)
+class Missed:
+    """So many events were dropped until now."""
+
+    dropped: int
+
+
+@dataclass(frozen=True)
 class Closing:
     """The last message; `dropped` events never came."""
 
@@ -90,7 +97,9 @@ class Writing:
         """
         threading.Thread(target=self._read, args=(source,), daemon=True).start()
         while not isinstance(item := self._next(), Closing):
-            if item is not None:
+            if isinstance(item, Missed):
+                self._recording.missed(item.dropped)
+            elif item is not None:
                 self._guard(lambda item=item: self._recording.handle(item))  # type: ignore[misc]
             self._guard(lambda: self._recording.play(time.time()))
         self._guard(lambda: self._recording.close(item.dropped))

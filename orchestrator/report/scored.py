@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from orchestrator.config.campaign.records import column_name
 from orchestrator.report import style
 from orchestrator.scoring import ScoredRow, score
 from sim_engine.action import ACTION_DIMENSIONS
+
+NOTE_WIDTH = 44
+"""Characters of a line in the picture's lower right corner, where no pour lies unless it was foretold badly."""
 
 COLOURS = {"train": style.PALE, "test": style.MEASURED, "transfer": style.BEST}
 SAID = {"train": "pours that θ was fitted to", "test": "unseen pours", "transfer": "another receiver"}
@@ -120,5 +124,14 @@ def draw_scored(path: Path, rows: Sequence[ScoredRow], *, title: str, note: str)
         grid="both",
     )
     figure.legend(loc="outside lower center", fontsize=8.5, frameon=False)
-    figure.supxlabel(note, fontsize=8.0, color=style.GREY)
+    axes.text(
+        0.98,
+        0.02,
+        textwrap.fill(note, NOTE_WIDTH),
+        transform=axes.transAxes,
+        ha="right",
+        va="bottom",
+        fontsize=8.0,
+        color=style.GREY,
+    )
     return style.save(figure, path)

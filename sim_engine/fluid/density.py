@@ -18,6 +18,7 @@ import taichi as ti
 
 from sim_engine.fluid.kernels import SIGMA, slope, wall_density, wall_slope, weight
 from sim_engine.fluid.state import SUPPORT, VESSELS
+from sim_engine.fluid.vectors import length, square
 
 PACKING = 1.012
 """Kernel sum of bulk liquid of spacing d over its continuum value, measured on a cup at rest: with it the density there
@@ -42,7 +43,7 @@ def measure_first(f: ti.template(), s):
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
             r = xi - f.x[j]
-            r2 = r.dot(r)
+            r2 = square(r)
             u = ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0)
             w = weight(u)
             g = slope(u)
@@ -63,7 +64,7 @@ def measure_first(f: ti.template(), s):
             if q < 1.0:
                 n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                 total -= wall_slope(q) * inv_h * n
-        f.squares[i] = scale * scale * f.squares[i] + total.dot(total) + 0.05 * inv_h * inv_h
+        f.squares[i] = scale * scale * f.squares[i] + square(total) + 0.05 * inv_h * inv_h
 
 
 @ti.func
@@ -78,7 +79,7 @@ def measure(f: ti.template(), s):
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
             r = xi - f.x[j]
-            w = weight(ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0))
+            w = weight(ti.max(1.0 - length(r) * inv_h, 0.0))
             rho += w
             f.density[j] = f.density[j] + w
         f.density[i] = f.density[i] + rho
@@ -171,7 +172,7 @@ def displace(f: ti.template(), s):
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
             r = xi - f.x[j]
-            u = ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0)
+            u = ti.max(1.0 - length(r) * inv_h, 0.0)
             m = ((pi + f.dp[j]) * slope(u) * scale) * r
             move += m
             f.dx[j] = f.dx[j] - m

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 from collections.abc import Sequence
 from typing import Generic, TypeVar
 
@@ -227,6 +228,23 @@ class _Pool(Generic[T]):
         return np.ascontiguousarray(np.concatenate(self._parts))
 
 
+def _without_places() -> None:
+    """Keep Taichi from drawing the line and carets of an error message for each of the thousands of nodes of a kernel.
+
+    Nobody reads them while kernels compile, and they are half of the time that even known kernels take to be looked up
+    in the cache. `DECANT_KERNEL_PLACES=1` leaves them in, for who changes a kernel.
+    """
+    from taichi.lang.ast import ast_transformer_utils
+
+    context = getattr(ast_transformer_utils, "ASTTransformerContext", None)
+    if context is not None and hasattr(context, "get_pos_info") and not os.environ.get("DECANT_KERNEL_PLACES"):
+        context.get_pos_info = _no_place
+
+
+def _no_place(context: object, node: object) -> str:
+    return ""
+
+
 def start(backend: str) -> None:
     """Start Taichi.
 
@@ -234,6 +252,7 @@ def start(backend: str) -> None:
         BackendError: this machine has no such backend.
     """
     require_backend(backend)
+    _without_places()
     # Taichi says on which architecture it starts, on stdout, which is for results alone.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
@@ -243,6 +262,8 @@ def start(backend: str) -> None:
             offline_cache_file_path=str(cache_directory() / "kernels"),
             log_level=ti.ERROR,
             enable_fallback=False,
+            # Its passes over one large kernel take two thirds of the time to compile it, and win nothing in a pour.
+            cfg_optimization=False,
         )
 
 

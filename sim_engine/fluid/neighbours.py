@@ -6,6 +6,7 @@ Source: Green 2010 (counting sort on a grid); Verlet 1967 (lists with a skin).
 import taichi as ti
 
 from sim_engine.fluid.state import NEIGHBOURS, SUPPORT
+from sim_engine.fluid.vectors import square
 from sim_engine.outcome import ParticleState
 
 SPILLED = int(ParticleState.SPILLED)
@@ -98,7 +99,7 @@ def rebuild(f: ti.template(), s, skin):
                     # Branch-free: write always, keep by counting on.
                     r = xi - f.x[j]
                     f.neighbour[entries] = j
-                    entries += ti.cast(r.dot(r) < reach2, ti.i32)
+                    entries += ti.cast(square(r) < reach2, ti.i32)
         f.count[i] = entries - f.first[i]
         if entries > last:
             f.fault[s] = 1
@@ -157,7 +158,7 @@ def list_widely(f: ti.template(), s, reach):
                 for k in range(k0, f.cell_start[column + ti.min(q[2] + 1, size[2] - 1)]):
                     r = xi - f.x_copy[k]
                     f.neighbour[entries] = f.ranked[k]
-                    entries += ti.cast(r.dot(r) < reach2, ti.i32)
+                    entries += ti.cast(square(r) < reach2, ti.i32)
         f.count[i] = entries - f.first[i]
         if entries > last:
             f.fault[s] = 1

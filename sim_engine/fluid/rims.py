@@ -19,6 +19,7 @@ Source: ours; critical flow over a crest: Henderson 1966, Open Channel Flow, sec
 import taichi as ti
 
 from sim_engine.fluid.state import VESSELS
+from sim_engine.fluid.vectors import square, turned
 from sim_engine.fluid.walls import to_vessel
 
 NEAR = 4.0
@@ -38,9 +39,9 @@ def lower_rims(f: ti.template(), s, dt):
         for b in range(VESSELS):
             if f.phi[i][b] < NEAR * d:
                 y = to_vessel(f, s, b, f.x[i], False)
-                carried = f.turn[s, b] @ y + f.origin[s, b] - f.turn0[s, b] @ y - f.origin0[s, b]
+                carried = turned(f.turn[s, b], y) + f.origin[s, b] - turned(f.turn0[s, b], y) - f.origin0[s, b]
                 u = f.v[i] - carried / dt
-                aim = f.lip_drop[s] * ti.max(d - u.norm_sqr() / gravity, 0.0)
+                aim = f.lip_drop[s] * ti.max(d - square(u) / gravity, 0.0)
                 change = share * (aim - f.sag[i][b])
                 f.sag[i][b] = f.sag[i][b] + ti.min(ti.max(change, -SLOWLY * d), SLOWLY * d)
             else:

@@ -14,6 +14,7 @@ from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
+from sim_engine.fluid.vectors import dot, length, square, turned
 from sim_engine.fluid.viscosity import relax
 from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
 from sim_engine.outcome import ParticleState
@@ -91,7 +92,7 @@ class Stepper:
         f = self.state
         fastest = ti.cast(0.0, ti.f32)
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            fastest = ti.max(fastest, f.v[i].norm_sqr())
+            fastest = ti.max(fastest, square(f.v[i]))
         return ti.sqrt(fastest)
 
     @ti.func
@@ -107,17 +108,17 @@ class Stepper:
             v[2] -= f.gravity[s] * dt
             x = x0 + dt * v
             # φ is that of the end of the last step: solid farther off than the way can't be met.
-            reach = STRETCH * (dt * v.norm() + f.swing[s]) + 2.0 * clear
+            reach = STRETCH * (dt * length(v) + f.swing[s]) + 2.0 * clear
             for b in range(VESSELS):
                 if f.phi[i][b] < reach:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
                     y = swept(f, grids, s, b, y0, y1, clear, f.sag[i][b])
-                    if (y - y1).norm_sqr() > 0.0:
+                    if square(y - y1) > 0.0:
                         x = to_world(f, s, b, y)
             f.x[i] = x
             f.push[i] = ti.Vector([0.0, 0.0])
-            if (x - f.x_listed[i]).norm_sqr() > limit * limit:
+            if square(x - f.x_listed[i]) > limit * limit:
                 f.stale[s] = 1
 
     @ti.func
@@ -131,7 +132,7 @@ class Stepper:
                     f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False), f.sag[i][b]
                 )
                 f.phi[i][b] = look[3]
-                n = f.turn[s, b] @ ti.Vector([look[0], look[1], look[2]])
+                n = turned(f.turn[s, b], look)
                 for c in ti.static(range(3)):
                     f.normal[i][b, c] = n[c]
 
@@ -149,7 +150,7 @@ class Stepper:
                 phi = f.phi[i][b]
                 if phi < 4.0 * f.spacing[s]:
                     n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
-                    phi += n.dot(f.dx[i])
+                    phi += dot(n, f.dx[i])
                     if phi < 0.0:
                         x -= phi * n
                         f.push[i][b] = f.push[i][b] - phi
@@ -203,17 +204,22 @@ class Stepper:
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             x = f.x[i]
             x0 = f.x0[i]
-            reach = STRETCH * ((x - x0).norm() + f.swing[s]) + d
+            reach = STRETCH * (length(x - x0) + f.swing[s]) + d
             for b in range(VESSELS):
                 if f.phi[i][b] < reach:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
                     y = y1
-                    look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, f.sag[i][b])
-                    risky = look[3] < STRETCH * (y1 - y0).norm()
-                    if risky:
-                        y = swept(f, grids, s, b, y0, y1, 0.5 * clear, f.sag[i][b])
+                    look = ti.Vector([0.0, 0.0, 0.0, FAR])
+                    risky = False
+                    looks = 1
+                    while looks > 0:
                         look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, f.sag[i][b])
+                        looks -= 1
+                        if not risky and look[3] < STRETCH * length(y1 - y0):
+                            risky = True
+                            looks = 1
+                            y = swept(f, grids, s, b, y0, y1, 0.5 * clear, f.sag[i][b])
                     n = ti.Vector([look[0], look[1], look[2]])
                     phi = look[3]
                     push = f.push[i][b]
@@ -224,11 +230,11 @@ class Stepper:
                     if push > 0.0 and phi < 1.5 * d:
                         # Coulomb: the wall, which moves with the vessel's frame, holds back at most μ times its push.
                         way = y - y0
-                        along = way - way.dot(n) * n
-                        length = along.norm()
-                        if length > 1e-9:
-                            y -= along * ti.min(f.friction[s] * push / length, 1.0)
-                    if (y - y1).norm_sqr() > 0.0:
+                        along = way - dot(way, n) * n
+                        slid = length(along)
+                        if slid > 1e-9:
+                            y -= along * ti.min(f.friction[s] * push / slid, 1.0)
+                    if square(y - y1) > 0.0:
                         x = to_world(f, s, b, y)
                     f.phi[i][b] = phi
                     if risky:
@@ -295,7 +301,7 @@ class Stepper:
         self.place_pourer(s, f.time[s], poses)
         # No point within SWING_ARM of the pourer's origin is carried farther than this in the step.
         turned = f.turn[s, 0] - f.turn0[s, 0]
-        f.swing[s] = (f.origin[s, 0] - f.origin0[s, 0]).norm() + turned.norm() * SWING_ARM
+        f.swing[s] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * SWING_ARM
         self.predict(s, dt, grids)
         if f.stale[s] == 1:
             rebuild(f, s, SKIN)

@@ -34,6 +34,7 @@ from sim_engine.fluid.kernels import (
 )
 from sim_engine.fluid.neighbours import list_widely
 from sim_engine.fluid.state import VESSELS
+from sim_engine.fluid.vectors import dot, length
 
 RANGE = 3.0
 """Over spacing d."""
@@ -81,7 +82,7 @@ def pull(f: ti.template(), s, dt):
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
             r = (xi - f.x[j]) * inv_h
-            q = ti.sqrt(r.dot(r)) + 1e-9
+            q = length(r) + 1e-9
             u = ti.max(1.0 - q, 0.0)
             w = bond(u)
             g = (attraction(u) / q) * r
@@ -93,12 +94,12 @@ def pull(f: ti.template(), s, dt):
         f.gradient[i] = f.gradient[i] + lean
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         lean = f.gradient[i] / PLANE
-        length = lean.norm() + 1e-9
-        g = ti.max(length - CALM, 0.0)
+        size = length(lean) + 1e-9
+        g = ti.max(size - CALM, 0.0)
         lacking = ti.max(BONDED - f.squares[i] / WHOLE, 0.0)
         energy = ti.sqrt(g * g + (ALONE * lacking) ** 2 + BLUNT**2)
         # Derivatives of the energy by the two sums; the second one is negative, and kept without its sign.
-        f.gradient[i] = (g / (length * PLANE * energy)) * lean
+        f.gradient[i] = (g / (size * PLANE * energy)) * lean
         f.dp[i] = ALONE**2 * lacking / (WHOLE * energy)
         f.squares[i] = g + lacking
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -112,12 +113,12 @@ def pull(f: ti.template(), s, dt):
             if calm and f.squares[j] == 0.0:
                 continue
             r = (xi - f.x[j]) * inv_h
-            q = ti.sqrt(r.dot(r)) + 1e-9
+            q = length(r) + 1e-9
             u = ti.max(1.0 - q, 0.0)
             e = r / q
             g = gi - f.gradient[j]
             across = attraction(u) / q
-            along = (attraction_slope(u) - across) * g.dot(e) + (pi + f.dp[j]) * attraction(u)
+            along = (attraction_slope(u) - across) * dot(g, e) + (pi + f.dp[j]) * attraction(u)
             pair = across * g + along * e
             force += pair
             f.dv[j] = f.dv[j] + pair
@@ -126,7 +127,7 @@ def pull(f: ti.template(), s, dt):
     bound = LARGEST_PULL * f.spacing[s] / dt
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         change = strength * f.dv[i]
-        f.v[i] = f.v[i] + ti.min(1.0, bound / (change.norm() + 1e-9)) * change
+        f.v[i] = f.v[i] + ti.min(1.0, bound / (length(change) + 1e-9)) * change
 
 
 def pull_interval(tension: float, density: float, spacing: float) -> float:

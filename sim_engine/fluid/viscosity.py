@@ -18,6 +18,7 @@ import taichi as ti
 
 from sim_engine.fluid.kernels import weight
 from sim_engine.fluid.state import SUPPORT
+from sim_engine.fluid.vectors import dot, length, square
 
 EDDIES = 5.0 * 0.17**2 * math.sqrt(15.0)
 """Rate of relaxation over the rate at which a pair parts."""
@@ -42,9 +43,9 @@ def relax(f: ti.template(), s, dt):
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
             r = xi - f.x[j]
-            w = weight(ti.max(1.0 - ti.sqrt(r.dot(r)) * inv_h, 0.0))
+            w = weight(ti.max(1.0 - length(r) * inv_h, 0.0))
             u = f.v[j] - vi
-            parting = ti.abs(u.dot(r)) / (r.dot(r) + closest)
+            parting = ti.abs(dot(u, r)) / (square(r) + closest)
             towards = w * (1.0 - ti.exp(-(f.viscosity[s] + EDDIES * parting) * dt)) * u
             total += w
             drift += towards

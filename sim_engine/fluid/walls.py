@@ -11,6 +11,7 @@ motion) is traced through the grid, and stops where it meets solid.
 
 import taichi as ti
 
+from sim_engine.fluid.vectors import dot, length, turned, turned_back
 from sim_engine.liquid import LARGEST_LIP_DROP
 
 FAR = 1.0
@@ -39,16 +40,16 @@ def to_vessel(f: ti.template(), s, b, x, before: ti.template()):
     """World → vessel frame, at the end of the step or before it."""
     y = x
     if ti.static(before):
-        y = f.turn0[s, b].transpose() @ (x - f.origin0[s, b])
+        y = turned_back(f.turn0[s, b], x - f.origin0[s, b])
     else:
-        y = f.turn[s, b].transpose() @ (x - f.origin[s, b])
+        y = turned_back(f.turn[s, b], x - f.origin[s, b])
     return y
 
 
 @ti.func
 def to_world(f: ti.template(), s, b, y):
     """Vessel frame → world at the end of the step."""
-    return f.turn[s, b] @ y + f.origin[s, b]
+    return turned(f.turn[s, b], y) + f.origin[s, b]
 
 
 @ti.func
@@ -114,9 +115,8 @@ def distance_and_gradient(f: ti.template(), grids: ti.template(), offset, s, b, 
         gz0 = d00 + w[1] * (d01 - d00)
         gz1 = d10 + w[1] * (d11 - d10)
         gz = gz0 + w[0] * (gz1 - gz0)
-        n = ti.Vector([gx, gy, gz])
-        length = n.norm() + 1e-12
-        result = ti.Vector([gx / length, gy / length, gz / length, c0 + w[0] * (c1 - c0)])
+        steep = ti.sqrt(gx * gx + gy * gy + gz * gz) + 1e-12
+        result = ti.Vector([gx / steep, gy / steep, gz / steep, c0 + w[0] * (c1 - c0)])
     return result
 
 
@@ -147,25 +147,25 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin, sag):
     leg = 0
     stride = 0
     while leg < 2:
-        length = way.norm()
+        left = length(way)
         phi = distance(f, grids, s, b, y, sag)
         if stride == 0:
             clear = ti.min(clear, 0.9 / STRETCH * ti.max(phi, 0.0))
         free = phi / STRETCH - clear
-        if length <= free or length < 1e-9:
+        if left <= free or left < 1e-9:
             y += way
             leg = 2
         elif free < 1e-5 or stride >= TRACE_STEPS:
             if leg == 0:
                 look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, sag)
                 n = ti.Vector([look[0], look[1], look[2]])
-                way -= ti.min(way.dot(n), 0.0) * n
+                way -= ti.min(dot(way, n), 0.0) * n
             clear *= 0.5
             stride = 1
             leg += 1
         else:
-            y += way * (free / length)
-            way *= 1.0 - free / length
+            y += way * (free / left)
+            way *= 1.0 - free / left
             stride += 1
     return y
 
@@ -174,9 +174,9 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin, sag):
 def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1, sag):
     """1 if a straight step in the vessel frame goes through the middle of a wall. Samples, apart from the sweep."""
     way = y1 - y0
-    length = way.norm()
+    far = length(way)
     hit = 0
-    samples = ti.min(ti.cast(length / (0.25 * f.wall[s, b]), ti.i32) + 2, 64)
+    samples = ti.min(ti.cast(far / (0.25 * f.wall[s, b]), ti.i32) + 2, 64)
     for k in range(samples + 1):
         if distance(f, grids, s, b, y0 + way * (k / samples), sag) < -0.35 * f.wall[s, b]:
             hit = 1

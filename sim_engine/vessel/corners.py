@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import fft, ndimage
 
 from sim_engine.vessel.sdf import SignedDistanceGrid
 
@@ -25,6 +25,23 @@ def half_space(q: Floats) -> Floats:
     u = np.clip(1.0 - np.abs(q), 0.0, 1.0)
     beyond = 21.0 * u**6 * (1.0 / 6.0 - u * (3.0 / 14.0 - u / 14.0))
     return np.where(q >= 0.0, beyond, 1.0 - beyond)
+
+
+def _convolved(values: Floats, kernel: Floats) -> Floats:
+    """Sums over the kernel where all of it lies inside the values; scipy.signal, which has that, takes long to load.
+
+    Args:
+        values: (a, b, c).
+        kernel: (k, k, k), symmetric.
+
+    Returns:
+        (a − k + 1, b − k + 1, c − k + 1).
+    """
+    shape = tuple(fft.next_fast_len(n + k - 1, real=True) for n, k in zip(values.shape, kernel.shape, strict=True))
+    product = fft.rfftn(values, shape) * fft.rfftn(kernel, shape)
+    inside = tuple(slice(k - 1, n) for n, k in zip(values.shape, kernel.shape, strict=True))
+    result: Floats = fft.irfftn(product, shape)[inside]
+    return result
 
 
 def equivalent_distance(
@@ -42,8 +59,6 @@ def equivalent_distance(
     Returns:
         Shape of the grid [m].
     """
-    from scipy import signal  # half a second to load, for those who only check a motion
-
     step = grid.spacing
     reach = int(np.ceil(support / step))
     z = grid.axes()[2]
@@ -59,7 +74,7 @@ def equivalent_distance(
     kernel = u**4 * (1.0 + 4.0 * r)
     kernel /= kernel.sum()
     padded = np.pad(solid, reach, mode="edge")
-    share = np.clip(signal.fftconvolve(padded, kernel, mode="valid"), 0.0, 1.0)
+    share = np.clip(_convolved(padded, kernel), 0.0, 1.0)
     q = np.linspace(-1.0, 1.0, 801)
     plane = support * np.interp(-share, -half_space(q), q)
     plane = np.where(share > 1e-4, plane, np.maximum(grid.values, support))

@@ -31,14 +31,14 @@ def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
         for event in watched.events(plan):
             monitor(event)
         with viewer(live.stream, tmp_path / "seen.rrd"):
-            contents = seen(tmp_path / "seen.rrd", lambda c: c.rows("/pours/narrow_cup/measured") == 3)
-        assert contents.values("/scene/receiver/mesh", "Mesh3D:vertex_positions")
+            contents = seen(tmp_path / "seen.rrd", lambda c: c.rows("/learning/narrow_cup/loss/measured") == 3)
+        assert contents.values("/simulation/receiver/mesh", "Mesh3D:vertex_positions")
         assert monitor.close(PATIENCE)
         with viewer(live.stream, tmp_path / "after.rrd"):
-            seen(tmp_path / "after.rrd", lambda c: ["ended: finished"] in c.values("/events/campaign", "TextLog:text"))
+            seen(tmp_path / "after.rrd", lambda c: ["ended: finished"] in c.values("/log/campaign", "TextLog:text"))
     assert (monitor.failed, monitor.dropped) == (0, 0)
     # what is on disk is complete, whoever looked
-    assert Contents(monitor.path).rows("/pours/narrow_cup/measured") == 3
+    assert Contents(monitor.path).rows("/learning/narrow_cup/loss/measured") == 3
 
 
 def test_two_campaigns_are_served_side_by_side(tmp_path: Path) -> None:
@@ -49,7 +49,7 @@ def test_two_campaigns_are_served_side_by_side(tmp_path: Path) -> None:
             for event in watched.events(plan):
                 monitor(event)
         with viewer(live.stream, tmp_path / "seen.rrd"):
-            seen(tmp_path / "seen.rrd", lambda c: c.rows("/pours/narrow_cup/measured") == 2)
+            seen(tmp_path / "seen.rrd", lambda c: c.rows("/learning/narrow_cup/loss/measured") == 2)
         assert all(monitor.close(PATIENCE) for monitor in monitors)
 
 
@@ -98,7 +98,7 @@ def test_server_that_dies_or_hangs_costs_the_recording_nothing(tmp_path: Path, d
         assert monitor.close(PATIENCE)
         if death == signal.SIGSTOP:
             os.kill(pid, signal.SIGCONT)
-    assert Contents(monitor.path).rows("/pours/narrow_cup/measured") == 1
+    assert Contents(monitor.path).rows("/learning/narrow_cup/loss/measured") == 1
 
 
 @pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGSTOP])

@@ -10,11 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.collections import PathCollection
 
-from orchestrator.events import LogLine
+from orchestrator.events import LogLine, RequestFinished
 from orchestrator.monitor.monitor import RerunMonitor
+from orchestrator.monitor.pictures import surrogate_picture
 from orchestrator.monitor.simulation import simulation_rrd
 from orchestrator.monitor.worker import QueueThread
+from orchestrator.report.units import DISCREPANCY
+from orchestrator.requests import Suggest, Suggested
 from sim_engine.simulated import RecordedFrames, SimulatedPour
 from tests.orchestrator import watched
 from tests.orchestrator.recorded import Contents
@@ -34,17 +38,17 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Contents:
 
 
 def test_recording_shows_both_vessels_and_the_particles_of_recorded_simulations(recorded: Contents) -> None:
-    for entity in ("/scene/pourer/mesh", "/scene/receiver/mesh"):
+    for entity in ("/simulation/pourer/mesh", "/simulation/receiver/mesh"):
         assert recorded.values(entity, "Mesh3D:vertex_positions")
     # two simulations of 3 s at 10 Hz
-    assert recorded.rows("/scene/liquid", "sim_time") == 2 * 31
-    assert all(len(row) == watched.PARTICLES for row in recorded.values("/scene/liquid", "Points3D:positions"))  # type: ignore[arg-type]
-    states = {state for row in recorded.values("/scene/liquid", "Points3D:class_ids") for state in row}  # type: ignore[attr-defined]
+    assert recorded.rows("/simulation/liquid", "sim_time") == 2 * 31
+    assert all(len(row) == watched.PARTICLES for row in recorded.values("/simulation/liquid", "Points3D:positions"))  # type: ignore[arg-type]
+    states = {state for row in recorded.values("/simulation/liquid", "Points3D:class_ids") for state in row}  # type: ignore[attr-defined]
     assert states == {0, 2, 3}
 
 
 def test_pourer_moves_in_the_recording_as_it_moved_in_the_simulation(recorded: Contents) -> None:
-    quaternions = recorded.values("/scene/pourer", "Transform3D:quaternion")
+    quaternions = recorded.values("/simulation/pourer", "Transform3D:quaternion")
     x, y, z, w = np.array([q[0] for q in quaternions], dtype=float).T  # type: ignore[index]
     tilts = np.degrees(2 * np.arctan2(y, w))
     assert np.allclose((x, z), 0.0)
@@ -53,57 +57,77 @@ def test_pourer_moves_in_the_recording_as_it_moved_in_the_simulation(recorded: C
 
 
 def test_recorded_simulations_follow_each_other_on_the_timeline_of_simulated_time(recorded: Contents) -> None:
-    times = 1e-9 * np.array(recorded.columns["/scene/liquid"]["sim_time"], dtype=np.int64)
+    times = 1e-9 * np.array(recorded.columns["/simulation/liquid"]["sim_time"], dtype=np.int64)
     assert len(np.unique(times)) == len(times), "two simulations share moments and would be shown through each other"
     assert times.max() == pytest.approx(3.0 + 0.5 + 3.0, abs=0.01)
 
 
 def test_every_pour_has_its_measured_and_predicted_loss_and_the_best_so_far(recorded: Contents) -> None:
     def numbers(what: str) -> list[float]:
-        return sorted(float(v[0]) for v in recorded.values(f"/pours/narrow_cup/{what}", "Scalars:scalars"))  # type: ignore[index]
+        return sorted(float(v[0]) for v in recorded.values(f"/learning/narrow_cup/loss/{what}", "Scalars:scalars"))  # type: ignore[index]
 
     # (spilled + retained) / loaded of 30, 15, 10 g beside and 2 g left, of 200 g
     assert numbers("measured") == pytest.approx([6.0, 8.5, 16.0])
     assert numbers("best") == pytest.approx([6.0, 8.5, 16.0])
     assert numbers("predicted") == pytest.approx([20 / 3, 10.0, 20.0])
     assert numbers("predicted_high") == pytest.approx([20 / 3 + 4, 14.0, 24.0])
-    assert recorded.columns["/pours/narrow_cup/measured"]["pour"][-1] == 3
+    assert recorded.columns["/learning/narrow_cup/loss/measured"]["step"][-1] >= 3
 
 
-def test_surrogate_maps_of_calibration_and_receiver_are_in_the_recording_with_their_observations(
-    recorded: Contents,
-) -> None:
-    for place, count in (("/maps/calibration", 1), ("/maps/narrow_cup", 3)):
-        for which in ("mean", "deviation"):
-            assert recorded.rows(f"{place}/{which}/picture") == count
-            assert recorded.rows(f"{place}/{which}/observed") == count
-    # The point (0.2, 0.3) of the unit square on a map of 9 × 9 cells of 16 pixels, the second axis upwards.
-    first = recorded.values("/maps/calibration/mean/observed", "Points2D:positions")[0][0]  # type: ignore[index]
-    assert first == pytest.approx([16 * (0.5 + 0.2 * 8), 16 * 9 - 16 * (0.5 + 0.3 * 8)], abs=1e-3)
+def test_surrogates_of_calibration_and_receiver_are_in_the_recording_as_pictures(recorded: Contents) -> None:
+    for place, count in (("calibration", 1), ("narrow_cup", 3)):
+        pictures = recorded.values(f"/learning/{place}/surrogate", "EncodedImage:blob")
+        assert len(pictures) == count
+        assert bytes(pictures[0][0][:8]) == b"\x89PNG\r\n\x1a\n"  # type: ignore[index]
 
 
-def test_map_of_two_out_of_three_parameters_is_a_cut_with_the_trials_projected_on_it(tmp_path: Path) -> None:
-    plan = watched.campaign()
-    monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
-    for event in watched.three_parameters():
-        monitor(event)
-    assert monitor.close(timeout=PATIENCE)
-    assert (monitor.failed, monitor.dropped) == (0, 0)
-    contents = Contents(monitor.path)
-    assert contents.rows("/maps/calibration/mean/picture") == 1
-    # (0.2, 0.9, 0.3) of the unit cube on a map of the first and third axis, 9 × 9 cells of 16 pixels
-    first = contents.values("/maps/calibration/mean/observed", "Points2D:positions")[0][0]  # type: ignore[index]
-    assert first == pytest.approx([16 * (0.5 + 0.2 * 8), 16 * 9 - 16 * (0.5 + 0.3 * 8)], abs=1e-3)
-    page = contents.values("/state", "TextDocument:text")[-1][0]  # type: ignore[index]
-    assert r"| \|measured − simulated\| spillage [%]: mean" in page, "the bars would end the table's cell"
-    assert "to the right particles 500 … 4 000, upwards friction 0 … 0.5; others at cohesion 0.04 N/m" in page
+def test_picture_of_a_surrogate_has_axes_units_data_and_the_next_point() -> None:
+    (event,) = watched.three_parameters()
+    assert isinstance(event, RequestFinished)
+    assert isinstance(event.request, Suggest)
+    assert isinstance(event.outcome, Suggested)
+    figure = surrogate_picture(event.request.problem, event.outcome.suggestion, DISCREPANCY, "θ")
+    panels = [axes for axes in figure.axes if axes.get_title(loc="left")]
+    assert [axes.get_title(loc="left") for axes in panels] == [
+        "expected |measured − simulated| spillage [%]",
+        "± σ [%]",
+        "lower bound, mean − 2 σ [%]",
+    ]
+    assert panels[0].get_xlabel() == "number of particles"
+    assert panels[0].get_ylabel() == "wall friction"
+    assert "held: cohesion 0.04 N/m" in figure.get_suptitle()
+    # (0.2, 0.9, 0.3) of the unit cube was observed, (0.3, 0.4, 0.7) is next: particles on a logarithmic axis, friction
+    points = [c for c in panels[0].collections if isinstance(c, PathCollection)]
+    observed, following = (np.asarray(c.get_offsets())[0] for c in points)
+    assert observed == pytest.approx([500 * 8**0.2, 0.15], rel=2e-3)
+    assert following == pytest.approx([500 * 8**0.3, 0.35], rel=2e-3)
+
+
+def test_page_says_at_a_glance_whether_it_is_real_and_what_is_going_on(recorded: Contents) -> None:
+    pages = [str(row[0]) for row in recorded.values("/status", "TextDocument:text")]  # type: ignore[index]
+    assert all(page.startswith("# VIRTUAL: ") for page in pages)
+    assert any("**Pour 2**: the arm tilts" in page for page in pages)
+    assert "Best into narrow: 6.00 %" in pages[-1]
+
+
+def test_lanes_of_the_machine_show_who_works_at_what(recorded: Contents) -> None:
+    simulators = [row[0] for row in recorded.values("/machine/lanes/simulator_1", "StateChange:state")]  # type: ignore[index]
+    assert simulators == ["calibrate", "idle"] * 2
+    arm = [row[0] for row in recorded.values("/machine/lanes/arm", "StateChange:state")]  # type: ignore[index]
+    assert arm == ["tilt", "idle"] * 3
+    assert len(recorded.values("/machine/wait", "Scalars:scalars")) == 2
+
+
+def test_wall_clock_shows_films_at_their_own_pace(recorded: Contents) -> None:
+    walls = np.sort(1e-9 * np.array(recorded.columns["/simulation/liquid"]["wall"], dtype=np.int64))
+    assert walls[30] - walls[0] == pytest.approx(3.0, abs=0.01), "a film of three seconds lasts three seconds"
 
 
 def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> None:
     lines = [
         str(v[0])  # type: ignore[index]
         for entity in recorded.columns
-        if entity.startswith("/events/")
+        if entity.startswith("/log/")
         for v in recorded.values(entity, "TextLog:text")
     ]
     assert "pour 2: least lower bound" in lines
@@ -117,7 +141,7 @@ def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_pat
     for event in watched.events(plan):
         monitor(event)
     assert monitor.close(timeout=PATIENCE)
-    assert Contents(monitor.path).blueprints == 1
+    assert Contents(monitor.path).blueprints == 3, "calibrating, deploying, replaying"
     checked = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "verify", str(monitor.path)],
         capture_output=True,
@@ -161,7 +185,7 @@ def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None
         monitor(event)
     assert monitor.close(timeout=PATIENCE)
     assert monitor.failed == 1
-    assert Contents(monitor.path).rows("/pours/narrow_cup/measured") == 3
+    assert Contents(monitor.path).rows("/learning/narrow_cup/loss/measured") == 3
 
 
 def test_slow_disk_drops_and_counts_events_and_never_holds_up_the_campaign() -> None:
@@ -203,7 +227,7 @@ def test_dropped_events_are_said_in_the_recording(tmp_path: Path, monkeypatch: p
     assert monitor.dropped > 0
     dropped = monitor.dropped
     assert monitor.close(timeout=PATIENCE)
-    said = Contents(monitor.path).values("/events/recording", "TextLog:text")
+    said = Contents(monitor.path).values("/log/recording", "TextLog:text")
     assert said == [[f"{dropped} events are missing: the recording could not keep up"]]
 
 
@@ -211,7 +235,7 @@ def test_simulation_recording_thins_particles_to_ten_frames_a_second(tmp_path: P
     task, result = watched.simulation()
     dense = SimulatedPour(result.outcome, watched.frames(rate=50.0))
     contents = Contents(simulation_rrd(tmp_path / "pour.rrd", task, dense))
-    assert contents.rows("/scene/liquid", "sim_time") == 31
+    assert contents.rows("/simulation/liquid", "sim_time") == 31
     assert contents.blueprints == 1
 
 

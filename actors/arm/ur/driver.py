@@ -145,7 +145,8 @@ class UrArm:
         """Where the arm is; answered at once, also during a motion."""
         leg, progress = self._leg, self._session.progress
         if leg is None:
-            return ArmState(stopped=self._stopped, tilt=self._tilt)
+            joints = () if progress is None else progress.joints
+            return ArmState(stopped=self._stopped, tilt=self._tilt, joints=joints)
         clock = 0.0 if progress is None or self._announced else min(progress.clock, leg.path.duration)
         return ArmState(
             moving=not self._announced,
@@ -154,6 +155,7 @@ class UrArm:
             fraction=clock / leg.path.duration,
             phase="announced" if self._announced else leg.phase(clock),
             tilt=leg.tilt(clock),
+            joints=() if progress is None else progress.joints,
         )
 
     # ---- motions

@@ -11,34 +11,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects import status_lines
-from actors.balance.dialects.dialect import Dialect, LineSettings
-from actors.balance.reading import Reading, Reply
 from actors.balance.virtual_serial.voice import Voice
 
 
 @dataclass(frozen=True, kw_only=True)
-class MtSics(Dialect):
+class MtSics(status_lines.StatusLines):
     """See the module's text."""
 
     name: str = "mt-sics"
     title: str = "Mettler-Toledo MT-SICS"
-    lines: tuple[LineSettings, ...] = tuple(LineSettings(baud) for baud in (9600, 19200, 4800, 2400, 1200))
     gap: float = 0.05
-    query: bytes = b"SI\r\n"
-    tare: bytes = b"T\r\n"
-    zero: bytes | None = b"Z\r\n"
-    cancel: bytes | None = b"@\r\n"
-    acknowledged: bool = True
-    turn: int = 2
-    identity: tuple[str, ...] = status_lines.IDENTITY
-
-    def decode(self, line: bytes) -> Reply:
-        """See `Dialect.decode`."""
-        return status_lines.decode(line)
-
-    def encode(self, reading: Reading) -> bytes:
-        """See `Dialect.encode`."""
-        return status_lines.encode(reading)
 
     def likeness(self, said: Mapping[str, str]) -> int:
         """See `Dialect.likeness`."""

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-from actors.balance.dialects.dialect import number_in, text_of
+from actors.balance.dialects.dialect import Dialect, number_in, text_of
 from actors.balance.reading import Acknowledgement, Answer, LineError, Reading, Reply, Status
 from actors.balance.virtual_serial.voice import END, Display, Lines, Repeat, Said, Waiting, line_of, weight_line
 
@@ -88,6 +89,27 @@ IDENTITY = ("I1", "I2")
 """Ask for the levels of commands, and for the model."""
 
 _SIGNS = {Status.OVER: "+", Status.UNDER: "-"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatusLines(Dialect):
+    """What the dialects of such lines have in common."""
+
+    query: bytes = b"SI\r\n"
+    tare: bytes = b"T\r\n"
+    zero: bytes | None = b"Z\r\n"
+    cancel: bytes | None = b"@\r\n"
+    acknowledged: bool = True
+    turn: int = 2
+    identity: tuple[str, ...] = IDENTITY
+
+    def decode(self, line: bytes) -> Reply:
+        """See `Dialect.decode`."""
+        return decode(line)
+
+    def encode(self, reading: Reading) -> bytes:
+        """See `Dialect.encode`."""
+        return encode(reading)
 
 
 class StatusLineVoice:

@@ -93,7 +93,9 @@ class Section(BaseModel):
     with one bad value still takes part in the checks of the others, and all errors of a file come at once.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, populate_by_name=False, use_attribute_docstrings=True, defer_build=True
+    )
 
     required: ClassVar[dict[str, str]] = {}
     """Keys that must be given, each with an example."""

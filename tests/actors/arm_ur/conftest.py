@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 
 from actors.arm.joint_path import PourPath
 from actors.arm.ur.driver import UrArm
+from actors.contracts import arm as contract
 from actors.virtual_ur import VirtualController
 from tests.patience import PATIENCE
 
@@ -29,21 +29,8 @@ def next_address() -> str:
     return f"127.{160 + pid % 64}.{pid // 64 % 256}.{number}"
 
 
-class Call(threading.Thread):
-    """A blocking call in a thread."""
-
-    def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
-        super().__init__(daemon=True)
-        self._call, self._arguments = call, arguments
-        self.value: Any = None
-        self.error: Exception | None = None
-        self.start()
-
-    def run(self) -> None:
-        try:
-            self.value = self._call(*self._arguments)
-        except Exception as error:
-            self.error = error
+class Call(contract.Call):
+    """A blocking call in a thread, with what it gave."""
 
     def result(self, patience: float = PATIENCE) -> Any:
         self.join(patience)

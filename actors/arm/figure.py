@@ -1,0 +1,151 @@
+"""What an arm looks like to those who watch: where its links are for given joints, as plain rounded bars. No driver.
+
+Bars and not a manufacturer's meshes: they are worked out from the kinematics, and nobody's drawings are copied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One link.
+
+    Attributes:
+        name: for people.
+        radius: [m].
+    """
+
+    name: str
+    radius: float
+
+
+class ArmFigure(Protocol):
+    """Where everything of an arm is, in the world of pours (`actors.arm.geometry`)."""
+
+    @property
+    def bars(self) -> tuple[Bar, ...]:
+        """The links, from the base to the tool; each as long as it always is."""
+        ...
+
+    @property
+    def home(self) -> tuple[float, ...]:
+        """Joints where it waits [rad]."""
+        ...
+
+    @property
+    def table(self) -> float:
+        """Height of the table [m]."""
+        ...
+
+    def ends(self, joints: FloatArray) -> FloatArray:
+        """Both ends of every bar, shape (..., bars, 2, 3) [m], for joints (..., n) [rad]."""
+        ...
+
+    def tool(self, joints: FloatArray) -> FloatArray:
+        """Poses of the tool centre point, shape (T, 7), for joints (T, n)."""
+        ...
+
+    def pourer(self, joints: FloatArray) -> FloatArray:
+        """Poses of the vessel in the hand, shape (T, 7), for joints (T, n)."""
+        ...
+
+    def tool_of(self, poses: FloatArray) -> FloatArray:
+        """Places of the tool centre point, shape (T, 3) [m], for poses (T, 7) of the vessel in the hand."""
+        ...
+
+    def executed(self, record: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+        """Times (T,) [s] and joints (T, n) [rad] of a pour's record (`Executed.record`); None where it has none."""
+        ...
+
+
+@dataclass(frozen=True)
+class LinkFigure:
+    """A UR arm, drawn by its kinematics.
+
+    Args:
+        spec: of the arm and its cell (`actors.arm.spec.UrArmSpec`).
+    """
+
+    spec: Any
+
+    @property
+    def bars(self) -> tuple[Bar, ...]:
+        """See `ArmFigure.bars`."""
+        return (
+            Bar("base", 0.075),
+            Bar("shoulder", 0.068),
+            Bar("upper arm", 0.055),
+            Bar("elbow", 0.055),
+            Bar("forearm", 0.045),
+            Bar("wrist 1", 0.043),
+            Bar("wrist 2", 0.043),
+            Bar("wrist 3", 0.04),
+            Bar("gripper", 0.022),
+        )
+
+    @property
+    def home(self) -> tuple[float, ...]:
+        """See `ArmFigure.home`."""
+        return tuple(self.spec.home)
+
+    @property
+    def table(self) -> float:
+        """See `ArmFigure.table`."""
+        return float(self.spec.cell.table - self.spec.cell.receiver[2])
+
+    def ends(self, joints: FloatArray) -> FloatArray:
+        """See `ArmFigure.ends`."""
+        from actors.arm.path.kinematics import MODELS, link_points
+        from actors.arm.path.transforms import cell_transforms, flange_transforms
+
+        cell, q = cell_transforms(self.spec), np.asarray(joints, dtype=float)
+        points = cell.base.apply(link_points(q, MODELS[self.spec.model]))
+        foot = np.broadcast_to(cell.base.position, (*q.shape[:-1], 1, 3))
+        flange = flange_transforms(q, self.spec)
+        tool = (flange @ cell.tool).position[..., None, :]
+        chain = cell.world.inverse.apply(np.concatenate([foot, points, tool], axis=-2))
+        ends: FloatArray = np.stack([chain[..., :-1, :], chain[..., 1:, :]], axis=-2)
+        return ends
+
+    def tool(self, joints: FloatArray) -> FloatArray:
+        """See `ArmFigure.tool`."""
+        from actors.arm.path.transforms import cell_transforms, flange_transforms, quaternions
+
+        cell = cell_transforms(self.spec)
+        frames = cell.world.inverse @ flange_transforms(np.asarray(joints, dtype=float), self.spec) @ cell.tool
+        return np.concatenate([frames.position, quaternions(frames.rotation)], axis=-1)
+
+    def pourer(self, joints: FloatArray) -> FloatArray:
+        """See `ArmFigure.pourer`."""
+        from actors.arm.path.transforms import pourer_motion
+
+        q = np.asarray(joints, dtype=float)
+        return pourer_motion(q, np.arange(len(q), dtype=float), self.spec).poses
+
+    def tool_of(self, poses: FloatArray) -> FloatArray:
+        """See `ArmFigure.tool_of`."""
+        from actors.arm.path.transforms import Transforms, cell_transforms
+        from sim_engine.contact import rotations
+
+        cell = cell_transforms(self.spec)
+        held = Transforms(rotations(poses), np.asarray(poses, dtype=float)[:, :3])
+        places: FloatArray = (held @ cell.pourer.inverse @ cell.tool).position
+        return places
+
+    def executed(self, record: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+        """See `ArmFigure.executed`."""
+        from actors.arm.joint_path import unpack
+
+        if "packed" not in record:
+            return None
+        read = unpack(dict(record))
+        return read.times, read.joints

@@ -1,0 +1,227 @@
+"""The cell: table, tray, both vessels, the arm as it moves, its path planned and executed, and the pour's liquid."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.figure import ArmFigure
+from actors.protocols import PourProgress
+from orchestrator.monitor import shapes
+from orchestrator.monitor.films import Films
+from orchestrator.monitor.outlet import Outlet
+from orchestrator.monitor.simulated import MAXIMUM_RATE
+from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
+from orchestrator.requests import Pour
+from sim_engine.outcome import PourMeasurement
+from sim_engine.simulated import RecordedFrames
+from sim_engine.task import Scene
+
+if TYPE_CHECKING:
+    from sim_engine.vessel.spec import VesselSpec
+
+PLACE = "/cell"
+
+SLOW = 3.0
+"""A bench whose time runs faster than this is shown by films of its pours: nobody could follow it."""
+
+_TRAY = 0.012
+"""Thickness of the tray [m]."""
+
+FloatArray = NDArray[np.float64]
+
+
+class Cell:
+    """What stands and moves on the bench. For one thread.
+
+    Args:
+        outlet: where rows go.
+        films: that pours are shown by once they are known.
+        plan: of the campaign.
+    """
+
+    def __init__(self, outlet: Outlet, films: Films, plan: CampaignPlan) -> None:
+        import rerun as rr
+
+        self._rr, self._outlet, self._films = rr, outlet, films
+        laboratory = plan.laboratory
+        self._figure: ArmFigure | None = None if laboratory.arm is None else laboratory.arm.figure()
+        scales = [one.time_scale for one in (laboratory.bench, laboratory.arm) if one is not None]
+        self.time_scale = max(scales, default=1.0) or float("inf")
+        self._shown: dict[str, str] = {}
+        self._trail: list[list[float]] = []
+        self._liquid: RecordedFrames | None = None
+        outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
+        outlet.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
+        self._furnish()
+
+    def _furnish(self) -> None:
+        rr = self._rr
+        table = -_TRAY if self._figure is None else min(self._figure.table, -_TRAY)
+        self._outlet.log(
+            f"{PLACE}/tray",
+            rr.Boxes3D(
+                centers=[[0.0, 0.0, -0.5 * _TRAY - 1e-3]],
+                half_sizes=[[0.16, 0.16, 0.5 * _TRAY]],
+                colors=[shapes.TRAY],
+                fill_mode="solid",
+            ),
+            static=True,
+        )
+        middle, half = np.zeros(2), np.array([0.45, 0.4])
+        if self._figure is not None:
+            home = self._figure.ends(np.array(self._figure.home))
+            base = home[0, 0, :2]
+            low, high = np.minimum(base, 0.0) - 0.3, np.maximum(base, 0.0) + 0.3
+            middle, half = 0.5 * (low + high), 0.5 * (high - low)
+            # Where it waits, until it moves: what is logged without a time gives way to nothing that has one.
+            self._outlet.times(wall=time.time(), step=0, sim_time=0.0)
+            self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home))
+        self._outlet.log(
+            f"{PLACE}/table",
+            rr.Boxes3D(
+                centers=[[*middle, table - 0.015]],
+                half_sizes=[[*half, 0.012]],
+                colors=[shapes.TABLE],
+                fill_mode="solid",
+            ),
+            static=True,
+        )
+
+    # ---- a pour under way
+
+    def begin(self, pour: Pour, scene: Scene) -> None:
+        """A pour begins: its vessels stand there, and its path is planned."""
+        self._trail, self._liquid = [], None
+        self._stand("pourer", scene.pourer)
+        self._stand("receiver", scene.receiver)
+        self._outlet.log(f"{PLACE}/liquid", self._rr.Clear(recursive=False))
+        self._outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
+        self._outlet.log(f"{PLACE}/path/executed", self._rr.Clear(recursive=False))
+        planned = planned_poses(scene, pour)
+        if planned is None:
+            return
+        self._outlet.log(f"{PLACE}/path/planned", self._line(self._tool_places(planned), style.PREDICTED, 1.5e-3))
+        if self._figure is None:
+            self._outlet.log(f"{PLACE}/pourer", shapes.placed(planned[0]))
+
+    def progress(self, told: PourProgress) -> None:
+        """The arm is somewhere."""
+        if told.liquid is not None:
+            self._liquid = told.liquid
+        if self.time_scale > SLOW and self._films.next_due is not None:
+            return  # a film of the pour before is shown
+        if told.joints and self._figure is not None:
+            self._move(np.array(told.joints))
+        elif told.pourer:
+            self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
+            self._trail.append(list(told.pourer[:3]))
+        else:
+            return
+        if len(self._trail) > 1 and self.time_scale <= SLOW:
+            self._outlet.log(f"{PLACE}/path/executed", self._line(np.array(self._trail), style.MEASURED, 3e-3))
+
+    def _move(self, joints: FloatArray) -> None:
+        figure = self._figure
+        assert figure is not None
+        self._outlet.log(f"{PLACE}/arm", shapes.bars(figure, figure.ends(joints)))
+        tool, pourer = figure.tool(joints[None])[0], figure.pourer(joints[None])[0]
+        self._outlet.log(f"{PLACE}/tool", shapes.placed(tool))
+        self._outlet.log(f"{PLACE}/pourer", shapes.placed(pourer))
+        self._trail.append([float(value) for value in tool[:3]])
+
+    # ---- a pour that is over
+
+    def finish(
+        self,
+        scene: Scene,
+        measured: PourMeasurement,
+        *,
+        now: float,
+        step: int,
+        beside: Callable[[float], object],
+    ) -> None:
+        """Show what was done and what the liquid did.
+
+        Args:
+            scene: what was poured.
+            measured: what came of it.
+            now: on the wall clock [s since 1970].
+            step: of the campaign.
+            beside: logs what else there is to say of a moment of the pour [s].
+        """
+        moves = self._executed(measured)
+        liquid, self._liquid = self._liquid, None
+        if moves is None and liquid is None:
+            return
+        ends = [float(each[-1]) for each in (None if moves is None else moves[0], _times(liquid)) if each is not None]
+        if self.time_scale <= SLOW and liquid is None:
+            return  # it was seen as it was made
+        times = np.arange(0.0, max(ends) + 0.5 / MAXIMUM_RATE, 1.0 / MAXIMUM_RATE)
+        radius = 0.0 if liquid is None else 0.5 * shapes.spacing(liquid.positions[0], scene.liquid.volume)
+        path = self._path(moves, liquid)
+
+        def frame(moment: float, *, first: bool) -> Callable[[], None]:
+            def log() -> None:
+                if first and len(path) > 1:
+                    self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
+                if moves is not None:
+                    self._move(np.array([np.interp(moment, moves[0], column) for column in moves[1].T]))
+                if liquid is not None:
+                    self._pour(liquid, moment, radius, posed=moves is None)
+                beside(moment)
+
+            return log
+
+        moments = [frame(float(moment), first=place == 0) for place, moment in enumerate(times)]
+        self._films.add(now, step, [float(moment) for moment in times], moments)
+
+    def _executed(self, measured: PourMeasurement) -> tuple[FloatArray, FloatArray] | None:
+        record = measured.notes.get("executed")
+        return None if self._figure is None or not record else self._figure.executed(record)
+
+    def _path(self, moves: tuple[FloatArray, FloatArray] | None, liquid: RecordedFrames | None) -> FloatArray:
+        if moves is not None and self._figure is not None:
+            return self._figure.tool(moves[1][::5])[:, :3]
+        return np.zeros((0, 3)) if liquid is None else np.asarray(liquid.pourer_poses, float)[:, :3]
+
+    def _pour(self, liquid: RecordedFrames, moment: float, radius: float, *, posed: bool) -> None:
+        index = int(np.clip(np.searchsorted(liquid.times, moment + 1e-6) - 1, 0, len(liquid.times) - 1))
+        states = np.asarray(liquid.states[index])
+        self._outlet.log(f"{PLACE}/liquid", shapes.particles(liquid.positions[index], states, radius))
+        if posed:
+            self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.asarray(liquid.pourer_poses[index], float)))
+
+    # ---- how
+
+    def _stand(self, what: str, spec: VesselSpec) -> None:
+        if self._shown.get(what) != (key := spec.content_hash()):
+            self._shown[what] = key
+            self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+
+    def _tool_places(self, poses: FloatArray) -> FloatArray:
+        return poses[:, :3] if self._figure is None else self._figure.tool_of(poses)
+
+    def _line(self, points: FloatArray, colour: str, radius: float) -> Any:
+        return self._rr.LineStrips3D([np.asarray(points, np.float32)], colors=[shapes.rgb(colour)], radii=[radius])
+
+
+def planned_poses(scene: Scene, pour: Pour) -> FloatArray | None:
+    """Poses of the pourer along a planned pour, shape (T, 7); None where nothing can be planned."""
+    from actors.bench.planning import plan_pour
+    from actors.protocols import InvalidActionError
+
+    try:
+        motion = plan_pour(scene, pour.action)
+    except InvalidActionError:
+        return None
+    return motion.sample(np.linspace(0.0, motion.duration, 120))
+
+
+def _times(liquid: RecordedFrames | None) -> FloatArray | None:
+    return None if liquid is None else np.asarray(liquid.times, dtype=float)

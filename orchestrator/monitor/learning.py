@@ -1,0 +1,156 @@
+"""What a campaign learns: losses against predictions, surrogates, θ, and whether the simulator is to be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from orchestrator.events import RequestFinished
+from orchestrator.monitor import pictures, shapes
+from orchestrator.monitor.outlet import Outlet
+from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
+from orchestrator.report.names import receiver_names
+from orchestrator.report.style import safe_name
+from orchestrator.report.units import (
+    DISCREPANCY,
+    at_least_nothing,
+    deployment_unit,
+    is_calibration,
+    loss_of_pour,
+    unit_of_pour,
+)
+from orchestrator.requests import Pour, Poured, Suggest, Suggested
+from orchestrator.strategies.calibration.base import Calibrated
+from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.trust import Compared
+from orchestrator.strategies.learnt import Learnt
+from sim_engine.action import ACTION_DIMENSIONS
+
+PLACE = "/learning"
+
+CALIBRATION = "calibration"
+
+DRAWING_INTERVAL = 20.0
+"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.3 s."""
+
+
+class LearningStage:
+    """Rows and pictures of what is learnt. For one thread.
+
+    Args:
+        outlet: where rows go.
+        plan: of the campaign.
+    """
+
+    def __init__(self, outlet: Outlet, plan: CampaignPlan) -> None:
+        import rerun as rr
+
+        self._rr, self._outlet, self._plan = rr, outlet, plan
+        self._names = receiver_names(plan)
+        self._styled: set[str] = set()
+        self._scene_of_stage: dict[str, str] = {}
+        self._drawn: dict[str, float] = {}
+        self._waiting: dict[str, Callable[[], bytes]] = {}
+        self._least: dict[str, float] = {}
+        self.best: dict[str, str] = {}
+        """What people are told of the best pour, by the receiver's name."""
+        self.trust = ""
+        """Whether the simulator is to be trusted, in words."""
+
+    def about(self, stage: str, scene: str) -> None:
+        """A stage has to do with a scene."""
+        self._scene_of_stage[stage] = scene
+
+    def poured(self, request: Pour, outcome: Poured) -> str:
+        """A pour was weighed; returns it in words."""
+        measured, unit = outcome.measurement, unit_of_pour(self._plan, request)
+        value = loss_of_pour(self._plan, request, measured)
+        weights = f"{1e3 * measured.spilled:.1f} g spilled, {1e3 * measured.retained:.1f} g left in the pourer"
+        if value is None:
+            return f"pour {request.number}: too little was poured for a loss ({weights})"
+        calibrating = is_calibration(self._plan, request)
+        place = f"{PLACE}/{CALIBRATION if calibrating else safe_name(request.scene)}/loss"
+        shown = unit.factor * value
+        self._number(f"{place}/measured", shown, f"measured [{unit.unit}]", style.MEASURED, marker=9.0)
+        if request.predicted is not None:
+            mean = unit.factor * at_least_nothing(request.predicted.mean)
+            sigma = unit.factor * request.predicted.deviation
+            self._number(f"{place}/predicted", mean, f"predicted [{unit.unit}]", style.PREDICTED)
+            for name, sign in (("low", -2.0), ("high", 2.0)):
+                label = f"predicted {'−' if sign < 0 else '+'} 2 σ [{unit.unit}]"
+                self._number(f"{place}/predicted_{name}", max(mean + sign * sigma, 0.0), label, "#f0c27a", width=1.5)
+        name = self._names.get(request.scene, request.scene)
+        if not calibrating:
+            self._best(request.scene, place, shown, unit.unit, name)
+        return f"pour {request.number} of {name}: {shown:.2f} {unit.unit} ({weights})"
+
+    def _best(self, scene: str, place: str, shown: float, unit: str, name: str) -> None:
+        self._least[scene] = least = min(shown, self._least.get(scene, shown))
+        self._number(f"{place}/best", least, f"best so far [{unit}]", style.GOOD)
+        self.best[name] = f"{least:.2f} {unit}"
+
+    def suggested(self, event: RequestFinished, request: Suggest, outcome: Suggested) -> None:
+        """The optimiser answered: a picture of its surrogate, unless there was one just now."""
+        problem, suggestion = request.problem, outcome.suggestion
+        if suggestion.surrogate is None:
+            return
+        # A space of actions belongs to the receiver in question, one of simulation parameters to the calibration.
+        acting = problem.space.names[0] in ACTION_DIMENSIONS
+        scene = self._scene_of_stage.get(event.stage)
+        deploying = acting and scene is not None and self._plan.deployment is not None
+        where = safe_name(scene or "") if deploying else CALIBRATION
+        unit = DISCREPANCY
+        if deploying and self._plan.deployment is not None:
+            unit = deployment_unit(self._plan.deployment)
+        subject = self._names.get(scene or "", scene or "") if deploying else "θ"
+        title = f"{subject}: what is known after {len(problem.data)} observations"
+        self._picture(
+            f"{PLACE}/{where}/surrogate",
+            event.time,
+            lambda: pictures.png(pictures.surrogate_picture(problem, suggestion, unit, title)),
+        )
+
+    def learnt(self, result: Learnt, now: float) -> None:
+        """A strategy has learnt so much."""
+        if isinstance(result, Calibrated) and result.found is not None:
+            found = result.found
+            if found.searched:
+                draw = f"{PLACE}/{CALIBRATION}/theta"
+                self._picture(draw, now, lambda: pictures.png(pictures.theta_picture(found)))
+        if isinstance(result, Deployed):
+            if isinstance(result.trust, Compared):
+                self.trust = result.trust.text
+            if result.trust.z_scores:
+                z = result.trust.z_scores[-1]
+                place = f"{PLACE}/{safe_name(result.scene)}/trust"
+                label = "worse than simulated by so many σ (2 and more: distrust)"
+                self._number(place, z, label, style.ESCAPED, marker=8.0)
+
+    def flush(self, now: float) -> None:
+        """Draw what has waited for its turn."""
+        for entity, draw in list(self._waiting.items()):
+            self._draw(entity, now, draw)
+
+    def _picture(self, entity: str, now: float, draw: Callable[[], bytes]) -> None:
+        if now - self._drawn.get(entity, -DRAWING_INTERVAL) < DRAWING_INTERVAL:
+            self._waiting[entity] = draw
+            return
+        self._draw(entity, now, draw)
+
+    def _draw(self, entity: str, now: float, draw: Callable[[], bytes]) -> None:
+        self._waiting.pop(entity, None)
+        self._drawn[entity] = now
+        self._outlet.log(entity, self._rr.EncodedImage(contents=draw(), media_type="image/png"))
+
+    def _number(
+        self, entity: str, value: float, name: str, colour: str, *, marker: float = 0.0, width: float = 3.0
+    ) -> None:
+        if entity not in self._styled:
+            self._styled.add(entity)
+            looks = (
+                self._rr.SeriesPoints(names=name, colors=shapes.rgb(colour), marker_sizes=marker)
+                if marker
+                else self._rr.SeriesLines(names=name, colors=shapes.rgb(colour), widths=width)
+            )
+            self._outlet.log(entity, looks, static=True)
+        self._outlet.log(entity, self._rr.Scalars(float(value)))

@@ -1,0 +1,108 @@
+"""What Rerun has no axes for, as pictures: surrogates over two axes, and what is known of θ."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from orchestrator.report import style
+from orchestrator.report.units import LossUnit
+from orchestrator.strategies.calibration.base import CalibratedTheta
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FloatArray = NDArray[np.float64]
+
+_DPI = 80
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as the bytes of a PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI, facecolor="white")
+    return buffer.getvalue()
+
+
+def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
+    """Mean, deviation and lower bound of a surrogate over two axes, with what was observed and what is asked for next.
+
+    Args:
+        problem: that was put to the optimiser.
+        suggestion: its answer, with a surrogate.
+        unit: of the cost.
+        title: what was searched for.
+    """
+    assert suggestion.surrogate is not None
+    surrogate, space = suggestion.surrogate, problem.space
+    plane = surrogate.plane(space)
+    columns = [space.names.index(name) for name in plane.names]
+    mean, deviation = (unit.factor * np.asarray(grid, float) for grid in (surrogate.mean, surrogate.deviation))
+    bound = mean - problem.kappa * deviation
+    figure, axes = style.new_figure(1, 3, size=(15.0, 5.2))
+    held = style.display_values(dict(surrogate.held(space)))
+    figure.suptitle(f"{title}{f'   (held: {held})' if held else ''}", fontsize=17, color=style.INK, x=0.01, ha="left")
+    panels = (
+        (f"expected {unit.label}", np.maximum(mean, 0.0), "viridis_r"),
+        (f"± σ [{unit.unit}]", deviation, "cividis"),
+        (f"lower bound, mean − {problem.kappa:g} σ [{unit.unit}]", bound, "viridis_r"),
+    )
+    across, up = plane.axes
+    scales = [style.display_factor(axis.name) for axis in (across, up)]
+    places = np.linspace(0.0, 1.0, len(mean))
+    grid = [[axis.decode(u) / scale for u in places] for axis, scale in zip((across, up), scales, strict=True)]
+    for panel, (name, values, colours) in zip(axes, panels, strict=True):
+        picture = panel.pcolormesh(*grid, values, shading="nearest", cmap=colours, zorder=0, rasterized=True)
+        bar = figure.colorbar(picture, ax=panel, pad=0.02)
+        bar.ax.tick_params(labelsize=13)
+        for points, look in (
+            (problem.data.points, {"marker": "o", "s": 55, "facecolor": "white", "edgecolor": style.INK}),
+            (suggestion.points, {"marker": "*", "s": 330, "facecolor": style.BEST, "edgecolor": "white"}),
+        ):
+            if points:
+                xs, ys = _values(points, columns, plane.axes, scales)
+                panel.scatter(xs, ys, linewidth=1.2, zorder=4, **look)
+        panel.set_title(name, fontsize=14, loc="left", color=style.INK)
+        panel.set_xlabel(style.label(across.name), fontsize=14)
+        style.frame(panel, across, "x")
+        style.frame(panel, up, "y")
+        panel.tick_params(labelsize=13)
+    axes[0].set_ylabel(style.label(up.name), fontsize=14)
+    axes[1].set_xlabel(f"{style.label(across.name)}      ○ observed   ★ next", fontsize=14)
+    return figure
+
+
+def theta_picture(found: CalibratedTheta) -> Figure:
+    """θ*, and which other θ fit the pours: one panel for each parameter that was searched."""
+    names = found.searched
+    figure, axes = style.new_figure(1, len(names), size=(5.0 * max(len(names), 2), 4.2), squeeze=False)
+    expected = f"expected |measured − simulated| {100 * max(found.predicted_discrepancy, 0.0):.1f} %"
+    figure.suptitle(f"θ*: {expected}", fontsize=17, color=style.INK, x=0.01, ha="left")
+    draws = () if found.posterior is None else found.posterior.thetas
+    chosen = found.theta.model_dump()
+    for panel, name in zip(axes[0], names, strict=True):
+        if draws:
+            panel.hist([theta[name] for theta in draws], bins=24, color=style.FALLING, density=True)
+        panel.axvline(chosen[name], color=style.BEST, linewidth=3.0)
+        title = f"{style.display_value(name, chosen[name])}"
+        panel.set_title(title, fontsize=15, loc="left", color=style.BEST)
+        panel.set_xlabel(style.label(name), fontsize=14)
+        panel.set_yticks([])
+        panel.tick_params(labelsize=13)
+    axes[0, 0].set_ylabel("how well it fits", fontsize=14)
+    return figure
+
+
+def _values(
+    points: Sequence[Sequence[float]], columns: list[int], axes: Any, scales: list[float]
+) -> tuple[list[float], list[float]]:
+    across, up = (
+        [axis.decode(point[column]) / scale for point in points]
+        for axis, column, scale in zip(axes, columns, scales, strict=True)
+    )
+    return across, up

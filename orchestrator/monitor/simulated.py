@@ -1,0 +1,91 @@
+"""A simulated pour on its own stage: vessels, particles by their fate, and how much of the liquid is where."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.monitor import shapes
+from orchestrator.monitor.films import Films
+from orchestrator.monitor.outlet import Outlet
+from orchestrator.report import style
+from sim_engine.simulated import RecordedFrames
+from sim_engine.task import Scene
+
+MAXIMUM_RATE = 10.0
+"""Frames per second of a film: 3 000 particles cost about 36 kB each."""
+
+PLACE = "/simulation"
+
+SHARES = ("in the pourer [%]", "falling [%]", "received [%]", "spilled [%]")
+
+
+class SimulatedStage:
+    """Films of simulations. For one thread.
+
+    Args:
+        outlet: where rows go.
+        films: that they are shown by.
+    """
+
+    def __init__(self, outlet: Outlet, films: Films) -> None:
+        import rerun as rr
+
+        self._rr, self._outlet, self._films = rr, outlet, films
+        self._shown: dict[str, str] = {}
+        outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
+        for state, name in enumerate(SHARES):
+            colour = shapes.rgb(style.PARTICLE_STATES[state][1])
+            outlet.log(f"{PLACE}/share/{state}", rr.SeriesLines(names=name, colors=colour, widths=3), static=True)
+
+    def film(self, frames: RecordedFrames, scene: Scene, title: str, *, now: float, step: int) -> None:
+        """Show a simulation.
+
+        Args:
+            frames: that were kept; thinned to `MAXIMUM_RATE`.
+            scene: what was simulated.
+            title: of it, for people.
+            now: on the wall clock [s since 1970].
+            step: of the campaign.
+        """
+        times = np.asarray(frames.times, dtype=float)
+        if len(times) == 0:
+            return
+        radius = 0.5 * shapes.spacing(frames.positions[0], scene.liquid.volume)
+        kept = thinned(times)
+
+        def frame(index: int, *, first: bool) -> Callable[[], None]:
+            def log() -> None:
+                if first:
+                    self._set(scene, title)
+                self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.asarray(frames.pourer_poses[index], float)))
+                states = np.asarray(frames.states[index])
+                self._outlet.log(f"{PLACE}/liquid", shapes.particles(frames.positions[index], states, radius))
+                shares = 100.0 * np.bincount(states, minlength=5) / max(len(states), 1)
+                for state in range(len(SHARES)):
+                    self._outlet.log(f"{PLACE}/share/{state}", self._rr.Scalars(float(shares[state])))
+
+            return log
+
+        moments = [frame(index, first=place == 0) for place, index in enumerate(kept)]
+        self._films.add(now, step, [float(times[index]) for index in kept], moments)
+
+    def _set(self, scene: Scene, title: str) -> None:
+        self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
+        for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
+            if self._shown.get(what) != (key := spec.content_hash()):
+                self._shown[what] = key
+                self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+
+
+def thinned(times: NDArray[np.float64]) -> list[int]:
+    """Which frames a film keeps: `MAXIMUM_RATE`, and the last one, which decides what was spilled."""
+    kept = [0]
+    for index in range(1, len(times)):
+        if times[index] - times[kept[-1]] >= 1.0 / MAXIMUM_RATE - 1e-6:
+            kept.append(index)
+    if kept[-1] != len(times) - 1:
+        kept.append(len(times) - 1)
+    return kept
