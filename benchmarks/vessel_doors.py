@@ -67,7 +67,7 @@ def profile_of(built: Vessel, z: np.ndarray) -> np.ndarray:
         np.interp(z, curve[1:, 2] - built.inner_floor, np.hypot(curve[1:, 0], curve[1:, 1]))
         for curve in built.meridians[::12]
     ]
-    return np.mean(found, axis=0)
+    return np.asarray(np.mean(found, axis=0))
 
 
 def spillages(receiver: VesselSpec, simulator: PourSimulator, seeds: int) -> tuple[float, float]:

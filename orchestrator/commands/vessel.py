@@ -239,16 +239,15 @@ def _points(sources: Sources, wall: float | None, floor: float | None, notes: li
         f"{len(scan.points):,} points of {surfaces}, {1e3 * scan.scatter:.2f} mm about it, "
         f"{1e3 * scan.out_of_round:.2f} mm out of round"
     )
+    if not scan.round:
+        notes.append("it is not round: the points became a mesh")
+        return _Uneven(*mesh_of(scan, wall, floor))
     if thick is None:
         raise RefusalError(
             "the points are of one surface: how thick is the wall? Say it with --wall, for example --wall '3 mm'",
             BAD_INPUT,
         )
     below = thick if floor is None else floor
-    if not scan.round:
-        notes.append("it is not round: the points became a mesh")
-        vertices, faces = mesh_of(scan, thick, below)
-        return _Uneven(vertices, faces)
     return _Seen(radii_of(scan, thick, below), scan.height - (0.0 if scan.seen == "inner" else below), between)
 
 

@@ -121,7 +121,7 @@ def scan_of(points: Floats, surface: Literal["auto", "inner", "outer"] = "auto")
     tried = sorted((sought((x, y, 0.0, 0.0), few, 0.04) for x, y in begins), key=lambda each: float(each.fun))
     polished = min((sought(each.x, chosen, 0.01) for each in tried[:2]), key=lambda each: float(each.fun))
     moved = _moved(centred, polished.x, size)
-    low, high = _ends(moved, float(polished.fun) * size)
+    low, high = _ends(moved, min(float(polished.fun) * size, ROUND))
     moved = moved[(moved[:, 2] >= low - 0.1 * (high - low)) & (moved[:, 2] <= high + 0.1 * (high - low))]
     moved[:, 2] -= low
     layers, seen = _layers(moved, surface)
@@ -189,7 +189,7 @@ def _halved(radii: Floats) -> list[Floats]:
     return np.split(ordered, [least + int(np.argmax(gaps))])
 
 
-def _parted(radii: Floats) -> list[Floats]:
+def surfaces(radii: Floats) -> list[Floats]:
     """The radii of one or of two surfaces, from inside; what is farther out, or made of few points, is a handle."""
     ordered = np.sort(radii)
     parts = np.split(ordered, 1 + np.flatnonzero(np.diff(ordered) > APART))
@@ -198,7 +198,7 @@ def _parted(radii: Floats) -> list[Floats]:
 
 def _layers(points: Floats, surface: str) -> tuple[list[Layer], Literal["inner", "outer", "both"]]:
     found: list[Layer] = []
-    slices = [(part, _parted(np.hypot(part[:, 0], part[:, 1]))) for part in _slices(points) if len(part) >= 6]
+    slices = [(part, surfaces(np.hypot(part[:, 0], part[:, 1]))) for part in _slices(points) if len(part) >= 6]
     twice = sum(len(parts) == 2 for _, parts in slices) > len(slices) // 2 and surface == "auto"
     for part, parts in slices:
         if twice and len(parts) < 2:

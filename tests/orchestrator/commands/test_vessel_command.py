@@ -60,15 +60,14 @@ def mesh(of: Bench, folder: Path) -> Sources:
     return Sources(mesh=folder / "scan.stl")
 
 
-@pytest.mark.parametrize(
-    "name", ["tumbler", *(pytest.param(each, marks=pytest.mark.slow) for each in ("cone", "beaker"))]
-)
+@pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("door", [callipers, fill, tilt, photo, points, mesh])
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
     of = bench(name)
     assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
+@pytest.mark.slow
 def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
