@@ -42,6 +42,7 @@ from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.stages import CALIBRATION, calibrated_theta, calibration_stages, measured_pours, scenes_of, stage_seed
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
 from orchestrator.strategies.protocol import Strategy
@@ -200,7 +201,7 @@ def without_simulator(plan: CalibrationPlan, folds: Sequence[Sequence[int]]) -> 
             continue
         count += known
         totals["mean"] += known * (mean_predictor_discrepancy(train, test) or 0.0)
-        totals["regression"] += known * (regression_discrepancy(plan.actions, train, test) or 0.0)
+        totals["regression"] += known * (regression_discrepancy(Contexts.of(plan), train, test) or 0.0)
     return {name: round(total / count, 4) for name, total in totals.items()}
 
 

@@ -23,6 +23,7 @@ from orchestrator.commands.options import (
     Resume,
     RunId,
     Seed,
+    Thetas,
     call,
     examples,
 )
@@ -134,10 +135,7 @@ def plan(
     seeds: Annotated[
         int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction and its spread.")
     ] = 5,
-    thetas: Annotated[
-        int,
-        typer.Option(min=0, max=50, help="Predict with so many θ of the posterior in --parameters; 0: with θ* alone."),
-    ] = 0,
+    thetas: Thetas = None,
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
     as_json: Json = False,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+from actors.optimizer.core.mismatch import Displacement
 from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
 from orchestrator.strategies.deployment.objectives import Objectives
@@ -17,6 +18,9 @@ from sim_engine.marks import FREE
 from sim_engine.space import Space
 from sim_engine.task import Scene
 
+Design = Literal["stratified", "active"]
+"""How calibration pours are chosen: spread evenly, or each by what it will tell about deployment."""
+
 
 @dataclass(frozen=True)
 class RecordedPour:
@@ -25,6 +29,7 @@ class RecordedPour:
     Attributes:
         poured, spilled, retained: masses [kg].
         split: 'train', 'test' or 'transfer'.
+        scene: name of the one that it was made in; '' for that of its `RecordSet`.
     """
 
     action: Action
@@ -32,6 +37,7 @@ class RecordedPour:
     spilled: float
     retained: float
     split: str
+    scene: str = ""
 
     @property
     def poured_fraction(self) -> float:
@@ -42,6 +48,21 @@ class RecordedPour:
     def normalised_spillage(self) -> float | None:
         """r = spilled / poured, None where too little was poured for it."""
         return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
+
+
+@dataclass(frozen=True)
+class KnownSimulation:
+    """One that was made before a calibration, in one of its scenes.
+
+    Attributes:
+        theta: values of the searched parameters.
+        spillage: c_s.
+    """
+
+    theta: dict[str, float]
+    scene: str
+    action: Action
+    spillage: float
 
 
 @dataclass(frozen=True)
@@ -136,6 +157,10 @@ class CalibrationPlan(StagePlan):
         constraints: on actions, beside the bounds of their space.
         prior: dimensions along which g is not uniform.
         parameter_prior: searched parameters that were measured beforehand, each with its tolerance.
+        further: scenes beside the first one, with other receivers, into which pours are made by turns.
+        design: how the pours are chosen.
+        design_simulations: made to choose them, where they are chosen actively.
+        known: simulations that were made before, filled in when the calibration begins.
     """
 
     settings: CalibrationSettings
@@ -151,6 +176,15 @@ class CalibrationPlan(StagePlan):
     constraints: tuple[Linear, ...] = ()
     prior: tuple[NormalPrior, ...] = ()
     parameter_prior: tuple[NormalPrior, ...] = ()
+    further: tuple[Scene, ...] = ()
+    design: Design = "stratified"
+    design_simulations: int = 0
+    known: tuple[KnownSimulation, ...] = ()
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """All scenes that calibration pours are made in."""
+        return (self.scene, *self.further)
 
     @property
     def simulations(self) -> int:
@@ -174,6 +208,7 @@ class DeploymentPlan(StagePlan):
         confirm: how often the recommended action is poured again in each scene, after the strategy has ended.
         thetas: draws of a posterior, equally likely, for settings that need them, where no calibration of the same
             campaign makes them.
+        bench: how the bench may differ from the simulator, equally likely, as far as anything is known of it.
     """
 
     settings: DeploymentSettings
@@ -185,6 +220,7 @@ class DeploymentPlan(StagePlan):
     constraints: tuple[Linear, ...] = ()
     confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
+    bench: tuple[Displacement, ...] = ()
 
     @property
     def pours(self) -> int:

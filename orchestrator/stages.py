@@ -11,15 +11,19 @@ import numpy as np
 
 from orchestrator.errors import RunError
 from orchestrator.flights import Order
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, RecordSet
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, KnownSimulation, RecordSet
 from orchestrator.results import Results, learnt_by
+from orchestrator.strategies.calibration.active import ActivePours
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
+from orchestrator.strategies.calibration.draws import drawn_benches
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
 from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.play import displacement
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.liquid import SimulationParameters
@@ -67,7 +71,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     """
     found: list[Scene] = []
     if plan.calibration is not None:
-        found.append(plan.calibration.scene)
+        found += plan.calibration.scenes
         found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
     if plan.deployment is not None:
         found += plan.deployment.scenes
@@ -82,34 +86,41 @@ def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
     """All stages of a campaign in order: pours, calibration, evaluation, then a deployment for each receiver."""
     stages: list[StageDefinition] = []
     if plan.calibration is not None:
-        stages += calibration_stages(plan.calibration)
+        stages += calibration_stages(plan.calibration, plan.deployment)
     if plan.deployment is not None:
         stages += deployment_stages(plan, plan.deployment)
     return tuple(stages)
 
 
-def calibration_stages(plan: CalibrationPlan) -> list[StageDefinition]:
-    """Pours (unless records take their place), the strategy, and what came of it beside its rivals."""
+def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None = None) -> list[StageDefinition]:
+    """Pours (unless records take their place), the strategy, and what came of it beside its rivals.
+
+    Args:
+        deployment: what pours that are chosen actively are to teach about; None: about calibration's own actions.
+    """
     stages = []
     if plan.pour_count > 0:
 
         def pours(results: Results, seed: int) -> Strategy:
+            if plan.design == "active":
+                return ActivePours(plan, deployment, seed)
             return DesignedPours(
-                plan.scene, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
+                plan.scenes, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
             )
 
         stages.append(StageDefinition(POURS, pours, pours=True))
 
     def calibration(results: Results, seed: int) -> Strategy:
         pours = [scored.pour for scored in measured_pours(plan, results)]
-        return plan.settings.build(plan, pours, seed)
+        return plan.settings.build(replace(plan, known=known_simulations(plan, results)), pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
         theta = calibrated_theta(results).theta
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        plain = SimulationParameters.from_values(plan.fixed_parameters) if rivals else None
-        return Scorecard(theta, rivals, pours, plan.actions, seed, uncalibrated=plain)
+        measured = {prior.name: prior.mean for prior in plan.parameter_prior}
+        plain = SimulationParameters.from_values(plan.fixed_parameters | measured) if rivals else None
+        return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain)
 
     found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
     return [*stages, found, StageDefinition(EVALUATION, evaluation)]
@@ -139,7 +150,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            known = with_posterior(deployment, results)
+            known = with_bench(with_posterior(deployment, results), results, _theta(plan, results))
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
         return build
@@ -162,13 +173,18 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
 
 def prediction_stages(
-    plan: CampaignPlan, deployment: DeploymentPlan, seeds: int, thetas: Sequence[SimulationParameters] = ()
+    plan: CampaignPlan,
+    deployment: DeploymentPlan,
+    seeds: int,
+    thetas: Sequence[SimulationParameters] = (),
+    discrepancy: float | None = None,
 ) -> list[StageDefinition]:
     """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
 
     Args:
         seeds: how many, each.
         thetas: draws of a posterior that the seeds take turns with; none: the θ that was planned with.
+        discrepancy: shift that the calibration left over (`sim_engine.bands`); None: nobody knows.
     """
 
     def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
@@ -179,7 +195,8 @@ def prediction_stages(
             costing = Costing.of(deployment, scene, theta)
             draws = known.settings.draws(known, theta, seeds, seed)
             drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
-            return RepeatedSimulation(costing, action, seeds, seed, drawn, [draw.error for draw in draws])
+            errors = [draw.error for draw in draws]
+            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, discrepancy)
 
         return build
 
@@ -203,6 +220,26 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     kept = rows[:: max(len(rows) // POSTERIOR_DRAWS, 1)]
     thetas = tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
     return replace(deployment, thetas=thetas)
+
+
+def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
+    """The deployment with what is known of the bench: by pours into the receiver before, or by the calibration.
+
+    A calibration says something of it where it searched nuisances; those that it did not search have their tolerances.
+    """
+    if not deployment.settings.learns_of_benches or deployment.bench:
+        return deployment
+    former = [learnt.bench for learnt in results.values() if isinstance(learnt, Deployed) and learnt.bench is not None]
+    if former:
+        return replace(deployment, bench=former[-1].displacements())
+    found = calibrated_theta(results) if CALIBRATION in results else None
+    known = set(SimulationParameters.nuisances()).intersection(() if found is None else found.searched)
+    if found is None or found.posterior is None or not known:
+        return deployment
+    rows = found.posterior.thetas
+    posterior = [SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in rows]
+    benches = drawn_benches(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
+    return replace(deployment, bench=tuple(displacement(best, bench, deployment.actions) for bench in benches))
 
 
 def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
@@ -230,14 +267,26 @@ def calibrated_theta(results: Results) -> CalibratedTheta:
 
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
     """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
-    made = []
+    made, scenes = [], {scene.name: scene for scene in plan.scenes}
     for pour in learnt_by(results, POURS, DesignPoured).measured if POURS in results else ():
-        action = plan.scene.action(dict(pour.action_si))
-        made.append(ScoredPour(plan.scene.name, MeasuredPour(action, pour.spillage, pour.poured, pour.split)))
+        scene = scenes.get(pour.scene, plan.scene)
+        action = scene.action(dict(pour.action_si))
+        measured = MeasuredPour(action, pour.spillage, pour.poured, pour.split, scene.name)
+        made.append(ScoredPour(scene.name, measured))
     return [*made, *_recorded(plan.records)]
+
+
+def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSimulation, ...]:
+    """What the stage that made the pours has simulated in the calibration's scenes."""
+    simulated = learnt_by(results, POURS, DesignPoured).simulated if POURS in results else ()
+    scenes = {scene.name: scene for scene in plan.scenes}
+    return tuple(
+        KnownSimulation(dict(one.theta), one.scene, scenes[one.scene].action(dict(one.action_si)), one.spillage)
+        for one in simulated
+    )
 
 
 def _recorded(records: RecordSet | None) -> list[ScoredPour]:
     if records is None:
         return []
-    return [ScoredPour(records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]
+    return [ScoredPour(pour.scene or records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]

@@ -30,7 +30,8 @@ def _work(plan: CampaignPlan, name: str) -> Work:
     if calibration is not None:
         pour = pour_time(plan.laboratory, calibration.scene, calibration.actions)
         if name == POURS:
-            return Work(pours=calibration.pour_count, pour_time=pour)
+            designing = calibration.design_simulations
+            return Work(designing, particles=particles_of(plan), pours=calibration.pour_count, pour_time=pour)
         if name == CALIBRATION:
             return Work(calibration.simulations, particles=particles_of(plan))
         if name == EVALUATION:

@@ -89,7 +89,8 @@ def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> lis
     calibrating, deploying = _pouring(stages)
     cases: list[tuple[Scene, Action]] = []
     if plan.calibration is not None and calibrating:
-        cases += _from_all_over(plan.calibration.scene, plan.calibration.actions, plan.calibration.constraints)
+        for scene in plan.calibration.scenes:
+            cases += _from_all_over(scene, plan.calibration.actions, plan.calibration.constraints)
     if plan.deployment is not None and deploying:
         for scene in plan.deployment.scenes:
             cases += _from_all_over(scene, plan.deployment.actions, plan.deployment.constraints)

@@ -53,7 +53,7 @@ class Guard:
         if length.isdigit() and int(length) > self._limit:
             await _refuse(send, 413, self._too_large)
             return
-        read, begun = 0, False
+        read, refused = 0, False
 
         async def counted() -> Message:
             nonlocal read
@@ -63,16 +63,15 @@ class Guard:
                 raise TooLargeError
             return message
 
-        async def noted(message: Message) -> None:
-            nonlocal begun
-            begun = True
-            await send(message)
-
-        try:
-            await self._app(scope, counted, noted)
-        except TooLargeError:
-            if not begun:
+        async def answered(message: Message) -> None:
+            nonlocal refused
+            if read <= self._limit:
+                await send(message)
+            elif not refused:  # whatever else would be said about a body that was not read to its end
+                refused = True
                 await _refuse(send, 413, self._too_large)
+
+        await self._app(scope, counted, answered)
 
     @property
     def _too_large(self) -> str:

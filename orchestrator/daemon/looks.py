@@ -209,6 +209,6 @@ def campaign_out(request: Request, daemon: Supervisor, item: Item) -> CampaignOu
             "needs_arming": item.mode == "hardware" and not item.armed and waits,
             "progress": daemon.progress(item),
             "report": run is not None and (run / REPORT).is_file(),
-            "live": request.app.state.live(item.id),
+            "live": request.app.state.live(item.id) if daemon.progress(item) is not None else None,
         }
     )

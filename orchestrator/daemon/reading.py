@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.codec import CodecError, decode_outcome, decode_request
-from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal_file import JournalError
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_name
+from orchestrator.report.run_page import REPORT_NAME as REPORT
 from orchestrator.report.units import is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured
 
-REPORT = "report.html"
+__all__ = ["REPORT", "pours_of", "summary_of"]
 
 
 def pours_of(plan: CampaignPlan, directory: Path) -> list[dict[str, Any]]:

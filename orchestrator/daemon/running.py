@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +19,15 @@ from orchestrator.daemon.people import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import Item, Store
 from orchestrator.daemon.watching import Watching
-from orchestrator.events import Watcher
+from orchestrator.events import CampaignStateChanged, Watcher
 from orchestrator.jobs import Job, Verb, job
 from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.monitor.live import RECORDING, LiveView
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.plan import CampaignPlan
 from orchestrator.publish import publish
 from orchestrator.runs import create_run
+from orchestrator.states import State
 from sim_engine.extras import installed
 
 MOVING = ("approach", "tilt", "hold", "return")
@@ -50,8 +51,7 @@ class Common:
     feed: Feed
     asking: Asking
     warm: WarmSimulators
-    hooks: tuple[Callable[[str, CampaignPlan, Path], Watcher | None], ...] = ()
-    """Asked for another watcher of each run: its campaign's id, plan and folder."""
+    live: LiveView | None = None
 
 
 def job_of(settings: Settings, item: Item, rig: Rig) -> Job:
@@ -103,9 +103,6 @@ class Running:
         watchers: list[Watcher] = [self._common.feed.watcher(self.item.id), self.watching, self._note_state]
         if monitor is not None:
             watchers.append(monitor)
-        for hook in self._common.hooks:
-            if (watcher := hook(self.item.id, work.plan, directory)) is not None:
-                watchers.append(watcher)
         try:
             result = await self._run(work, directory, watchers, checksum)
         finally:
@@ -155,13 +152,17 @@ class Running:
             self.note_run(directory)
         if not plan.outputs.rrd or not installed("rerun"):
             return None
-        return RerunMonitor(directory / "campaign.rrd", plan)
+        live = self._common.live
+        if live is not None and live.alive:
+            return live.watcher_for(plan, directory)
+        return RerunMonitor(directory / RECORDING, plan)
 
     def _note_state(self, event: Any) -> None:
-        from orchestrator.events import CampaignStateChanged
-
         if isinstance(event, CampaignStateChanged):
-            self._common.store.change(self.item.id, state=event.after, reason=event.reason)
+            # Finished is what has been published: killed before that, it is taken up again for it.
+            done = event.after == State.FINISHED
+            state, reason = ("running", "being published") if done else (event.after, event.reason)
+            self._common.store.change(self.item.id, state=state, reason=reason)
 
     def _announce(self, text: str, seconds: float) -> None:
         self._common.feed.tell("Announced", {"rig": self._rig.name, "text": text, "seconds": seconds}, self.item.id)

@@ -17,9 +17,12 @@ from pythonjsonlogger.json import JsonFormatter
 
 from orchestrator.daemon.api import serve_app
 from orchestrator.daemon.auth import Tokens
+from orchestrator.daemon.notify import OCCASIONS, Notifier, NotifyError, pass_on
 from orchestrator.daemon.settings import Settings
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.errors import RunError
+from orchestrator.monitor.live import LiveView
+from orchestrator.state_directory import use_state_directory
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -50,20 +53,51 @@ def serve(settings: Settings, ready: Callable[[str], None] = lambda url: None) -
         RunError: it can't begin: the state directory is another's, the tokens are open to others, the port is taken.
     """
     os.umask(0o077)
+    use_state_directory(settings.state)
     asyncio.run(_serve(settings, ready))
 
 
 async def _serve(settings: Settings, ready: Callable[[str], None]) -> None:
     settings.state.mkdir(parents=True, exist_ok=True, mode=0o700)
     tokens = Tokens(settings.tokens)
-    listening = _listen(settings)
+    with contextlib.ExitStack() as opened:
+        listening = opened.enter_context(_listen(settings))
+        notifier = _notifier(settings)
+        if notifier is not None:
+            opened.callback(notifier.close)
+        live = None if settings.live is None else LiveView(address=settings.live[0], web_port=settings.live[1])
+        if live is not None:
+            opened.enter_context(live)
+        await _serve_with(settings, tokens, listening, ready, live, notifier)
+    _log.info("ended")
+
+
+def _notifier(settings: Settings) -> Notifier | None:
+    chosen = settings.notify
+    if chosen is None or not chosen.to:
+        return None
     try:
-        daemon = Supervisor(settings)
-    except BaseException:
-        listening.close()
-        raise
+        return Notifier(
+            chosen.to,
+            about=OCCASIONS if chosen.about is None else chosen.about,
+            silence=chosen.silence,
+            page=chosen.page or "",
+        )
+    except NotifyError as error:
+        raise ServeError(f"notify: to: {error}") from None
+
+
+async def _serve_with(
+    settings: Settings,
+    tokens: Tokens,
+    listening: socket.socket,
+    ready: Callable[[str], None],
+    live: LiveView | None,
+    notifier: Notifier | None,
+) -> None:
+    daemon = Supervisor(settings, live)
     ending = _Ending(daemon)
-    app = serve_app(daemon, tokens, ending)
+    app = serve_app(daemon, tokens, ending, None if live is None else lambda campaign: live.url)
     server = _Server(
         uvicorn.Config(
             app,
@@ -81,6 +115,8 @@ async def _serve(settings: Settings, ready: Callable[[str], None]) -> None:
     for number in ENDING:
         loop.add_signal_handler(number, ending)
     serving = asyncio.create_task(server.serve([listening]))
+    telling = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
+    daemon.words = {} if notifier is None else notifier.counts
     url = _url(settings, listening)
     settings.address.write_text(url + "\n", encoding="utf-8")
     try:
@@ -90,13 +126,14 @@ async def _serve(settings: Settings, ready: Callable[[str], None]) -> None:
         await asyncio.wait({serving, asyncio.ensure_future(ending.asked.wait())}, return_when=asyncio.FIRST_COMPLETED)
         _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
         await daemon.close()
+        if telling is not None:
+            await telling
     finally:
         settings.address.unlink(missing_ok=True)
         server.should_exit = True
         await serving
         for number in ENDING:
             loop.remove_signal_handler(number)
-    _log.info("ended")
 
 
 class _Ending:

@@ -16,6 +16,7 @@ from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Count, FilePath, Name, PositiveCount, Section, Switch, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
+from orchestrator.daemon.notify import NotifySection
 from orchestrator.state_directory import state_directory
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -36,7 +37,7 @@ class TlsSection(Section):
     required: ClassVar[dict[str, str]] = {"certificate": "decant.crt", "key": "decant.key"}
 
     certificate: FilePath | None = None
-    """Of the server, with its chain (PEM)."""
+    """The server's certificate, with its chain (PEM)."""
 
     key: FilePath | None = None
     """Its private key (PEM)."""
@@ -59,6 +60,16 @@ class ListenSection(Section):
 
     body: Annotated[float, Quantity("MB", "4 MB", 0.01, 1000.0)] = 4.0
     """Largest request that is read: a campaign with the files that it refers to."""
+
+
+class LiveSection(Section):
+    """A live view of what runs, for browsers."""
+
+    host: Text = "127.0.0.1"
+    """Address to listen at. It has no password: whoever reaches it can look."""
+
+    port: Port | None = None
+    """TCP port of the viewer's page; the usual one, or the next free one, unless given."""
 
 
 class RecordingsSection(Section):
@@ -94,6 +105,12 @@ class DaemonFile(Section):
 
     recordings: RecordingsSection = RecordingsSection()
     """How long recordings are kept."""
+
+    live: LiveSection | None = None
+    """Serve a live view; none unless given."""
+
+    notify: NotifySection | None = None
+    """Who is told what happens; nobody unless given."""
 
     keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
     """Room on the disk below which no campaign is begun."""
@@ -142,6 +159,8 @@ class Settings:
     recording_age: float | None = None
     keep_free: int = 500_000_000
     events: int = 50_000
+    live: tuple[str, int | None] | None = None
+    notify: NotifySection | None = None
     quick_start: bool = field(default=True, compare=False)
     """Whether simulators are started at once, or with the first campaign."""
 
@@ -255,4 +274,6 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> Settings:
         recording_age=file.recordings.age,
         keep_free=round(file.keep_free * 1e6),
         events=file.events,
+        live=None if file.live is None else (file.live.host, file.live.port),
+        notify=file.notify,
     )

@@ -11,9 +11,7 @@ import contextlib
 import logging
 import secrets
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from actors.protocols import LaboratoryError
@@ -21,15 +19,15 @@ from actors.warm import WarmSimulators
 from orchestrator.campaign import CampaignResult
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.daemon.feed import Feed
+from orchestrator.daemon.notify import Counts
 from orchestrator.daemon.people import Asking
 from orchestrator.daemon.retention import prune_recordings
 from orchestrator.daemon.running import Common, Running
 from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
 from orchestrator.errors import RunError
-from orchestrator.events import Watcher
 from orchestrator.lanes import PourUnknownError
-from orchestrator.plan import CampaignPlan
+from orchestrator.monitor.live import LiveView
 from orchestrator.reserve import MB, free_space
 from orchestrator.unknown import OperatorNeededError
 
@@ -39,8 +37,6 @@ RETRY = 30.0
 PAUSED, EMERGENCY = "paused", "emergency"
 
 _log = logging.getLogger(__name__)
-
-Hook = Callable[[str, CampaignPlan, Path], Watcher | None]
 
 
 class RefusedError(RunError):
@@ -52,10 +48,10 @@ class Supervisor:
 
     Args:
         settings: in force.
-        hooks: asked for another watcher of each run.
+        live: view that runs are shown in, open already.
     """
 
-    def __init__(self, settings: Settings, hooks: Sequence[Hook] = ()) -> None:
+    def __init__(self, settings: Settings, live: LiveView | None = None) -> None:
         settings.runs.mkdir(parents=True, exist_ok=True)
         settings.snapshots.mkdir(parents=True, exist_ok=True)
         self.settings = settings
@@ -63,9 +59,10 @@ class Supervisor:
         self.feed = Feed(settings.state / "events.sqlite", settings.events, self._feed_broken)
         self.asking = Asking(self.store, self.feed.tell)
         self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
-        self._common = Common(settings, self.store, self.feed, self.asking, self.warm, tuple(hooks))
+        self._common = Common(settings, self.store, self.feed, self.asking, self.warm, live)
         self.lanes = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
         self.problems: dict[str, str] = {}
+        self.words: dict[str, Counts] = {}
         self.stopping = False
         self.ended = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []

@@ -16,7 +16,8 @@ def receiver_names(plan: CampaignPlan) -> dict[str, str]:
         for known in (plan.calibration.records, plan.calibration.transfer):
             if known is not None:
                 names.setdefault(known.scene.name, known.scene.receiver.name)
-        names.setdefault(plan.calibration.scene.name, plan.calibration.scene.receiver.name)
+        for scene in plan.calibration.scenes:
+            names.setdefault(scene.name, scene.receiver.name)
     return names
 
 

@@ -95,7 +95,7 @@ def campaign_warnings(plan: CampaignPlan) -> dict[str, list[SpaceWarning]]:
     particles = float(plan.parameters.particles)
     if plan.calibration is not None:
         particles = _middle(plan.calibration, particles)
-        spaces.append((plan.calibration.scene, plan.calibration.actions, particles))
+        spaces += [(scene, plan.calibration.actions, particles) for scene in plan.calibration.scenes]
     if plan.deployment is not None:
         spaces += [(scene, plan.deployment.actions, particles) for scene in plan.deployment.scenes]
     found = {scene.name: space_warnings(scene, actions, n) for scene, actions, n in spaces}

@@ -106,7 +106,7 @@ def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePict
     if not known and shown is None:
         return None
     return SurrogatePicture(
-        title=f"Discrepancy over θ: {plan.calibration.scene.receiver.name}",
+        title=f"Discrepancy over θ: {', '.join(scene.receiver.name for scene in plan.calibration.scenes)}",
         cost=DISCREPANCY.label,
         space=plan.calibration.parameters,
         points=[theta for theta, _ in known],

@@ -26,6 +26,7 @@ from orchestrator.stages import (
     with_posterior,
 )
 from orchestrator.strategies.calibration.c1 import C1Settings
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, draw_allowed, stratified
 from orchestrator.strategies.calibration.prior import region_of
 from orchestrator.strategies.calibration.scorecard import Scorecard
@@ -118,7 +119,7 @@ def _pours(study: StudyPlan, seed: int) -> Strategy:
     plan = study.base.calibration
     assert plan is not None
     points = calibration_actions(study)
-    return DesignedPours(plan.scene, plan.actions, len(points), study.holdout, seed, points=points)
+    return DesignedPours(plan.scenes, plan.actions, len(points), study.holdout, seed, points=points)
 
 
 def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
@@ -126,10 +127,11 @@ def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, di
     calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
     assert calibration is not None
     mass, pours = calibration.scene.liquid.mass, []
+    scenes = {scene.name: scene for scene in calibration.scenes}
     for pour in learnt_by(load(cell.needs[0]), POURS, DesignPoured).measured:
-        poured = pour.poured * mass
-        action, spilled = calibration.scene.action(dict(pour.action_si)), (pour.spillage or 0.0) * poured
-        pours.append(RecordedPour(action, poured, spilled, mass - poured, pour.split))
+        poured, scene = pour.poured * mass, scenes.get(pour.scene, calibration.scene)
+        action, spilled = scene.action(dict(pour.action_si)), (pour.spillage or 0.0) * poured
+        pours.append(RecordedPour(action, poured, spilled, mass - poured, pour.split, scene.name))
     records = RecordSet(calibration.scene, tuple(pours), directory.parent / cell.needs[0] / JOURNAL_NAME)
     return replace(plan, calibration=replace(calibration, records=records))
 
@@ -156,7 +158,7 @@ def _calibration(
 def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
     assert plan.calibration is not None
     pours = measured_pours(plan.calibration, {})
-    return Scorecard(plan.parameters, {}, pours, plan.calibration.actions, seed)
+    return Scorecard(plan.parameters, {}, pours, Contexts.of(plan.calibration), seed)
 
 
 def _deployment(

@@ -112,11 +112,21 @@ def _check_effort(problem: SuggestProblem) -> None:
 def _check_posterior(problem: SuggestProblem) -> None:
     question = problem.posterior
     if question is None:
+        if problem.design is not None:
+            raise ValueError("a design needs a posterior: what is known of the searched parameters")
         return
     if not problem.context:
         raise ValueError("a posterior needs a context: differences at actions, with which pours can be compared")
     _check_points("posterior", question.contexts, len(problem.context[0]))
-    if len(question.offsets) != len(question.contexts) or not question.contexts:
+    for name, points in (
+        ("candidates", () if problem.design is None else problem.design.candidates),
+        ("targets", () if problem.design is None else problem.design.targets),
+    ):
+        _check_points(name, points, len(problem.context[0]))
+        if problem.design is not None and not points:
+            raise ValueError(f"design: no {name}")
+    nothing_weighed = problem.design is not None and not question.offsets
+    if len(question.offsets) != len(question.contexts) or not (question.contexts or nothing_weighed):
         raise ValueError(f"posterior: {len(question.contexts)} pours but {len(question.offsets)} offsets")
     if not all(math.isfinite(value) for value in (*question.offsets, question.noise)) or question.noise < 0.0:
         raise ValueError("posterior: offsets and noise must be finite, the noise not negative")

@@ -6,9 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.optimizer.core.asked import Asked, array, tuples
+from actors.optimizer.core.design import Weighed, expected_reductions
 from actors.optimizer.core.models import Model
-from actors.optimizer.core.posterior import sample_posterior
-from actors.optimizer.core.problem import Point, Posterior, PosteriorQuestion, SuggestProblem, SurrogateMap
+from actors.optimizer.core.posterior import DISCREPANCY_PRIOR, drawn_beforehand, sample_posterior
+from actors.optimizer.core.problem import (
+    DesignQuestion,
+    Point,
+    Posterior,
+    PosteriorQuestion,
+    SuggestProblem,
+    SurrogateMap,
+)
 from actors.optimizer.core.region import Feasibility, Region
 from actors.optimizer.core.risk import RiskProcess
 
@@ -73,6 +81,10 @@ def posterior_of(
 ) -> Posterior:
     """Draws of θ given weighed pours."""
     contexts = array(question.contexts, model.process.points.shape[1] - problem.space.dimension)
+    if not len(contexts):
+        drawn = drawn_beforehand(question.count, problem.space.dimension, array(question.prior, 2), rng)
+        lack = (DISCREPANCY_PRIOR[0],) * question.count
+        return Posterior(tuples(region.snap(drawn)), lack, float(question.count))
     sampled = sample_posterior(
         model.process,
         contexts,
@@ -84,6 +96,22 @@ def posterior_of(
         prior=array(question.prior, 2),
     )
     return Posterior(tuples(sampled.points), tuple(map(float, sampled.discrepancies)), sampled.effective)
+
+
+def design_of(
+    problem: SuggestProblem, question: DesignQuestion, made: PosteriorQuestion, model: Model, posterior: Posterior
+) -> dict[str, object]:
+    """What weighing a pour at each candidate would tell, beside those made."""
+    beside = model.process.points.shape[1] - problem.space.dimension
+    gains, variance = expected_reductions(
+        model.process,
+        np.array(posterior.points),
+        np.array(posterior.discrepancies),
+        Weighed(array(made.contexts, beside), np.array(made.offsets), made.noise),
+        array(question.candidates, beside),
+        array(question.targets, beside),
+    )
+    return {"gains": tuple(map(float, gains)), "uncertainty": variance}
 
 
 def _axis_names(problem: SuggestProblem) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
 from actors.optimizer.core.covariance import matern
@@ -109,6 +110,16 @@ def sample_posterior(
     flat = kept.reshape(-1, dimension + 1)
     chosen = flat[np.linspace(0, len(flat) - 1, count).round().astype(int)]
     return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(kept))
+
+
+def drawn_beforehand(count: int, dimension: int, prior: Array, rng: np.random.Generator) -> Array:
+    """Draws (count, dimension) of θ before anything is weighed: even in the cube, along the axes of `prior` normal."""
+    points = qmc.Sobol(dimension, rng=rng).random(2 ** math.ceil(math.log2(max(count, 2))))[:count]
+    for i, (centre, deviation) in enumerate(prior):
+        if deviation > 0.0:
+            low, high = ndtr((np.array([0.0, 1.0]) - centre) / deviation)
+            points[:, i] = np.clip(centre + deviation * ndtri(low + points[:, i] * (high - low)), 0.0, 1.0)
+    return np.asarray(points)
 
 
 class _Likelihood:

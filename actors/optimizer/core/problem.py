@@ -74,6 +74,19 @@ class PosteriorQuestion:
 
 
 @dataclass(frozen=True)
+class DesignQuestion:
+    """Which pour would tell most about others; asked beside a `PosteriorQuestion`, which may then have no pours yet.
+
+    Attributes:
+        candidates: contexts at which a pour could be weighed.
+        targets: contexts at which the spillage is to be predicted.
+    """
+
+    candidates: tuple[Point, ...]
+    targets: tuple[Point, ...]
+
+
+@dataclass(frozen=True)
 class Posterior:
     """Draws of θ given weighed pours, equally weighted.
 
@@ -184,6 +197,7 @@ class SuggestProblem:
         noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
         widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
         posterior: with a context: weighed pours, for draws of the searched parameters given them.
+        design: with a posterior: which pour to weigh next.
         risk: if given, the observations are of requests as they were executed, disturbances included: points of `data`
             have `space.dimension` coordinates (which may leave the cube) followed by the disturbances' context. What is
             minimised, predicted and mapped is the measure over the disturbances of a request.
@@ -213,6 +227,7 @@ class SuggestProblem:
     noise: NoiseName = "constant"
     widening: float = 1.0
     posterior: PosteriorQuestion | None = None
+    design: DesignQuestion | None = None
     risk: Risk | None = None
     pouring: tuple[Point, ...] = ()
     effort: Effort | None = None
@@ -282,6 +297,9 @@ class Suggestion:
         risk: with a risk: what else is known at `SuggestProblem.predict_at`.
         values: 'knowledge': what a simulation at each point is worth, those before it given; in the cost's unit, ≥ 0.
         pour_value: 'knowledge': the same of the one real observation that is worth most.
+        gains: 'design': by how much weighing a pour at each candidate is expected to lower the variance of predictions,
+            in the mean over the targets; in the cost's unit, squared.
+        uncertainty: 'design': that variance as it is, the mean over the targets.
         mismatch: 'adaptive': what the observations say about the simulator.
         fitted: with `SuggestProblem.effort`: hyperparameters of each process, to start the next fit with.
     """
@@ -305,4 +323,6 @@ class Suggestion:
     values: tuple[float, ...] = ()
     pour_value: float | None = None
     fitted: tuple[tuple[float, ...], ...] = ()
+    gains: tuple[float, ...] = ()
+    uncertainty: float | None = None
     mismatch: MismatchFound | None = None

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from actors.optimizer.core import acquisition
 from actors.optimizer.core.asked import Asked, tuples
 from actors.optimizer.core.checks import check
-from actors.optimizer.core.describe import describe, posterior_of
+from actors.optimizer.core.describe import describe, design_of, posterior_of
 from actors.optimizer.core.knowledge import Knowledge, most_instructive
 from actors.optimizer.core.least_loss import found, proposals
 from actors.optimizer.core.models import Model, fit
@@ -76,7 +76,10 @@ def _answer(problem: SuggestProblem) -> Suggestion:
     if model is not None:
         answer = describe(problem, asked, model, points, feasibility)
     if model is not None and problem.posterior is not None:
-        answer["posterior"] = posterior_of(problem, problem.posterior, asked.region, model, rng)
+        posterior = posterior_of(problem, problem.posterior, asked.region, model, rng)
+        answer["posterior"] = posterior
+        if problem.design is not None:
+            answer |= design_of(problem, problem.design, problem.posterior, model, posterior)
     if model is not None and problem.effort is not None:
         answer["fitted"] = tuples([process.theta for process in model.fitted])
     if knowledge is not None:

@@ -272,7 +272,8 @@ def check_campaign(
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)
         if calibration.records is None:
-            checker.reachable(calibration, calibration.scene, _Role("calibration", section))
+            for scene in calibration.scenes:
+                checker.reachable(calibration, scene, _Role("calibration", section))
         else:
             pours, at = calibration.records.pours, ("calibration", "pours")
             checker.recorded(calibration.scene, [p.action for p in pours], _Role("calibration.pours", section), at)

@@ -14,6 +14,9 @@ from orchestrator.plan import CalibrationPlan, NormalPrior
 from orchestrator.strategies.doors import calibrations
 from sim_engine.space import Axis, Space
 
+DESIGN_SIMULATIONS = 64
+"""Simulations of an active design unless a campaign says how many."""
+
 
 def resolve_calibration(
     section: CalibrationSection,
@@ -37,7 +40,8 @@ def resolve_calibration(
     from_file = pours is not None and pours.source is not None
     from_run = None if pours is None else pours.from_run
     pourer = builder.pourer(section.pourer, place)
-    receiver = builder.receiver(section.receiver, place)
+    receivers = builder.receivers(section, place, inherit=False)
+    receiver = receivers[0] if receivers else None
     actions = builder.space(section.actions, section.motion, place)
     constraints = builder.constraints(section.actions, place, actions)
     prior = _prior(section, builder, place, actions, constraints)
@@ -55,12 +59,20 @@ def resolve_calibration(
         recorded=from_file or from_run is not None,
         constants=constants,
     )
+    further = tuple(
+        builder.scene(f"calibration-{other.name}", pourer, other, motions, searched_actions, place)
+        for other in receivers[1:]
+        if other is not None and scene is not None
+    )
+    if further and from_file:
+        text = "stands beside pours that are read 'from' a file, which were made into one; keep 'receiver'"
+        report.add(place.at("receivers"), text, key=True)
     records = transfer = None
     count = holdout = 0
     if pours is not None and (from_file or from_run is not None):
         source = "a file" if from_file else "a run"
-        for key in ("count", "holdout"):
-            if pours.value(key) is not None:
+        for key in ("count", "holdout", "design", "simulations"):
+            if at.at(key).loc in at.document.marks:
                 report.add(
                     at.at(key), f"belongs to pours that are still to be made; these are read 'from' {source}", key=True
                 )
@@ -74,8 +86,11 @@ def resolve_calibration(
         records, transfer = resolve_records(pours, at, builder, table, actions, scene, pourer, motions)
     elif from_run is not None:
         if scene is not None and actions is not None:
-            records = records_of_run(from_run, at.at("from_run"), scene, actions, laboratory, report)
+            scenes = (scene, *(other for other in further if other is not None))
+            records = records_of_run(from_run, at.at("from_run"), scenes, actions, laboratory, report)
     elif pours is not None:
+        if pours.simulations is not None and pours.design != "active":
+            report.add(at.at("simulations"), "belongs to 'design: active'; remove it, or add that", key=True)
         count = pours.count or 0
         if (
             not count
@@ -96,7 +111,9 @@ def resolve_calibration(
         train = count - holdout if records is None else records.training_pours
         complaints = PlacedComplaints(place, report, frozenset(CalibrationSection.model_fields))
         settings = section.settings.settled(tuple(searched), train, complaints)
-    if scene is None or actions is None or settings is None or not searched:
+    active = pours is not None and pours.design == "active" and count > 0
+    others = tuple(other for other in further if other is not None)
+    if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:
         return None
     return CalibrationPlan(
         settings=settings,
@@ -112,6 +129,9 @@ def resolve_calibration(
         transfer=transfer,
         random_baseline=section.random_baseline,
         parameter_prior=known,
+        further=others,
+        design="stratified" if pours is None else pours.design,
+        design_simulations=(pours.simulations or DESIGN_SIMULATIONS) if pours is not None and active else 0,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from actors.spec import LaboratorySpec
@@ -12,7 +13,8 @@ from orchestrator.config.yaml.errors import did_you_mean
 from orchestrator.config.yaml.files import missing_file, out_of_bounds, resolved
 from orchestrator.config.yaml.source import Place, Report
 from orchestrator.former import FormerRun, fitting, pours_in, read_former_run
-from orchestrator.journal import JOURNAL_NAME, JournalError
+from orchestrator.journal import JOURNAL_NAME
+from orchestrator.journal_file import JournalError
 from orchestrator.plan import ExistingPours, RecordedPour, RecordSet
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.space import Space
@@ -136,25 +138,37 @@ def former_run(run: str, place: Place, report: Report) -> FormerRun | None:
 
 
 def records_of_run(
-    run: str, place: Place, scene: Scene, actions: Space, laboratory: LaboratorySpec | None, report: Report
+    run: str,
+    place: Place,
+    scenes: tuple[Scene, ...],
+    actions: Space,
+    laboratory: LaboratorySpec | None,
+    report: Report,
 ) -> RecordSet | None:
-    """Calibration's pours from a former run; None where something is wrong."""
+    """Calibration's pours from a former run, in any of its scenes; None where something is wrong."""
     former = former_run(run, place, report)
     if former is None:
         return None
     if laboratory is not None and laboratory.mode == "hardware" and former.mode != "hardware":
         report.add(place, f"was poured in a virtual laboratory, and '{laboratory.name}' has a real one's liquid")
         return None
-    pours, why = pours_in(former, scene)
-    fit = fitting(pours, scene, actions)
-    if why or not fit.pours:
-        report.add(place, f"has nothing to calibrate on: it {why or 'has ' + '; '.join(fit.left_out)}")
+    found: list[RecordedPour] = []
+    left_out: list[str] = []
+    reasons: list[str] = []
+    for scene in scenes:
+        pours, why = pours_in(former, scene)
+        fit = fitting(pours, scene, actions)
+        found += [replace(pour, scene=scene.name) for pour in fit.pours] if len(scenes) > 1 else fit.pours
+        left_out += fit.left_out
+        reasons += [why] if why else []
+    if not found:
+        report.add(place, f"has nothing to calibrate on: it {'; it '.join(reasons) or 'has ' + '; '.join(left_out)}")
         return None
-    if fit.left_out:
-        text = f"has pours that this calibration could not have made ({'; '.join(fit.left_out)})"
+    if left_out:
+        text = f"has pours that this calibration could not have made ({'; '.join(left_out)})"
         report.add(place, f"{text}; change the motion, or the bounds under actions")
         return None
-    if all(pour.split != "train" for pour in fit.pours):
+    if all(pour.split != "train" for pour in found):
         report.add(place, "has no pour with split 'train' to calibrate on")
         return None
-    return RecordSet(scene, fit.pours, former.path)
+    return RecordSet(scenes[0], tuple(found), former.path)

@@ -194,9 +194,10 @@ class SceneBuilder:
         """A section's receiver, or the campaign's."""
         return self._vessel("receiver", value, place)
 
-    def receivers(self, section: Any, place: Place) -> list[VesselSpec | None]:
-        """Deployment's receivers: its own, or the campaign's."""
-        for owner, at in ((section, place), (self.file, self.root)):
+    def receivers(self, section: Any, place: Place, *, inherit: bool = True) -> list[VesselSpec | None]:
+        """A section's receivers: its own, or the campaign's; `inherit`: those under the campaign's 'receivers', too."""
+        owners = ((section, place), (self.file, self.root))
+        for owner, at in owners if inherit else owners[:1]:
             if owner.receiver is not None and owner.receivers is not None:
                 self.report.add(at.at("receiver"), "stands beside 'receivers'; keep one of them", key=True)
             if owner.receivers is not None:

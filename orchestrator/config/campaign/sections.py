@@ -25,6 +25,7 @@ from orchestrator.config.yaml.sections import (
     Text,
     tagged,
 )
+from orchestrator.plan import Design
 from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES, calibrations, deployments
 from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings, StrategySettings
 from sim_engine.losses import LossName
@@ -59,6 +60,12 @@ class PoursSection(Section):
     holdout: Count | None = None
     """How many of them are kept for testing; an eighth unless given."""
 
+    design: Design = "stratified"
+    """stratified: spread evenly over the actions; active: each by what it will tell about what is to be deployed."""
+
+    simulations: PositiveCount | None = None
+    """active: simulations to learn from what pours would tell; 64 unless given."""
+
     source: FilePath | None = Field(default=None, alias="from")
     """CSV file of weighed pours; its column `split` says which are kept for testing."""
 
@@ -85,6 +92,9 @@ class CalibrationSection(Section):
 
     receiver: PathOr[VesselFile] | None = None
     """The campaign's unless given."""
+
+    receivers: list[PathOr[VesselFile]] | None = None
+    """Several receivers, into which calibration pours are made by turns."""
 
     motion: Motion | None = None
     """What has other values than in the campaign's `motion`."""

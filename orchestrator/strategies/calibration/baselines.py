@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from actors.optimizer.core.problem import Data, Point, SuggestProblem
+from actors.optimizer.core.problem import Data, SuggestProblem
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import MeasuredPour
-from sim_engine.space import Space
 
 
 def mean_predictor_discrepancy(train: Sequence[MeasuredPour], test: Sequence[MeasuredPour]) -> float | None:
@@ -18,7 +18,9 @@ def mean_predictor_discrepancy(train: Sequence[MeasuredPour], test: Sequence[Mea
     return sum(abs(r - mean) for r in wanted) / len(wanted)
 
 
-def regression_discrepancy(actions: Space, train: Sequence[MeasuredPour], test: Sequence[MeasuredPour]) -> float | None:
+def regression_discrepancy(
+    contexts: Contexts, train: Sequence[MeasuredPour], test: Sequence[MeasuredPour]
+) -> float | None:
     """Mean |r − m(a)| over the test pours, m a GP regression of the training pours, clipped to [0, 1].
 
     Hard to beat inside the scene it was fitted in, and no answer at all for another vessel. None where there
@@ -30,16 +32,12 @@ def regression_discrepancy(actions: Space, train: Sequence[MeasuredPour], test: 
     wanted = [pour for pour in test if pour.spillage is not None]
     if len(usable) < 2 or not wanted:
         return None
-    data = Data(tuple(_point(actions, pour) for pour in usable), tuple(_spillages(usable)))
-    places = tuple(_point(actions, pour) for pour in wanted)
-    predictions = propose(SuggestProblem(actions, data, count=0, predict_at=places)).predictions
+    data = Data(tuple(contexts.point(pour) for pour in usable), tuple(_spillages(usable)))
+    places = tuple(contexts.point(pour) for pour in wanted)
+    predictions = propose(SuggestProblem(contexts.space, data, count=0, predict_at=places)).predictions
     errors = [abs(r - min(max(p, 0.0), 1.0)) for r, p in zip(_spillages(wanted), predictions, strict=True)]
     return sum(errors) / len(errors)
 
 
 def _spillages(pours: Sequence[MeasuredPour]) -> list[float]:
     return [pour.spillage for pour in pours if pour.spillage is not None]
-
-
-def _point(actions: Space, pour: MeasuredPour) -> Point:
-    return tuple(float(u) for u in actions.encode({name: getattr(pour.action, name) for name in actions.names}))

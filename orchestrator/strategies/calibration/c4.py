@@ -12,6 +12,7 @@ from orchestrator.errors import LearningError
 from orchestrator.plan import CalibrationPlan
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, TriedOnce, described
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.posterior import (
     PosteriorFound,
@@ -20,7 +21,6 @@ from orchestrator.strategies.calibration.posterior import (
     posterior_found,
     unit_prior,
 )
-from orchestrator.strategies.calibration.prior import actions_of_prior
 from orchestrator.strategies.calibration.settings import Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.settings import CalibrationSettings, Complaints
@@ -122,6 +122,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             LearningError: fewer than two usable pours.
         """
         super().__init__(plan, measured, seed)
+        self._contexts = Contexts.of(plan)
         self._knows_actions = self._settings.averaging == "context"
         self._started = False
         self._mapped = 0
@@ -129,6 +130,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         self._measured_at: tuple[float, ...] = ()
         self._expected_at: dict[Simulate, float] = {}
         self._posterior: Posterior | None = None
+        self._before = Data()
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -142,16 +144,18 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
     def _ask_regression(self) -> None:
         """c_r(a), and whether it is defined, along the prior's sequence of actions."""
-        count, seed = 2 * self._settings.budget, self._seeds.next()
-        plan, encode = self._plan, self._plan.actions.encode
-        sequence = actions_of_prior(plan.actions, count, seed, plan.constraints, plan.prior)
+        contexts = self._contexts
+        sequence = contexts.sequence(self._plan, 2 * self._settings.budget, self._seeds.next())
+        scenes = {scene.name: scene for scene in self._plan.scenes}
+        known = tuple(contexts.place(scenes[one.scene], one.action) for one in self._plan.known)
+        everywhere = (*sequence, *known)
         spillage, poured = Data(), Data()
         for pour in self._train:
-            point = tuple(encode({name: _number(pour, name) for name in self._plan.actions.names}))
+            point = contexts.point(pour)
             poured = poured.added(point, pour.poured)
             if pour.spillage is not None:
                 spillage = spillage.added(point, pour.spillage)
-        problem = SuggestProblem(self._plan.actions, spillage, count=0, predict_at=sequence)
+        problem = SuggestProblem(contexts.space, spillage, count=0, predict_at=everywhere)
 
         def with_poured(regression: Suggestion, likely: Suggestion | None) -> None:
             keep = [
@@ -168,6 +172,10 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             order = [keep[i % len(keep)] for i in range(self._settings.budget)]
             self._actions = tuple(sequence[i] for i in order)
             self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
+            expected = regression.predictions[len(sequence) :]
+            for one, place, measured in zip(self._plan.known, known, expected, strict=True):
+                theta = tuple(map(float, self._plan.parameters.encode(one.theta)))
+                self._before = self._before.added((*theta, *place), min(max(measured, 0.0), 1.0) - one.spillage)
             self.decisions.append(
                 Decision(f"c_r(a) regressed from {len(self._usable)} pours", dict(regression.hyperparameters or {}))
             )
@@ -176,7 +184,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             if len(self._usable) == len(self._train):
                 with_poured(regression, None)
             else:
-                where_defined = SuggestProblem(self._plan.actions, poured, count=0, predict_at=sequence)
+                where_defined = SuggestProblem(contexts.space, poured, count=0, predict_at=sequence)
                 self._questions.put(where_defined, "regress", lambda likely: with_poured(regression, likely))
 
         self._questions.put(problem, "regress", with_spillage)
@@ -200,8 +208,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
     def _ask_posterior(self) -> None:
         """Draws of θ given the training pours: first what the regression says at them, for it is in the differences."""
-        encode, names = self._plan.actions.encode, self._plan.actions.names
-        places = tuple(tuple(encode({name: _number(pour, name) for name in names})) for pour in self._usable)
+        places = tuple(self._contexts.point(pour) for pour in self._usable)
         weighed = tuple(pour.spillage for pour in self._usable if pour.spillage is not None)
 
         def drawn(suggestion: Suggestion) -> None:
@@ -225,7 +232,9 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._questions.put(problem, "posterior", drawn)
 
         data = Data(places, weighed)
-        self._questions.put(SuggestProblem(self._plan.actions, data, count=0, predict_at=places), "regress", regressed)
+        self._questions.put(
+            SuggestProblem(self._contexts.space, data, count=0, predict_at=places), "regress", regressed
+        )
 
     def _ask_expected(self, point: Point) -> None:
         """What is expected of θ*, and the map through it."""
@@ -246,6 +255,8 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
     def _problem(self, *, everything: bool = False, acquisition: str = "lcb", resolution: int = 0) -> SuggestProblem:
         data = self._trials.data(everything=everything)
+        if self._knows_actions:
+            data = Data(self._before.points + data.points, self._before.costs + data.costs)
         return SuggestProblem(
             self._plan.parameters,
             data,
@@ -263,8 +274,8 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         for i, point in enumerate(suggestion.points):
             index = len(self._trials)
             theta = self.parameters_at(point)
-            action = self._plan.scene.action(self._plan.actions.decode(self._actions[index]))
-            request = Simulate(self._plan.scene.name, action, theta, self._seeds.next(), "calibrate")
+            scene, action = self._contexts.request(self._actions[index])
+            request = Simulate(scene.name, action, theta, self._seeds.next(), "calibrate")
             context = self._actions[index] if self._knows_actions else ()
             self._expected_at[request] = self._measured_at[index]
             self._trials.add(Trial(point, (request,), context))
@@ -295,10 +306,3 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             discrepancy=None if trial.cost is None else abs(trial.cost),
             difference=trial.cost if self._knows_actions else None,
         )
-
-
-def _number(pour: MeasuredPour, name: str) -> float:
-    value = getattr(pour.action, name)
-    if value is None:
-        raise ValueError(f"{name} is searched, but switched off in a measured pour")
-    return float(value)

@@ -43,17 +43,19 @@ class MeasuredPour:
         spillage: r = spilled / poured; None below 5 % poured, where it is undefined.
         poured: fraction of the load that left the pourer.
         split: 'train', 'test' or 'transfer'.
+        scene: name of the one that it was made in; '' for the first of its calibration.
     """
 
     action: Action
     spillage: float | None
     poured: float
     split: str = "train"
+    scene: str = ""
 
     @classmethod
     def from_record(cls, record: RecordedPour) -> MeasuredPour:
         """From a row of a file of recorded pours."""
-        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split)
+        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split, record.scene)
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,9 @@ class DesignPoint(Part):
     split: str
     """'train', or 'test' for those that calibration does not see."""
 
+    scene: str = ""
+    """Where it was poured; '' for the calibration's first scene."""
+
 
 class PouredPoint(DesignPoint):
     """A pour that was weighed."""
@@ -147,6 +152,22 @@ class GivenUpPoint(DesignPoint):
     """Why."""
 
 
+class SimulatedPoint(Part):
+    """A simulation that an active design made in a scene of the calibration, which C4 learns from as well."""
+
+    theta: dict[str, float]
+    """Searched parameters."""
+
+    scene: str
+    """Where."""
+
+    action_si: dict[str, float]
+    """Searched dimensions of the action."""
+
+    spillage: float
+    """c_s."""
+
+
 class DesignPoured(Learnt):
     """The pours that calibration learns from."""
 
@@ -154,6 +175,9 @@ class DesignPoured(Learnt):
 
     pours: tuple[PouredPoint | GivenUpPoint, ...]
     """In the order made."""
+
+    simulated: tuple[SimulatedPoint, ...] = ()
+    """What an active design simulated in the calibration's scenes."""
 
     @property
     def measured(self) -> tuple[PouredPoint, ...]:
@@ -165,6 +189,7 @@ class DesignPoured(Learnt):
 class _Planned:
     stratum: Stratum
     split: str
+    scene: Scene
     tries: int = 0
     action: Action | None = None
     measured: MeasuredPour | None = None
@@ -184,7 +209,7 @@ class DesignedPours:
 
     def __init__(
         self,
-        scene: Scene,
+        scenes: Sequence[Scene],
         actions: Space,
         count: int,
         holdout: int,
@@ -196,10 +221,10 @@ class DesignedPours:
         """Plan.
 
         Args:
+            scenes: into which pours are made by turns, train and test each; at least one.
             points: the actions themselves, in the unit cube, in place of drawn ones: pours that are to be repeated.
             constraints: that the actions meet, if drawn.
         """
-        self._scene = scene
         self._actions = actions
         self._seeds = SeedStream(seed, "design")
         if points is None:
@@ -207,7 +232,12 @@ class DesignedPours:
         else:
             strata = [Stratum(point, point) for point in points]
         kept = choose_holdout(strata, holdout, self._seeds.rng)
-        self._planned = [_Planned(s, "test" if i in kept else "train") for i, s in enumerate(strata)]
+        turns = {"train": 0, "test": 0}
+        self._planned: list[_Planned] = []
+        for i, stratum in enumerate(strata):
+            split = "test" if i in kept else "train"
+            self._planned.append(_Planned(stratum, split, scenes[turns[split] % len(scenes)]))
+            turns[split] += 1
         self._region = region_of(actions, constraints if points is None else ())
         self._current = 0
         self._pouring: Pour | None = None
@@ -230,9 +260,9 @@ class DesignedPours:
         planned = self._planned[self._current]
         values = self._actions.decode(draw_allowed(planned.stratum, self._region, self._seeds.rng))
         planned.tries += 1
-        planned.action = self._scene.action(values)
+        planned.action = planned.scene.action(values)
         self._pouring = Pour(
-            self._scene.name, planned.action, self._current + 1, self._seeds.next(), purpose="calibration"
+            planned.scene.name, planned.action, self._current + 1, self._seeds.next(), purpose="calibration"
         )
         self.decisions.append(
             Decision(
@@ -254,7 +284,7 @@ class DesignedPours:
                 fractions = measurement.fractions
                 assert planned.action is not None
                 planned.measured = MeasuredPour(
-                    planned.action, normalised_spillage(fractions), fractions.poured, planned.split
+                    planned.action, normalised_spillage(fractions), fractions.poured, planned.split, planned.scene.name
                 )
             case Failed("invalid_action", reason) if planned.tries < MAX_TRIES:
                 planned.notes.append(reason)
@@ -274,7 +304,11 @@ class DesignedPours:
         rows: list[PouredPoint | GivenUpPoint] = []
         for number, planned in enumerate(self._planned[: self._current], start=1):
             if planned.measured is None:
-                rows.append(GivenUpPoint(number=number, split=planned.split, given_up=planned.given_up or ""))
+                rows.append(
+                    GivenUpPoint(
+                        number=number, split=planned.split, scene=planned.scene.name, given_up=planned.given_up or ""
+                    )
+                )
                 continue
             action = planned.measured.action
             values = {name: getattr(action, name) for name in self._actions.names}
@@ -282,6 +316,7 @@ class DesignedPours:
                 PouredPoint(
                     number=number,
                     split=planned.split,
+                    scene=planned.scene.name,
                     action=displayed_action(values),
                     action_si=values,
                     spillage=planned.measured.spillage,

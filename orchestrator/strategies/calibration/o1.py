@@ -55,7 +55,7 @@ class DiscrepancyOverPours(Calibration[S]):
         """Queue a θ on all training pours."""
         theta = self.parameters_at(point)
         requests = tuple(
-            Simulate(self._plan.scene.name, pour.action, theta, seed, "calibrate")
+            Simulate(pour.scene or self._plan.scene.name, pour.action, theta, seed, "calibrate")
             for pour, seed in zip(self._usable, self._seed_of_pour, strict=True)
         )
         self._trials.add(Trial(point, requests))

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Slots
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, Scores
 from orchestrator.strategies.progress import Progress
 from sim_engine.bands import left_over
 from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Space
 
 BySplit = dict[str, float | None]
 
@@ -52,7 +52,7 @@ class Scorecard:
         theta: SimulationParameters,
         random_thetas: Mapping[str, SimulationParameters],
         pours: Sequence[ScoredPour],
-        actions: Space,
+        contexts: Contexts,
         seed: int,
         *,
         uncalibrated: SimulationParameters | None = None,
@@ -62,7 +62,7 @@ class Scorecard:
         Args:
             random_thetas: by label, 'random 1' … .
             pours: of the splits 'train', 'test' and 'transfer'.
-            actions: space of the regression.
+            contexts: in which the regression lives.
             uncalibrated: θ that one would take without calibrating; None, or θ* itself, is not scored.
         """
         unseen = [scored for scored in pours if scored.pour.split != "train"]
@@ -75,7 +75,7 @@ class Scorecard:
         if uncalibrated is not None and uncalibrated != theta:
             self._parts.append(Evaluation({UNCALIBRATED: uncalibrated}, [*unseen, *train], seed))
         self._owner: dict[Simulate, Evaluation] = {}
-        self._actions = actions
+        self._contexts = contexts
         self._pours: dict[str, list[MeasuredPour]] = {}
         for scored in pours:
             self._pours.setdefault(scored.pour.split, []).append(scored.pour)
@@ -134,6 +134,6 @@ class Scorecard:
             test = {split: pours for split, pours in unseen.items() if split == "test"}
             self._baselines = (
                 {split: mean_predictor_discrepancy(train, pours) for split, pours in unseen.items()},
-                {split: regression_discrepancy(self._actions, train, pours) for split, pours in test.items()},
+                {split: regression_discrepancy(self._contexts, train, pours) for split, pours in test.items()},
             )
         return self._baselines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from orchestrator.daemon.api import serve_app
 from orchestrator.daemon.auth import Role, Tokens, token_of
 from orchestrator.daemon.packing import pack
 from orchestrator.daemon.settings import Settings
+from orchestrator.daemon.store import AT_REST
 from orchestrator.daemon.supervisor import Supervisor
 from sim_engine.outcome import PourMeasurement
 from sim_engine.task import Scene
@@ -124,7 +125,7 @@ class Served:
         async with asyncio.timeout(PATIENCE):
             async for _ in self.daemon.feed.read(0, beat=0.05):
                 found: dict[str, Any] = await self.get(f"/campaigns/{key}")
-                resting = found["state"] in ("running", "waiting for operator") or found["progress"] is None
+                resting = found["state"] not in AT_REST or found["progress"] is None
                 if found["state"] in states and resting:
                     return found
         raise AssertionError("unreachable")
@@ -204,8 +205,3 @@ def run(work: Any) -> None:
             await work
 
     asyncio.run(limited())
-
-
-@contextlib.contextmanager
-def nothing() -> Iterator[None]:
-    yield

@@ -84,7 +84,7 @@ AS_TIME_ALLOWS: dict[str, tuple[Any, dict[str, Any]]] = {
 
 @cache
 def measured() -> tuple[Any, ...]:
-    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 6, 1, 0)
+    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 6, 1, 0)
     Play(weighed)(design)
     return design.measured
 
@@ -180,7 +180,7 @@ def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
     def lost(request: Request) -> Outcome | None:
         return Poured(PourMeasurement(0.2, NAN, 0.0)) if isinstance(request, Pour) and request.number == 2 else None
 
-    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 4, 1, 0)
+    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 4, 1, 0)
     Play(weighed, answer=lost)(design)
     assert len(design.measured) == 3
     assert "no numbers" in str(design.result().pours[1].given_up)

@@ -9,6 +9,7 @@ from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggeste
 from orchestrator.stages import POURS, measured_pours
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour, choose_holdout, stratified
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
@@ -35,7 +36,7 @@ class Quiet:
 
 
 def measured(seed=0, count=32, holdout=4):
-    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, count, holdout, seed)
+    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
     Play(weighed)(design)
     return design.measured
 
@@ -81,7 +82,7 @@ def test_an_impossible_action_is_replaced_by_another_of_its_stratum():
             raise ValueError("cups touch")
         return 0.1
 
-    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 32, 4, 1)
+    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 32, 4, 1)
     played = Play(sometimes_touching)(design)
     assert refused
     assert len(played.pours) == 32 + len(refused)
@@ -94,14 +95,14 @@ def test_a_stratum_without_a_possible_action_is_given_up_with_its_reason():
     def never(action, theta, rng):
         raise ValueError("cups touch: at tilt 37° …")
 
-    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 2, 0, 1)
+    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 2, 0, 1)
     Play(never)(design)
     assert design.measured == ()
     assert "cups touch" in str(design.result().pours[0].given_up)
 
 
 def test_weighed_pours_survive_the_journal():
-    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, 6, 1, 1)
+    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 6, 1, 1)
     Play(weighed)(design)
     read_back = measured_pours(calibration_plan(), {POURS: design.result()})
     assert tuple(scored.pour for scored in read_back) == design.measured
@@ -215,7 +216,7 @@ BOX = Space((*PARAMETERS.axes, Axis("viscosity", 0.0, 1.0), Axis("friction", 0.0
 
 
 def spill_by_two(action, theta, rng):
-    """Of four searched parameters cohesion and friction matter."""
+    """A liquid to which of four searched parameters cohesion and friction matter."""
     u, v = unit(action, CALIBRATION_ACTIONS)
     return 0.2 * u + 0.1 * v + 5.0 * abs(theta.cohesion - 0.04) ** 1.5 + 0.8 * (theta.friction - 0.2) ** 2
 
@@ -303,7 +304,7 @@ def test_a_regression_beats_the_mean_inside_the_scene_it_was_fitted_in():
     train, test = [p for p in pours if p.split == "train"], [p for p in pours if p.split == "test"]
     mean = mean_predictor_discrepancy(train, test)
     assert mean == pytest.approx(np.mean([abs(p.spillage - np.mean([q.spillage for q in train])) for p in test]))
-    assert regression_discrepancy(CALIBRATION_ACTIONS, train, test) < 0.5 * mean
+    assert regression_discrepancy(Contexts(CALIBRATION_ACTIONS, (SCENE,)), train, test) < 0.5 * mean
     assert mean_predictor_discrepancy(train, []) is None
 
 
@@ -311,8 +312,8 @@ def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the
     pours = [ScoredPour("cup", pour) for pour in measured(count=8, holdout=2)]
     plain = SimulationParameters(particles=4000, cohesion=0.0)
     rivals = random_parameters(PARAMETERS, {}, 2, 1)
-    card = Scorecard(TRUE_THETA, rivals, pours, CALIBRATION_ACTIONS, 3, uncalibrated=plain)
-    without = Scorecard(TRUE_THETA, rivals, pours, CALIBRATION_ACTIONS, 3)
+    card = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=plain)
+    without = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3)
     played, before = Play(calibration_spill)(card), Play(calibration_spill)(without)
     asked = {theta: [r for r in played.simulations if r.parameters == theta] for theta in (TRUE_THETA, plain)}
     assert [(r.action, r.seed) for r in asked[TRUE_THETA]] == [(r.action, r.seed) for r in asked[plain]]
@@ -323,6 +324,6 @@ def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the
     assert result.discrepancy["uncalibrated"]["train"] > 2 * result.discrepancy["theta"]["train"]
     assert sum(pair.theta == "uncalibrated" for pair in result.pairs) == 8
     assert "uncalibrated" not in without.result().discrepancy
-    same = Scorecard(TRUE_THETA, rivals, pours, CALIBRATION_ACTIONS, 3, uncalibrated=TRUE_THETA)
+    same = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=TRUE_THETA)
     Play(calibration_spill)(same)
     assert "uncalibrated" not in same.result().discrepancy

@@ -19,7 +19,7 @@ BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"samples": 18
 
 
 def measured(seed=0, count=12, holdout=2):
-    design = DesignedPours(SCENE, CALIBRATION_ACTIONS, count, holdout, seed)
+    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
     Play(weighed)(design)
     return design.measured
 

@@ -102,7 +102,7 @@ def _touches(action: Action) -> bool:
 
 @cache
 def measured(dimension: int) -> tuple[MeasuredPour, ...]:
-    design = DesignedPours(SCENE, Space(ACTIONS[:dimension]), 6, 1, 0)
+    design = DesignedPours((SCENE,), Space(ACTIONS[:dimension]), 6, 1, 0)
     Play(spill)(design)
     return design.measured
 

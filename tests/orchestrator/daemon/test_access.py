@@ -1,0 +1,205 @@
+"""Who gets in, and with what: tokens, roles, guessing, paths that lead elsewhere, files that blow up, sheer size."""
+
+from __future__ import annotations
+
+import base64
+import stat
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.daemon.auth import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
+from orchestrator.daemon.packing import PackingError, unpack
+from tests.orchestrator.daemon.served import Served, held, run, serving
+
+LOOKING = ("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report")
+DOING = (
+    "/campaigns",
+    "/campaigns/x/pause",
+    "/campaigns/x/resume",
+    "/campaigns/x/stop",
+    "/campaigns/x/abort",
+    "/campaigns/x/move",
+    "/campaigns/x/arm",
+    "/questions/1/answer",
+    "/queue/pause",
+    "/queue/resume",
+    "/emergency-stop/clear",
+    "/shutdown",
+)
+
+
+def test_nothing_but_health_is_told_without_a_token_and_viewers_do_nothing(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            for path in LOOKING:
+                assert (await served.http.get(f"/api/v1{path}")).status_code == 401, path
+            for path in (*DOING, "/emergency-stop"):
+                assert (await served.http.post(f"/api/v1{path}", json={})).status_code == 401, path
+            for path in DOING:
+                answer = await served.http.post(f"/api/v1{path}", json={}, headers=served.headers(Role.VIEWER))
+                assert answer.status_code == 403, path
+            assert (await served.http.get("/healthz")).json() == {"ok": True, "problems": []}
+            assert (await served.http.get("/readyz")).status_code in (200, 503)
+            for path in ("/docs", "/openapi.json", "/api/v1/docs", "/redoc"):
+                assert (await served.http.get(path)).status_code == 404
+
+    run(work())
+
+
+def test_every_route_asks_for_a_token(tmp_path: Path) -> None:
+    from orchestrator.daemon.api import create_app
+
+    described = create_app().openapi()["paths"]
+    open_to_all = {path for path, verbs in described.items() for verb in verbs.values() if "security" not in verb}
+    assert open_to_all == {"/healthz", "/readyz"}
+
+
+def test_an_address_that_guesses_is_not_heard_for_a_while_but_may_still_stop_everything(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, held) as served:
+            await served.submit()
+            await served.pouring()
+            for _ in range(FAILURES):
+                answer = await served.http.get("/api/v1/status", headers={"Authorization": "Bearer guess"})
+                assert answer.status_code == 401
+            answer = await served.http.get("/api/v1/status", headers=served.headers())
+            assert answer.status_code == 429
+            assert int(answer.headers["Retry-After"]) <= WINDOW + 1
+            answer = await served.http.post("/api/v1/emergency-stop", headers=served.headers(Role.VIEWER))
+            assert served.laboratories[0].arm_stops == 1
+
+    run(work())
+
+
+def test_guesses_are_forgotten_after_a_while_and_do_not_bar_others(tmp_path: Path) -> None:
+    now = [0.0]
+    tokens = Tokens(tmp_path / "tokens", clock=lambda: now[0])
+    for _ in range(FAILURES):
+        assert tokens.person("guess", "here") is None
+    with pytest.raises(TooManyFailuresError, match="60 s"):
+        tokens.person("guess", "here")
+    assert tokens.person("guess", "there") is None
+    now[0] = WINDOW + 1.0
+    assert tokens.person("guess", "here") is None
+
+
+def test_tokens_are_made_once_for_their_owner_alone_and_refused_where_others_can_read_them(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "tokens"
+    Tokens(path)
+    text = path.read_text()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert [line.split()[0] for line in text.splitlines()[1:]] == ["admin", "operator", "viewer"]
+    Tokens(path)
+    assert path.read_text() == text
+    path.chmod(0o640)
+    with pytest.raises(TokenFileError, match="others may read the tokens"):
+        Tokens(path)
+    path.chmod(0o600)
+    path.write_text(text + "operator tablet short\n")
+    with pytest.raises(TokenFileError, match=r"tokens:5: should be ROLE NAME TOKEN"):
+        Tokens(path)
+
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{chr(98 + i)}: &{chr(98 + i)} [{', '.join([f'*{chr(97 + i)}'] * 10)}]\n" for i in range(8)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        pytest.param(BOMB, "more than 20000 values", id="aliases of aliases"),
+        pytest.param("[" * 5000, "nested more than", id="depth"),
+        pytest.param("name: !!python/object/apply:os.system [touch x]\n", "a list; put it in quotes", id="code"),
+        pytest.param("laboratory: ../../tokens\nname: x\nseed: 1\n", "lies outside", id="the daemon's own files"),
+        pytest.param("laboratory: /etc/passwd\nname: x\nseed: 1\n", "lies outside", id="the system's files"),
+        pytest.param("pourer: /nonexistent/x.yaml\nname: x\nseed: 1\n", "lies outside", id="what is not there"),
+        pytest.param("\x00\x01", "not YAML", id="not text"),
+    ],
+)
+def test_what_is_submitted_neither_looks_elsewhere_nor_blows_up(tmp_path: Path, text: str, said: str) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            told = await served.post("/campaigns", {"text": text}, status=422)
+            assert said in told["detail"]
+            assert "daemon:" not in told["detail"], "a file's content was shown"
+            assert str(tmp_path) not in told["detail"].replace(str(tmp_path / "state/tokens"), "")
+            assert list((tmp_path / "state/campaigns").iterdir()) == []
+
+    run(work())
+
+
+@pytest.mark.parametrize(
+    "name", ["../x", "/etc/x", "a/../../x", "a//b", ".hidden", "campaign.yaml", "a\x00b", "x" * 200, ""]
+)
+def test_files_go_nowhere_but_into_the_snapshot(tmp_path: Path, name: str) -> None:
+    with pytest.raises(PackingError, match="is not a name for one"):
+        unpack("name: x\n", {name: base64.b64encode(b"x").decode()}, tmp_path / "snapshot")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_in_a_root_does_not_lead_out_of_it(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    outside = tmp_path / "outside.yaml"
+    outside.write_text("name: secret\n")
+    (root / "link.yaml").symlink_to(outside)
+    (root / "refers.yaml").write_text("name: x\npourer: ../outside.yaml\nlaboratory: link.yaml\nseed: 1\n")
+
+    async def work() -> None:
+        async with serving(tmp_path, roots=(root,)) as served:
+            for path in ("link.yaml", "../outside.yaml", str(outside), "nothing.yaml", "/etc/passwd"):
+                told = await served.post("/campaigns", {"path": path}, status=422)
+                assert "no such campaign in the folders that may be read" in told["detail"], path
+            told = await served.post("/campaigns", {"path": "refers.yaml"}, status=422)
+            assert told["detail"].count("lies outside") == 2
+            assert "secret" not in told["detail"]
+
+    run(work())
+
+
+def test_a_campaign_in_a_root_is_submitted_by_its_path(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, roots=(tmp_path,)) as served:
+            key = (await served.post("/campaigns", {"path": "small.yaml"}))["id"]
+            await served.until(key, "finished")
+
+    run(work())
+
+
+def test_ten_megabytes_are_not_read(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            text = "x" * 10_000_000
+            told = await served.post("/campaigns", {"text": text}, status=413)
+            assert told["detail"] == "more than 4 MB are not read (listen: body in the daemon's settings)"
+
+            async def pieces() -> Any:  # of unknown length
+                for _ in range(100):
+                    yield b"x" * 100_000
+
+            answer = await served.http.post("/api/v1/campaigns", headers=served.headers(), content=pieces())
+            assert answer.status_code == 413
+
+    run(work())
+
+
+def test_another_name_for_this_machine_is_not_answered(tmp_path: Path) -> None:
+    async def ask(served: Served, host: str) -> int:
+        answer = await served.http.get("/healthz", headers={"Host": host})
+        return answer.status_code
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            for host in ("localhost:8377", "127.0.0.1", "[::1]:1", "[::1]"):
+                assert await ask(served, host) == 200, host
+            for host in ("evil.example", "evil.example:8377", "127.0.0.1.evil.example", ""):
+                assert await ask(served, host) == 421, host
+            answer = await served.http.options(
+                "/api/v1/status", headers={"Origin": "http://evil.example", "Access-Control-Request-Method": "GET"}
+            )
+            assert "access-control-allow-origin" not in answer.headers
+
+    run(work())
