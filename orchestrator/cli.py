@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb, vessel_verb, view
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -23,6 +23,7 @@ from orchestrator.commands.options import (
     Resume,
     RunId,
     Seed,
+    Thetas,
     call,
     examples,
 )
@@ -134,10 +135,7 @@ def plan(
     seeds: Annotated[
         int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction and its spread.")
     ] = 5,
-    thetas: Annotated[
-        int,
-        typer.Option(min=0, max=50, help="Predict with so many θ of the posterior in --parameters; 0: with θ* alone."),
-    ] = 0,
+    thetas: Thetas = None,
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
     as_json: Json = False,
@@ -262,6 +260,7 @@ app.command(
 )(bench_verbs.pour)
 
 app.command(epilog=report.EXAMPLES)(report.report)
+app.command(epilog=view.EXAMPLES)(view.view)
 app.add_typer(runs_verbs.runs)
 
 
@@ -308,6 +307,7 @@ def physics(
 
 
 daemon_verbs.register(app)
+vessel_verb.register(app)
 
 
 def main() -> None:

@@ -98,21 +98,17 @@ def shift_of(spillage: float, particles: int) -> float:
 def left_over(pairs: Sequence[tuple[float, float]], fitted: int) -> float | None:
     """The shift that a calibration left over: how far its θ* stays from the pours that it was fitted to.
 
-    Δr = φ(z) · shift, so that Σ Δr² / Σ φ² estimates its square: pours of which hardly anything is spilled, or all of
-    it, hardly count, for no shift would show in them.
-
     Args:
         pairs: measured and simulated r of every pour.
         fitted: number of parameters that were fitted.
 
     Returns:
-        Standard deviation of the shift; None where there are no more pours than parameters.
+        Standard deviation of the shift about none; None where there are no more pours than parameters.
     """
     if len(pairs) <= fitted:
         return None
-    differences = math.fsum((measured - simulated) ** 2 for measured, simulated in pairs)
-    slopes = math.fsum(_NORMAL.pdf(shift_of(measured, RESOLUTION_AT)) ** 2 for measured, _ in pairs)
-    return math.sqrt(differences / slopes * len(pairs) / (len(pairs) - fitted))
+    shifts = [shift_of(measured, RESOLUTION_AT) - shift_of(simulated, RESOLUTION_AT) for measured, simulated in pairs]
+    return math.sqrt(math.fsum(z * z for z in shifts) / (len(pairs) - fitted))
 
 
 def band(spillages: Sequence[float], particles: int, discrepancy: float | None = None, level: float = LEVEL) -> Band:
@@ -164,7 +160,7 @@ def band_of(outcomes: Sequence[PourOutcome], discrepancy: float | None = None) -
 
 
 def _quantile(places: Sequence[float], width: float, share: float) -> float:
-    """Of an even mixture of normal distributions, by bisection."""
+    """The quantile of an even mixture of normal distributions, by bisection."""
     low, high = -_WIDEST, _WIDEST
     for _ in range(60):
         middle = 0.5 * (low + high)

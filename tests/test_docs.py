@@ -73,7 +73,12 @@ def test_shown_commands_are_understood(page: Path) -> None:
         assert verb in verbs, line
         if not arguments:
             continue  # a verb that is only mentioned
-        verbs[verb].make_context(verb, list(arguments)).close()  # raises on what the command does not know
+        try:
+            verbs[verb].make_context(verb, list(arguments)).close()  # raises on what the command does not know
+        except Exception as error:
+            mentioned = all(word.startswith("-") for word in arguments)  # an option, which then needs no campaign
+            if not mentioned or type(error).__name__ != "MissingParameter":
+                raise
         for argument in arguments:
             if argument.startswith("configs/"):
                 assert (ROOT / argument).exists(), line
@@ -90,7 +95,7 @@ def test_tables_are_what_the_code_declares(tables: ModuleType) -> None:
     pages = tables.pages()
     assert {page.name for page in pages} >= {"user-guide.md", "how-it-works.md", "architecture.md"}
     for page in pages:
-        assert tables.render(text_of(page)) == text_of(page), "run: python docs/make_tables.py"
+        assert tables.render(text_of(page), page.name) == text_of(page), "run: python docs/make_tables.py"
 
 
 def test_every_table_stands_on_some_page(tables: ModuleType) -> None:
@@ -121,7 +126,7 @@ def test_exit_codes_are_the_commands() -> None:
 
 
 def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:
-    shown = [block for kind, block in FENCE.findall(text_of(ROOT / "docs" / "user-guide.md")) if "profile:" in block]
+    shown = [block for kind, block in FENCE.findall(text_of(ROOT / "docs" / "laboratories.md")) if "profile:" in block]
     assert len(shown) == 1
     path = tmp_path / "vessel.yaml"
     path.write_text(shown[0], encoding="utf-8")

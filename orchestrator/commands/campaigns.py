@@ -23,7 +23,16 @@ if TYPE_CHECKING:
     from sim_engine.vessel.spec import VesselSpec
 
 
-_TOLD = {"prediction", "predicted_delivered_g", "predicted_delivered_ml", "risk", "window", "not_covered"}
+_TOLD = {
+    "prediction",
+    "prediction_band",
+    "at_bounds",
+    "predicted_delivered_g",
+    "predicted_delivered_ml",
+    "risk",
+    "window",
+    "not_covered",
+}
 """Fields of a receiver's summary that a plan for it prints beside the action."""
 
 
@@ -151,12 +160,13 @@ def plan_pour(
     iterations: int | None,
     seed: int | None,
     seeds: int,
-    thetas: int,
+    thetas: int | None,
     laboratory: Path | None,
     in_process: bool,
     as_json: bool,
 ) -> None:
     """D1 for one receiver: the action that the calibrated simulator would pour with, and what to expect of it."""
+    from orchestrator.commands.foretelling import foretelling
     from orchestrator.results import learnt_by
     from orchestrator.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
     from orchestrator.strategies.deployment.learnt import Deployed
@@ -166,8 +176,9 @@ def plan_pour(
     check_campaign_can_run(plan, as_written=receiver is None)
     assert plan.deployment is not None
     planning = deployment_stages(plan, plan.deployment)
-    drawn = _drawn(plan, parameters, thetas)
-    stages = [*planning, *prediction_stages(plan, plan.deployment, max(seeds, len(drawn)), drawn)]
+    known = foretelling(plan, parameters, thetas, seeds)
+    count = max(seeds, len(known.drawn))
+    stages = [*planning, *prediction_stages(plan, plan.deployment, count, known.drawn, known.discrepancy)]
     check_laboratory_answers(plan, stages, in_process=in_process)
     directory = run_directory(plan, resume=False, run_id=None)
     if parameters is None:
@@ -211,21 +222,6 @@ def plan_pour(
         totals = {"simulations": finished.result.simulations, "cpu_s": finished.result.cpu_s, "run": str(directory)}
         first = answers[0]
         print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
-
-
-def _drawn(plan: CampaignPlan, parameters: Path | None, thetas: int) -> tuple[SimulationParameters, ...]:
-    """θ of the posterior that a prediction takes turns with."""
-    from orchestrator.config.load import load_posterior
-    from orchestrator.config.yaml.errors import ConfigError
-
-    if thetas == 0:
-        return ()
-    if parameters is None:
-        raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration", BAD_INPUT)
-    try:
-        return load_posterior(parameters, thetas, plan.parameters)
-    except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 def planning_plan(

@@ -42,6 +42,16 @@ Assignments = Annotated[
     list[str] | None,
     typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
 ]
+Thetas = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        max=50,
+        help="Predict with so many θ of the posterior in --parameters, in turn; 0: with θ* alone. As many as seeds if "
+        "not given and the file has a posterior.",
+        show_default=False,
+    ),
+]
 SceneName = Annotated[
     str | None,
     typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),

@@ -16,6 +16,7 @@ from orchestrator.commands.options import (
     Quiet,
     Receiver,
     SceneName,
+    Thetas,
     call,
 )
 from orchestrator.commands.speaking import BAD_INPUT, RefusalError
@@ -45,16 +46,7 @@ def simulate(
     seeds: Annotated[
         int, typer.Option(min=1, max=1000, help="How many seeds of a pour: SEED, SEED + 1, … Their spread is told.")
     ] = 3,
-    thetas: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            max=50,
-            help="Take turns with so many θ of the posterior in --parameters; 0: θ* alone. As many as seeds if not "
-            "given and the file has a posterior.",
-            show_default=False,
-        ),
-    ] = None,
+    thetas: Thetas = None,
     scene: SceneName = None,
     as_json: Json = False,
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 STYLE = "style.css"
 
+LARGEST_VECTOR = 1_500_000
+"""Bytes of an SVG that goes into a page; of a larger one, with a surface of many facets, the PNG does."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -77,7 +80,7 @@ class Picture:
             OSError: it can't be read.
         """
         vector = file.with_suffix(".svg")
-        file = vector if vector.is_file() else file
+        file = vector if vector.is_file() and vector.stat().st_size <= LARGEST_VECTOR else file
         kind = "svg+xml" if file.suffix == ".svg" else "png"
         data = base64.b64encode(file.read_bytes()).decode("ascii")
         return cls(f"data:image/{kind};base64,{data}", alt, caption, wide)

@@ -13,6 +13,7 @@ from pydantic import Field, SerializeAsAny, create_model
 from pydantic.json_schema import GenerateJsonSchema
 
 from orchestrator.plan import CampaignPlan
+from orchestrator.report import style
 from orchestrator.report.names import receiver_names
 from orchestrator.report.results import (
     SPLITS,
@@ -27,14 +28,18 @@ from orchestrator.results import Results, kinds
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.posterior import PosteriorSummary
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.strategies.deployment.adaptive import Believed
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed, FrontAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
 from orchestrator.strategies.learnt import Learnt, Part
+from orchestrator.strategies.repeats import Foreseen
+from sim_engine.bands import Band
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.regimes import NotCovered
+from sim_engine.space import Axis
 from sim_engine.spread import Spread
 
 if TYPE_CHECKING:
@@ -146,13 +151,20 @@ class ReceiverSummary(Part):
     predicted_spillage: float | None
     predicted_spillage_deviation: float | None
     untrustworthy_simulation: bool
-    trust: Compared | Foretold
+    trust: Compared | Foretold | Believed
     gave_up: str | None
+    ended: str | None
     front: tuple[FrontAction, ...] | None
     risk: RiskFound | None
     window: WindowFound | None
     prediction: dict[str, Spread] | None
     """What fresh seeds of the recommended action came to, by quantity."""
+
+    prediction_band: Band | None
+    """In which r of a single pour with it lies: of seeds, θ, what calibration left over, and resolution."""
+
+    at_bounds: tuple[str, ...]
+    """Dimensions of the recommended action that lie at an end of what was searched, in words."""
 
     predicted_delivered_g: float | None
     """Mean over these seeds of what is in the receiver."""
@@ -242,7 +254,6 @@ def summarise(
     """
     found = theta_of(results)
     names, predictions, confirmations = receiver_names(plan), predictions_of(results), confirmations_of(results)
-    spreads = {scene: foreseen.over_seeds for scene, foreseen in predictions.items()}
     liquids = {} if plan.deployment is None else {scene.name: scene.liquid for scene in plan.deployment.scenes}
     return RunSummary(
         **dict(totals or Totals()),
@@ -258,10 +269,11 @@ def summarise(
             scene: _receiver(
                 names.get(scene, scene),
                 result,
-                spreads.get(scene),
+                predictions.get(scene),
                 (best_not_covered or {}).get(scene, ()),
                 liquids.get(scene),
                 confirmations.get(scene),
+                () if plan.deployment is None else plan.deployment.actions.axes,
             )
             for scene, result in deployments_of(results).items()
         },
@@ -300,12 +312,14 @@ _NOTHING: dict[str, None] = dict.fromkeys(Recommended.model_fields)
 def _receiver(
     name: str,
     result: Deployed,
-    prediction: dict[str, Spread] | None,
+    foreseen: Foreseen | None,
     not_covered: Sequence[NotCovered],
     liquid: Liquid | None,
     confirmed: Confirmed | None,
+    axes: tuple[Axis, ...],
 ) -> ReceiverSummary:
     pours, best = result.weighed, result.best
+    prediction = None if foreseen is None else foreseen.over_seeds
     received = None if prediction is None else prediction.get("received")
     delivered = None if received is None or liquid is None else received.mean * liquid.mass
     recommended: Mapping[str, Any] = _NOTHING if result.recommended is None else dict(result.recommended)
@@ -335,10 +349,13 @@ def _receiver(
         untrustworthy_simulation=result.trust.alarm,
         trust=result.trust,
         gave_up=result.gave_up,
+        ended=result.ended,
         front=result.front,
         risk=result.risk,
         window=result.window,
         prediction=prediction,
+        prediction_band=None if foreseen is None else foreseen.band,
+        at_bounds=tuple(style.at_ends(dict(recommended["action_si"] or {}), axes)),
         predicted_delivered_g=None if delivered is None else 1e3 * delivered,
         predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),
         confirmed=confirmed,

@@ -16,6 +16,7 @@ from orchestrator.report.trust import trust_line
 from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import FrontAction
+from sim_engine.bands import Band
 from sim_engine.spread import Spread
 
 if TYPE_CHECKING:
@@ -148,8 +149,11 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
     remarks: list[RenderableType] = []
     for row in rows:
         receiver = row.receiver
-        if row.untrustworthy_simulation:
-            remarks.append(Text(f"  {receiver}: {trust_line(row.trust)}", style="yellow"))
+        if said := trust_line(row.trust):
+            style = "yellow" if row.untrustworthy_simulation else ""
+            remarks.append(Text(f"  {receiver}: {said}", style=style))
+        if row.ended:
+            remarks.append(Text(f"  {receiver}, the end: {row.ended}"))
         if row.failed_pours:
             what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
             why = f": {'; '.join(row.failures)}" if row.failures else ""
@@ -171,6 +175,12 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
             amount = _amount(row.predicted_delivered_g, row.predicted_delivered_ml)
             delivered = f"; delivered {amount} in the mean" if amount else ""
             remarks.append(Text(f"  {receiver}, best action: {_prediction(row.prediction)}{delivered}"))
+        if row.prediction_band is not None:
+            remarks.append(Text(f"  {receiver}, best action: {band_line(row.prediction_band)}"))
+        if row.at_bounds:
+            ends = ", ".join(row.at_bounds)
+            text = f"  {receiver}, best action lies at the edge of what was searched: {ends}; beyond may be better"
+            remarks.append(Text(text, style="yellow"))
         for one in row.not_covered:
             remarks.append(Text(f"  {receiver}, best action, {one.kind}: {one.text}", style="yellow"))
     return remarks
@@ -194,6 +204,15 @@ def _prediction(over_seeds: Mapping[str, Spread]) -> str:
     parts = [f"{words.get(name, name)} {spread.percent(2)}" for name, spread in shown.items()]
     count = max(spread.count for spread in shown.values())
     return f"{', '.join(parts)} (mean ± standard deviation, {count} fresh seeds)"
+
+
+def band_line(band: Band) -> str:
+    """'nine single pours in ten spill 0.8 … 5.7 % of what is poured (simulations ± 0.3, …)'."""
+    causes = {"simulations": band.simulations, "left over by calibration": band.discrepancy}
+    causes["resolution"] = band.resolution
+    said = ", ".join(f"{name} ± {100 * value:.2f}" for name, value in causes.items() if value is not None)
+    lacking = "" if band.discrepancy is not None else "; what calibration left over is not known"
+    return f"nine single pours in ten spill {band.percent(2)} of what is poured ({said}{lacking})"
 
 
 def print_summary(plan: CampaignPlan, summary: RunSummary) -> None:

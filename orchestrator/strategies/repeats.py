@@ -12,6 +12,7 @@ from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from sim_engine.action import Action
+from sim_engine.bands import Band, band_of
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourOutcome
 from sim_engine.spread import Spread, spreads
@@ -44,6 +45,9 @@ class Foreseen(Learnt):
     over_seeds: dict[str, Spread]
     """Mean and standard deviation of every fraction, of 'spillage' r = spilled / poured, and of the 'loss'."""
 
+    band: Band | None = None
+    """In which r of a single pour lies; null where no simulation has an r."""
+
 
 class RepeatedSimulation:
     """Simulate an action again, for a prediction with its spread.
@@ -60,6 +64,7 @@ class RepeatedSimulation:
         seed: int,
         thetas: Sequence[SimulationParameters] = (),
         errors: Sequence[PoseError | None] = (),
+        discrepancy: float | None = None,
     ) -> None:
         """Plan.
 
@@ -70,10 +75,12 @@ class RepeatedSimulation:
             thetas: that the seeds take turns with, in place of the one θ: draws of a posterior.
             errors: that they take turns with, too. Cups that touch because of one are the worst loss, not a lost
                 simulation.
+            discrepancy: shift that the calibration left over (`sim_engine.bands`); None: nobody knows.
         """
         scene, parameters = costing.scene, costing.parameters
         seeds = SeedStream(seed, f"prediction {scene.name}")
         self._costing = costing
+        self._discrepancy = discrepancy
         self._unissued: list[Simulate] = []
         self._open: set[Simulate] = set()
         self._outcomes: list[PourOutcome] = []
@@ -142,4 +149,5 @@ class RepeatedSimulation:
             thetas=self._thetas,
             touching=self._touching,
             over_seeds=over_seeds,
+            band=band_of(self._outcomes, self._discrepancy),
         )

@@ -103,6 +103,45 @@ def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path
     mean, deviation = (100 * getattr(found["spillage"], name) for name in ("mean", "deviation"))
     assert f"cup, best action: spilled / poured {mean:.2f} ± {deviation:.2f} %" in text
     assert "(mean ± standard deviation, 3 fresh seeds)" in text
+    band = summary.receivers["cup"].prediction_band
+    assert band is not None
+    assert band.low < found["spillage"].mean < band.high
+    assert f"nine single pours in ten spill {band.percent(2)} of what is poured" in text
+    assert "what calibration left over is not known" in text
+
+
+def test_what_calibration_left_over_widens_the_band_of_a_planned_pour() -> None:
+    bands = []
+    for discrepancy in (None, 0.6):
+        strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), ACTION, 5, 3, discrepancy=discrepancy)
+        Play(narrow_cup)(strategy)
+        found = strategy.result().band
+        assert found is not None
+        bands.append(found)
+    assert bands[1].low < bands[0].low < bands[0].high < bands[1].high
+    assert bands[0].discrepancy is None
+
+
+def test_a_planned_action_at_the_edge_of_the_box_is_said_to_be(tmp_path: Path) -> None:
+    plan = toy_plan(tmp_path)
+    assert plan.deployment is not None
+    plan = replace(plan, deployment=replace(plan.deployment, settings=D1Settings(pours=0, iterations=4)))
+    assert plan.deployment is not None
+    stages = deployment_stages(plan, plan.deployment)
+    result = asyncio.run(run_toy(tmp_path / "run", learning_laboratory(), plan=plan, stages=stages))
+    deployed: Any = result.results["deployment:cup"]
+    axis = plan.deployment.actions.axes[0]
+    for value, said in ((axis.upper, 1), (0.5 * (axis.lower + axis.upper), 0)):
+        where = {
+            name: 0.5 * (a.lower + a.upper)
+            for name, a in zip(plan.deployment.actions.names, plan.deployment.actions.axes, strict=True)
+        }
+        recommended = deployed.recommended.model_copy(update={"action_si": {**where, axis.name: value}})
+        changed_result = deployed.model_copy(update={"recommended": recommended})
+        summary = summarise(plan, {"deployment:cup": changed_result})
+        text = " ".join(shown(summary_table(plan, summary)).split())
+        assert text.count("best action lies at the edge of what was searched: ") == said
+        assert len(summary.receivers["cup"].at_bounds) == said
 
 
 @pytest.mark.parametrize(("name", "strategy"), [("D3", Hybrid), ("D1", OneShotPlanning)])

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from actors.optimizer.core.problem import Posterior
-from orchestrator.config.load import load_parameters, load_posterior
+from orchestrator.config.load import load_discrepancy, load_parameters, load_posterior
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.publish import theta_file
 from orchestrator.report.posterior import draw_posterior, posterior_lines
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.strategies.calibration.evaluation import ScoredPair, Scores
 from orchestrator.strategies.calibration.posterior import (
     PosteriorFound,
     PosteriorSummary,
@@ -172,6 +173,27 @@ def test_theta_file_carries_the_posterior_and_can_still_be_planned_with(determin
     assert sum(one["weight"] for one in content["posterior"]) == pytest.approx(1.0)
     for one in content["posterior"]:
         assert SimulationParameters.model_validate(one["theta"]).friction == 0.1  # what was fixed stays so
+
+
+def test_theta_file_says_what_calibration_left_over_of_its_training_pours(determined: Any, tmp_path: Path) -> None:
+    def pair(split: str, measured: float, simulated: float, theta: str = "theta") -> ScoredPair:
+        return ScoredPair(theta=theta, split=split, scene="cup", measured=measured, simulated=simulated, reason="")
+
+    near = [pair("train", 0.2 + 0.01 * i, 0.19 + 0.01 * i) for i in range(20)]
+    others = [pair("test", 0.2, 0.9), pair("train", 0.2, 0.9, "uncalibrated")]
+    wrong = [pair("train", 0.2 + 0.01 * i, 0.1 + 0.01 * i) for i in range(20)]
+    found = []
+    for pairs in ([*near, *others], wrong):
+        scores = Scores(simulations=20, undefined={}, discrepancy={}, random_median={}, thetas={}, pairs=tuple(pairs))
+        path = tmp_path / "theta.json"
+        path.write_text(json.dumps(theta_file(determined.found, scores)), encoding="utf-8")
+        found.append(load_discrepancy(path))
+    assert found[0] is not None
+    assert found[1] is not None
+    assert 0.02 < found[0] < 0.05  # 0.01 of spillage where the stream's density is 0.28 to 0.4
+    assert 0.3 < found[1] < 0.5
+    path.write_text('{"theta": {"cohesion": 0.02}}', encoding="utf-8")
+    assert load_discrepancy(path) is None
 
 
 def test_the_posterior_is_drawn(determined: Any, tmp_path: Path) -> None:
