@@ -3,7 +3,9 @@
 A daemon of its own, on a bench of numbers at twice real time. Each time a campaign is stopped while its arm tilts:
 'pause' and 'stop' are measured until the daemon has taken note (they wait for the pour by intention), 'abort' and the
 emergency stop until the arm has confirmed that it stands. Saturated: a busy process for each core beside all
-that, and 200 readers of all events. Run from the project's root: python -m benchmarks.daemon_stops [--times N] > stops.json
+that, and 200 readers of all events. Run from the project's root:
+
+    python -m benchmarks.daemon_stops [--times N] > stops.json
 """
 
 from __future__ import annotations
