@@ -43,7 +43,7 @@ from orchestrator.events import DecisionMade, Event
 from orchestrator.occupancy import RESTS, Occupancy
 from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.trust import TrustSettings

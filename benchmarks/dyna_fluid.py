@@ -32,7 +32,7 @@ from orchestrator.config.study.sections import load_study
 from orchestrator.occupancy import Occupancy
 from orchestrator.plan import DeploymentPlan, OutputPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.trust import Compared

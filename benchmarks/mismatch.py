@@ -35,7 +35,7 @@ from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.deployment.base import Deployment
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.trust import TrustSettings
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss

@@ -27,7 +27,8 @@ from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.deployment.base import Deployment
 from orchestrator.strategies.deployment.d2 import D2Settings, RealOnly
-from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.trust import Compared, TrustSettings
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss

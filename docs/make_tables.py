@@ -30,8 +30,11 @@ from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Choice, Section
 from orchestrator.config.yaml.validate import sections_in
+from orchestrator.daemon import settings as daemon
+from orchestrator.daemon.notify import NotifySection
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment.adaptive import IgnoranceSettings, RiskLimitSettings, StopSettings
 from orchestrator.strategies.deployment.objectives import Objective
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.risk import RiskSettings
@@ -56,6 +59,9 @@ SECTIONS: dict[str, type[Section]] = {
     "risk": RiskSettings,
     "window": WindowSettings,
     "prices": PricesSettings,
+    "ignorance": IgnoranceSettings,
+    "risk_limit": RiskLimitSettings,
+    "stop": StopSettings,
     "data": campaign.DataSection,
     "loss": campaign.LossSection,
     "objective": Objective,
@@ -76,6 +82,12 @@ SECTIONS: dict[str, type[Section]] = {
     "level": study.LevelSection,
     "compared-calibrations": study.CalibrationsSection,
     "compared-deployments": study.DeploymentsSection,
+    "daemon": daemon.DaemonFile,
+    "listen": daemon.ListenSection,
+    "tls": daemon.TlsSection,
+    "live": daemon.LiveSection,
+    "recordings": daemon.RecordingsSection,
+    "notify": NotifySection,
 }
 
 OF_SECTIONS = {
@@ -105,6 +117,9 @@ OF_SECTIONS = {
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
     "WindowSettings": "[window](#risk-and-the-safe-window)",
     "PricesSettings": "[prices](#prices)",
+    "IgnoranceSettings": "[ignorance](#ignorance-limits-and-the-end)",
+    "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
+    "StopSettings": "[stop](#ignorance-limits-and-the-end)",
     "DataSection": "[data](#existing-data)",
     "ProfileSection": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
@@ -124,13 +139,36 @@ OF_SECTIONS = {
 }
 
 
-def render(text: str) -> str:
+GUIDE = ("user-guide.md", "laboratories.md", "studies.md")
+"""Pages that explain the keys of files; a table on one of them may speak of what another one explains."""
+
+
+def render(text: str, page: str) -> str:
     """The page with its tables as the code has them now.
+
+    Args:
+        text: of the page.
+        page: its file's name; links to what other pages explain lead there.
 
     Raises:
         KeyError: a marker names a table that does not exist.
     """
-    return MARKED.sub(lambda m: f"{m[1]}{TABLES[m[2]]()}{m[3]}", text)
+    homes = {anchor: name for name in reversed(GUIDE) for anchor in _anchors((FOLDER / name).read_text("utf-8"))}
+    own = _anchors(text)
+
+    def linked(match: re.Match[str]) -> str:
+        home = homes.get(match[1], page)
+        return match[0] if match[1] in own or home == page else f"({home}#{match[1]})"
+
+    def table(match: re.Match[str]) -> str:
+        return f"{match[1]}{re.sub(r'[(]#([a-z-]+)[)]', linked, TABLES[match[2]]())}{match[3]}"
+
+    return MARKED.sub(table, text)
+
+
+def _anchors(text: str) -> set[str]:
+    """Those of a page's headings."""
+    return {heading.lower().replace(" ", "-") for heading in re.findall(r"^#+ ([A-Za-z ]+)$", text, re.MULTILINE)}
 
 
 def pages() -> list[Path]:
@@ -345,7 +383,7 @@ def main() -> None:
     """Bring all pages up to date."""
     for page in pages():
         old = page.read_text(encoding="utf-8")
-        new = render(old)
+        new = render(old, page.name)
         if new != old:
             page.write_text(new, encoding="utf-8")
             print(f"{page}: updated")

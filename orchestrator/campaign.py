@@ -23,7 +23,8 @@ from orchestrator.events import (
     Watchers,
 )
 from orchestrator.fingerprint import fingerprint
-from orchestrator.journal import JOURNAL_NAME, Header, Journal, JournalError, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, Journal, JournalReader, Kind
+from orchestrator.journal_file import Header, JournalError
 from orchestrator.lanes import Deadlines, LaneError, Lanes
 from orchestrator.plan import CampaignPlan
 from orchestrator.rehearsal import Rehearsal

@@ -10,9 +10,7 @@ see `orchestrator.reserve`.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
-import os
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,30 +22,20 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from orchestrator.codec import canonical, digest, first_difference
-from orchestrator.errors import RunError
+from orchestrator.journal_file import (
+    FORMAT,
+    Header,
+    JournalError,
+    connect,
+    connect_writer,
+    has_tables,
+    lay_out,
+    take_lock,
+)
 from orchestrator.reserve import MB, Reserve, free_space
 from orchestrator.states import State
 
-FORMAT = 2
-"""Version of the tables and of the entries' bodies. A journal of another version is refused, never guessed at."""
-
 JOURNAL_NAME = "journal.sqlite"
-
-_SCHEMA = """
-create table header (
-    format integer not null, name text not null, fingerprint text not null check (json_valid(fingerprint)),
-    created real not null
-) strict;
-create table event (
-    seq integer primary key, stage text not null, t real not null, kind text not null,
-    body text not null check (json_valid(body))
-) strict;
-create index event_by_stage on event (stage, seq);
-create trigger event_is_never_changed before update on event
-    begin select raise(abort, 'the journal is append-only'); end;
-create trigger event_is_never_deleted before delete on event
-    begin select raise(abort, 'the journal is append-only'); end;
-"""
 
 
 class Kind(StrEnum):
@@ -73,14 +61,6 @@ class Kind(StrEnum):
 _DURABLE = frozenset({Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED, Kind.OPERATOR_ANSWERED})
 
 
-class JournalError(RunError):
-    """The journal can't be used; the text says why and what to do."""
-
-
-class JournalLockedError(JournalError):
-    """Another process is writing this journal."""
-
-
 @dataclass(frozen=True)
 class Entry:
     """One row."""
@@ -101,21 +81,6 @@ class Draft:
     stage: str = ""
 
 
-@dataclass(frozen=True)
-class Header:
-    """Which campaign the journal belongs to.
-
-    Attributes:
-        name: of the campaign.
-        fingerprint: JSON-ready; everything in the plan that decides what is asked for.
-        created: seconds since 1970.
-    """
-
-    name: str
-    fingerprint: dict[str, Any]
-    created: float = 0.0
-
-
 class JournalReader:
     """Reads a journal, also while a run is writing it."""
 
@@ -128,7 +93,7 @@ class JournalReader:
         self.path = path
         if not path.is_file():
             raise JournalError(f"{path}: there is no journal here; has the run been started?")
-        self._connection = _connect(f"{path.absolute().as_uri()}?mode=ro")
+        self._connection = connect(f"{path.absolute().as_uri()}?mode=ro")
         try:
             self.header = self._read_header()
         except BaseException:
@@ -221,11 +186,11 @@ class Journal(JournalReader):
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as opened:
-            lock = opened.enter_context(_take_lock(path))
-            connection = opened.enter_context(closing(_connect_writer(path)))
-            if _has_tables(connection, path):
+            lock = opened.enter_context(take_lock(path))
+            connection = opened.enter_context(closing(connect_writer(path)))
+            if has_tables(connection, path):
                 raise JournalError(f"{path}: holds a run already; resume that one, or begin in another directory")
-            _lay_out(connection, header, path)
+            lay_out(connection, header, path)
             journal = cls(path, lock, connection)
             opened.pop_all()
             return journal
@@ -241,10 +206,10 @@ class Journal(JournalReader):
         if not path.is_file():
             raise JournalError(f"{path}: there is no journal to resume; begin the campaign without --resume")
         with contextlib.ExitStack() as opened:
-            lock = opened.enter_context(_take_lock(path))
-            connection = opened.enter_context(closing(_connect_writer(path)))
-            if not _has_tables(connection, path):
-                _lay_out(connection, header, path)
+            lock = opened.enter_context(take_lock(path))
+            connection = opened.enter_context(closing(connect_writer(path)))
+            if not has_tables(connection, path):
+                lay_out(connection, header, path)
             journal = cls(path, lock, connection)
             journal._check_same_campaign(header)
             opened.pop_all()
@@ -319,57 +284,3 @@ class Journal(JournalReader):
             f"{self.path}: this run was begun with other settings, and its next steps depend on them: {difference}. "
             "Set that back to resume it, or begin a new run"
         )
-
-
-def _connect(uri: str) -> sqlite3.Connection:
-    # Autocommit, so that every transaction in this file is one that it begins itself.
-    return sqlite3.connect(uri, uri=True, isolation_level=None, timeout=10.0)
-
-
-def _connect_writer(path: Path) -> sqlite3.Connection:
-    connection = _connect(path.absolute().as_uri())
-    try:
-        connection.execute("pragma journal_mode = wal")
-        connection.execute("pragma synchronous = normal")
-    except sqlite3.DatabaseError as error:
-        connection.close()
-        raise JournalError(f"{path}: not a journal of Decant ({error})") from error
-    return connection
-
-
-def _has_tables(connection: sqlite3.Connection, path: Path) -> bool:
-    try:
-        with closing(connection.execute("select count(*) from sqlite_master")) as cursor:
-            return bool(cursor.fetchone()[0])
-    except sqlite3.DatabaseError as error:
-        raise JournalError(f"{path}: not a journal of Decant ({error})") from error
-
-
-def _lay_out(connection: sqlite3.Connection, header: Header, path: Path) -> None:
-    row = (FORMAT, header.name, canonical(header.fingerprint), header.created or time.time())
-    # One transaction: a file with tables always has its header.
-    try:
-        connection.executescript(f"begin immediate; {_SCHEMA}")
-        connection.execute("insert into header values (?, ?, ?, ?)", row)
-        connection.execute("commit")
-    except sqlite3.OperationalError as error:
-        raise JournalError(f"{path}: can't be written ({error}; {free_space(path) / MB:.1f} MB are free)") from error
-
-
-def _take_lock(path: Path) -> IO[str]:
-    """Hold the run for this process; the system lets go of it when the process ends, however it ends."""
-    file = path.with_suffix(".lock").open("a+", encoding="utf-8")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.seek(0)
-        owner = file.read().strip()
-        file.close()
-        who = f"process {owner}" if owner else "another process"
-        raise JournalLockedError(
-            f"{path.parent}: {who} is running this campaign; wait for it, or stop it before you resume"
-        ) from None
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
-    return file

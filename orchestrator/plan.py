@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+from actors.optimizer.core.mismatch import Displacement
 from actors.optimizer.core.problem import Linear
 from actors.spec import LaboratorySpec
 from orchestrator.strategies.deployment.objectives import Objectives
@@ -207,6 +208,7 @@ class DeploymentPlan(StagePlan):
         confirm: how often the recommended action is poured again in each scene, after the strategy has ended.
         thetas: draws of a posterior, equally likely, for settings that need them, where no calibration of the same
             campaign makes them.
+        bench: how the bench may differ from the simulator, equally likely, as far as anything is known of it.
     """
 
     settings: DeploymentSettings
@@ -218,6 +220,7 @@ class DeploymentPlan(StagePlan):
     constraints: tuple[Linear, ...] = ()
     confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
+    bench: tuple[Displacement, ...] = ()
 
     @property
     def pours(self) -> int:

@@ -14,7 +14,8 @@ from typing import Any
 from orchestrator.catalogue.registry import register
 from orchestrator.codec import digest
 from orchestrator.fingerprint import fingerprint
-from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader
+from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal_file import JournalError
 from orchestrator.plan import CampaignPlan
 from orchestrator.reserve import TO_BEGIN, require_space
 from orchestrator.states import State

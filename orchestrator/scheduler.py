@@ -30,7 +30,8 @@ from orchestrator.events import (
     Watchers,
 )
 from orchestrator.flights import Flight, Order, free_slots, is_recorded, next_to_tell
-from orchestrator.journal import Draft, Journal, JournalError, Kind
+from orchestrator.journal import Draft, Journal, Kind
+from orchestrator.journal_file import JournalError
 from orchestrator.lanes import Lanes
 from orchestrator.replay import StageHistory, replay, replayed_events
 from orchestrator.requests import Ask, Decision, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest

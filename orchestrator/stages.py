@@ -17,11 +17,13 @@ from orchestrator.strategies.calibration.active import ActivePours
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
+from orchestrator.strategies.calibration.draws import drawn_benches
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
 from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.play import displacement
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from sim_engine.liquid import SimulationParameters
@@ -148,7 +150,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            known = with_posterior(deployment, results)
+            known = with_bench(with_posterior(deployment, results), results, _theta(plan, results))
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
         return build
@@ -218,6 +220,26 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     kept = rows[:: max(len(rows) // POSTERIOR_DRAWS, 1)]
     thetas = tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
     return replace(deployment, thetas=thetas)
+
+
+def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
+    """The deployment with what is known of the bench: by pours into the receiver before, or by the calibration.
+
+    A calibration says something of it where it searched nuisances; those that it did not search have their tolerances.
+    """
+    if not deployment.settings.learns_of_benches or deployment.bench:
+        return deployment
+    former = [learnt.bench for learnt in results.values() if isinstance(learnt, Deployed) and learnt.bench is not None]
+    if former:
+        return replace(deployment, bench=former[-1].displacements())
+    found = calibrated_theta(results) if CALIBRATION in results else None
+    known = set(SimulationParameters.nuisances()).intersection(() if found is None else found.searched)
+    if found is None or found.posterior is None or not known:
+        return deployment
+    rows = found.posterior.thetas
+    posterior = [SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in rows]
+    benches = drawn_benches(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
+    return replace(deployment, bench=tuple(displacement(best, bench, deployment.actions) for bench in benches))
 
 
 def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:

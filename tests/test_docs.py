@@ -95,7 +95,7 @@ def test_tables_are_what_the_code_declares(tables: ModuleType) -> None:
     pages = tables.pages()
     assert {page.name for page in pages} >= {"user-guide.md", "how-it-works.md", "architecture.md"}
     for page in pages:
-        assert tables.render(text_of(page)) == text_of(page), "run: python docs/make_tables.py"
+        assert tables.render(text_of(page), page.name) == text_of(page), "run: python docs/make_tables.py"
 
 
 def test_every_table_stands_on_some_page(tables: ModuleType) -> None:
@@ -126,7 +126,7 @@ def test_exit_codes_are_the_commands() -> None:
 
 
 def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:
-    shown = [block for kind, block in FENCE.findall(text_of(ROOT / "docs" / "user-guide.md")) if "profile:" in block]
+    shown = [block for kind, block in FENCE.findall(text_of(ROOT / "docs" / "laboratories.md")) if "profile:" in block]
     assert len(shown) == 1
     path = tmp_path / "vessel.yaml"
     path.write_text(shown[0], encoding="utf-8")

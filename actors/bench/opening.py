@@ -12,9 +12,9 @@ from actors.arm.numbers import NumbersSpec
 from actors.arm.spec import ArmSpec, UrArmSpec
 from actors.balance.actor import DeviceBalance
 from actors.balance.spec import BalanceDevice, BalanceSpec
+from actors.bench.consent import Setup
 from actors.bench.device_stand_ins import DeviceStandIns
 from actors.bench.numbers_bench import NumbersBench, NumbersOperator, numbers_balance
-from actors.bench.one_pour import Setup
 from actors.bench.pouring_bench import PouringBench
 from actors.bench.questions import Questions
 from actors.bench.spec import VirtualBenchSpec

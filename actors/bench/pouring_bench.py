@@ -7,7 +7,8 @@ from typing import Any
 
 from actors.arm.protocol import PlannedPour
 from actors.balance.placement import Weighed
-from actors.bench.one_pour import OnePour, Setup
+from actors.bench.consent import Setup
+from actors.bench.procedure import PourProcedure
 from actors.protocols import InvalidActionError, ProgressCallback
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
@@ -25,7 +26,7 @@ class PouringBench:
         self._setup = setup
         self.arm, self.balance, self.nature = setup.arm, setup.balance, setup.nature
         self._known: dict[str, dict[str, Weighed]] = {}
-        self._one_pour = asyncio.Lock()
+        self._one_at_a_time = asyncio.Lock()
 
     @property
     def mode(self) -> str:
@@ -42,9 +43,9 @@ class PouringBench:
             NotPouredError: it did not begin.
             UnknownPourError: it began, and did not go as it should.
         """
-        async with self._one_pour:
+        async with self._one_at_a_time:
             path = await asyncio.to_thread(self._checked, scene, action)
-            pour = OnePour(
+            pour = PourProcedure(
                 self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
             )
             try:

@@ -41,7 +41,8 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
 
 def given_up_pours(directory: Path) -> list[str]:
     """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
-    from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
+    from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+    from orchestrator.journal_file import JournalError
     from orchestrator.replay import read_history
     from orchestrator.requests import Pour
 

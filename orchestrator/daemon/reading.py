@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.codec import CodecError, decode_outcome, decode_request
-from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal_file import JournalError
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.names import receiver_name

@@ -21,8 +21,9 @@ from orchestrator.report.units import (
 )
 from orchestrator.requests import Pour, Poured, Suggest, Suggested
 from orchestrator.strategies.calibration.base import Calibrated
+from orchestrator.strategies.deployment.adaptive import Believed
 from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.trust import Compared
+from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.learnt import Learnt
 from sim_engine.action import ACTION_DIMENSIONS
 
@@ -118,11 +119,16 @@ class LearningStage:
                 draw = f"{PLACE}/{CALIBRATION}/theta"
                 self._picture(draw, now, lambda: pictures.png(pictures.theta_picture(found)))
         if isinstance(result, Deployed):
-            if isinstance(result.trust, Compared):
+            if not isinstance(result.trust, Foretold):
                 self.trust = result.trust.text
-            if result.trust.z_scores:
+            place = f"{PLACE}/{safe_name(result.scene)}/trust"
+            if isinstance(result.trust, Believed):
+                if result.trust.after:
+                    share = result.trust.after[-1].ignorance
+                    label = "probability that the simulator says nothing of this bench"
+                    self._number(place, share, label, style.ESCAPED, marker=8.0)
+            elif result.trust.z_scores:
                 z = result.trust.z_scores[-1]
-                place = f"{PLACE}/{safe_name(result.scene)}/trust"
                 label = "worse than simulated by so many σ (2 and more: distrust)"
                 self._number(place, z, label, style.ESCAPED, marker=8.0)
 

@@ -28,6 +28,7 @@ from orchestrator.results import Results, kinds
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.posterior import PosteriorSummary
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.strategies.deployment.adaptive import Believed
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed, FrontAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.pours import Foretold
@@ -150,8 +151,9 @@ class ReceiverSummary(Part):
     predicted_spillage: float | None
     predicted_spillage_deviation: float | None
     untrustworthy_simulation: bool
-    trust: Compared | Foretold
+    trust: Compared | Foretold | Believed
     gave_up: str | None
+    ended: str | None
     front: tuple[FrontAction, ...] | None
     risk: RiskFound | None
     window: WindowFound | None
@@ -347,6 +349,7 @@ def _receiver(
         untrustworthy_simulation=result.trust.alarm,
         trust=result.trust,
         gave_up=result.gave_up,
+        ended=result.ended,
         front=result.front,
         risk=result.risk,
         window=result.window,

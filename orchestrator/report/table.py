@@ -149,8 +149,11 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
     remarks: list[RenderableType] = []
     for row in rows:
         receiver = row.receiver
-        if row.untrustworthy_simulation:
-            remarks.append(Text(f"  {receiver}: {trust_line(row.trust)}", style="yellow"))
+        if said := trust_line(row.trust):
+            style = "yellow" if row.untrustworthy_simulation else ""
+            remarks.append(Text(f"  {receiver}: {said}", style=style))
+        if row.ended:
+            remarks.append(Text(f"  {receiver}, the end: {row.ended}"))
         if row.failed_pours:
             what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
             why = f": {'; '.join(row.failures)}" if row.failures else ""

@@ -10,6 +10,7 @@ import numpy as np
 
 from orchestrator.report import style
 from orchestrator.report.units import LossUnit
+from orchestrator.strategies.deployment.adaptive import Believed
 from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.deployment.trust import Compared, Comparison
 
@@ -24,12 +25,14 @@ FOLLOWED = {
 """What followed on an alarm, in words."""
 
 
-def trust_line(trust: Compared | Foretold) -> str | None:
+def trust_line(trust: Compared | Foretold | Believed) -> str | None:
     """What people should know of a comparison: what was wrong by how much, and what followed; None where nothing was.
 
     Args:
         trust: of a deployment's result.
     """
+    if isinstance(trust, Believed):
+        return trust.text or None
     if not trust.alarm:
         return None
     if isinstance(trust, Foretold):  # a run that only tells

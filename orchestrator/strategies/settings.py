@@ -153,6 +153,11 @@ class DeploymentSettings(StrategySettings):
         """Whether it plans with draws of θ given the pours of a calibration."""
         return False
 
+    @property
+    def learns_of_benches(self) -> bool:
+        """Whether it goes by what calibration, or pours into another receiver, said about the bench."""
+        return False
+
     def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
         """Ways in which what it recommends may go otherwise than planned, for a prediction; none: as planned."""
         return ()

@@ -17,7 +17,8 @@ from typing import Any
 
 import psutil
 
-from orchestrator.journal import JOURNAL_NAME, Entry, JournalError, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, Entry, JournalReader, Kind
+from orchestrator.journal_file import JournalError
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.load import load_campaign
 from orchestrator.plan import CampaignPlan
 from orchestrator.stages import stages_of
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from sim_engine.task import PoseError
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"

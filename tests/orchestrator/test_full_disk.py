@@ -14,7 +14,8 @@ from actors.protocols import Notice, ProgressCallback
 from orchestrator.commands.campaigns import run_directory
 from orchestrator.commands.common import BAD_INPUT, RefusalError
 from orchestrator.events import Event, LogLine
-from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal_file import JournalError
 from orchestrator.plan import OutputPlan
 from orchestrator.requests import Poured
 from orchestrator.reserve import MB, RESERVE, TO_BEGIN, NoSpaceError, Reserve

@@ -12,17 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.journal import (
-    FORMAT,
-    JOURNAL_NAME,
-    Draft,
-    Header,
-    Journal,
-    JournalError,
-    JournalLockedError,
-    JournalReader,
-    Kind,
-)
+from orchestrator.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
+from orchestrator.journal_file import FORMAT, Header, JournalError, JournalLockedError
 from orchestrator.states import State
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
@@ -105,7 +96,8 @@ def test_pours_are_flushed_to_the_disk_and_simulations_need_not_be(path: Path) -
 def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal import Header, Journal, Kind
+        from orchestrator.journal import Journal, Kind
+        from orchestrator.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         for number in range(10**6):
             journal.append(Kind.NOTE, {{"number": number}})
@@ -128,7 +120,8 @@ def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) ->
 def test_a_second_process_is_refused_and_told_who_is_first(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal import Header, Journal
+        from orchestrator.journal import Journal
+        from orchestrator.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         print("open", flush=True)
         input()

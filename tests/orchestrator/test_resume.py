@@ -17,7 +17,8 @@ import pytest
 
 from actors.spec import LaboratorySpec
 from orchestrator.events import Event, RequestFinished, StageClosed
-from orchestrator.journal import JOURNAL_NAME, JournalError, JournalLockedError, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal_file import JournalError, JournalLockedError
 from orchestrator.replay import ReplayError
 from orchestrator.stages import StageDefinition
 from tests.orchestrator import toy

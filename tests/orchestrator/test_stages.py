@@ -21,7 +21,7 @@ from orchestrator.report.table import summary_table
 from orchestrator.requests import Pour, Simulate
 from orchestrator.stages import scenes_of, stages_of
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.settings import DeploymentSettings
 from orchestrator.work import work_of
 from sim_engine.losses import Loss

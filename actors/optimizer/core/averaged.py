@@ -7,12 +7,12 @@ something more that nobody simulated:
     v_j² = σ_j² + e^{2 g_j} s_s²(A_j x + s_j),    y = f(x) + ε,    ε ~ N(0, (n + 0.15 μ_j(x))²)
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. The last
-hypothesis is ignorance: the simulator says nothing of this bench, and f is a GP around 0.6. The posterior weights are
-prior times marginal likelihood of the observations. So nothing is ever forgotten: a hypothesis that fails
-fades, and the weight of ignorance says how far the simulator is to be trusted.
+hypothesis is ignorance: the simulator says nothing of this bench, and f is a GP around 0.6, more towards corners. The
+posterior weights are prior times marginal likelihood of the observations. So nothing is forgotten: a hypothesis that
+fails fades, and the weight of ignorance says how far the simulator is to be trusted.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
-Limitations: the hypotheses are a fixed set; predictions come from the 16 heaviest of them, and ignorance.
+Limitations: the hypotheses are a fixed set; predictions come from at most 16 of them, the heaviest, and ignorance.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 HYPOTHESES = 512
 HEAVIEST = 16
+LIGHT = 0.005
+"""Share of the heaviest ones' weight below which a hypothesis is left out of predictions, but for the first four."""
 GAIN = 0.3
 """Standard deviation of g."""
 RESTS = (0.02, 0.3)
@@ -43,6 +45,8 @@ FARTHER = (0.4, 3.0)
 NOISE, NOISE_GROWTH = 0.02, 0.15
 """Deviation of one observation where nothing is lost, and what it grows by where everything is."""
 IGNORANT_MEAN, IGNORANT_SIGNAL = 0.6, 0.4
+IGNORANT_EDGE = 0.3
+"""How much more ignorance expects in the corners than in the middle: a box is drawn around what may be good."""
 IGNORANT_LENGTHS = (0.15, 0.3, 0.6)
 KNOWN_SHARE = 0.75
 """Share of the hypotheses around displacements that were found before, where some were."""
@@ -136,7 +140,7 @@ class AveragedProcess:
         self._costs = np.clip(costs / mismatch.worst, 0.0, 1.0)
         self._all = Hypotheses.of(mismatch)
         informed = self._evidences(self._informed(self._all, points), self._all.lengths)
-        ignorant = self._evidences(self._ignorant(len(points), self._costs), np.array(IGNORANT_LENGTHS))
+        ignorant = self._evidences(self._ignorant(points, self._costs), np.array(IGNORANT_LENGTHS))
         logs = np.concatenate(
             [
                 informed + np.log((1.0 - mismatch.ignorance) / len(informed)),
@@ -147,6 +151,9 @@ class AveragedProcess:
         self.weights = weights / weights.sum()
         self.ignorance = float(self.weights[len(informed) :].sum())
         heavy = np.argsort(-self.weights[: len(informed)], kind="stable")[:HEAVIEST]
+        told = self.weights[heavy] >= LIGHT * self.weights[heavy].sum()
+        told[:4] = True
+        heavy = heavy[told]
         self._kept = self._all.only(heavy)
         share = self.weights[heavy] / max(self.weights[heavy].sum(), 1e-300) * (1.0 - self.ignorance)
         self.mixture = np.concatenate([share, self.weights[len(informed) :]])
@@ -166,13 +173,15 @@ class AveragedProcess:
         spreads = np.hypot(hypotheses.rests[:, None], gain * deviation.reshape(J, m))
         return _Prior(means, spreads, NOISE + NOISE_GROWTH * means)
 
-    def _ignorant(self, count: int, seen: Array | float) -> _Prior:
-        shape = len(IGNORANT_LENGTHS), count
+    def _ignorant(self, points: Array, seen: Array | float) -> _Prior:
+        shape = len(IGNORANT_LENGTHS), len(points)
+        edge = ((2.0 * points - 1.0) ** 2).mean(axis=1)
+        means = np.broadcast_to(IGNORANT_MEAN + IGNORANT_EDGE * np.clip(edge, 0.0, 1.0), shape)
         noises = np.broadcast_to(NOISE + NOISE_GROWTH * seen, shape)  # by what was seen there, if anything was
-        return _Prior(np.full(shape, IGNORANT_MEAN), np.full(shape, IGNORANT_SIGNAL), noises)
+        return _Prior(means, np.full(shape, IGNORANT_SIGNAL), noises)
 
     def _prior(self, points: Array, seen: Array | float = IGNORANT_MEAN) -> _Prior:
-        parts = self._informed(self._kept, points), self._ignorant(len(points), seen)
+        parts = self._informed(self._kept, points), self._ignorant(points, seen)
         return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
 
     # -- what the observations say ---------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Where to pour when every pour counts, and where to simulate for it.
 
-With H pours to follow, b the least expected cost of an action that was poured, and f the cost by `AveragedProcess`, the
-next pour minimises what it loses less what it may save in all that follow:
+With H pours to follow (4 at most), b the least expected cost of an action that was poured, and f the cost by
+`AveragedProcess`, the next pour minimises what it loses less what it may save in all that follow:
 
     E clip(f(x), 0, 1) − H E (b − f(x)⁺)⁺
 
@@ -40,6 +40,9 @@ Score = Callable[[Array], Array]
 LATEST = 8
 """Poured places, and as many to come, that simulations are made for."""
 
+FORESIGHT = 4
+"""Most pours whose savings count: what is found later could be found otherwise."""
+
 WORTH_AT = 256
 """Places all over the region at which the worth of one more pour is looked at."""
 
@@ -62,7 +65,7 @@ def least_loss(
         feasibility: of requests; None while nothing was refused. What can't be made is as bad as the worst.
     """
     best = float(process.predict(known)[0].min()) / process.worst if len(known) else 0.0
-    left = mismatch.left if len(known) else 0
+    left = min(mismatch.left, FORESIGHT) if len(known) else 0
 
     def score(points: Array) -> Array:
         means, deviations, _ = process.components(points)
@@ -192,7 +195,7 @@ def found(
     gain = None
     if len(known):
         kept = over <= (1.0 if limit is None else limit.probability)
-        gain = float(worth(process, candidates[kept], known).max()) if kept.any() else 0.0
+        gain = float(worth(process, candidates[kept], known).max()) if kept.any() else None
     shifts, deviations, factor = process.displaced()
     drawn: tuple[Displacement, ...] = ()
     if problem.count == 0:

@@ -69,7 +69,8 @@ class MismatchFound:
         shifts: of the cube's centre, by which the simulator's action differs; mean over all other hypotheses.
         deviations: of these shifts.
         factor: real over simulated cost, the median of those hypotheses.
-        gain: by how much one more observation is expected to lower the least expected cost; None before any was made.
+        gain: by how much one more observation is expected to lower the least expected cost; None before any was made,
+            and where no action keeps the limit.
         exceedances: at the proposals: probabilities that an observation is above the limit; empty without one.
         least_exceedance: the smallest that any action has; None without a limit.
         drawn: displacements drawn from the posterior, for another receiver; only with `count=0`.

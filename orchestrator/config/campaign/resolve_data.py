@@ -13,7 +13,8 @@ from orchestrator.config.yaml.errors import did_you_mean
 from orchestrator.config.yaml.files import missing_file, out_of_bounds, resolved
 from orchestrator.config.yaml.source import Place, Report
 from orchestrator.former import FormerRun, fitting, pours_in, read_former_run
-from orchestrator.journal import JOURNAL_NAME, JournalError
+from orchestrator.journal import JOURNAL_NAME
+from orchestrator.journal_file import JournalError
 from orchestrator.plan import ExistingPours, RecordedPour, RecordSet
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.space import Space

@@ -29,7 +29,7 @@ from orchestrator.strategies.calibration.c3 import C3Settings
 from orchestrator.strategies.calibration.c4 import C4Settings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.doors import calibrations, deployments
 from orchestrator.strategies.settings import StrategySettings
 from orchestrator.study.plan import StudyPlan

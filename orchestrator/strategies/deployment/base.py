@@ -23,6 +23,7 @@ from orchestrator.requests import (
     Suggest,
 )
 from orchestrator.strategies.asking import Questions
+from orchestrator.strategies.deployment.adaptive import Believed
 from orchestrator.strategies.deployment.compromise import Compromise
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed, Recommended, RiskFound, SimulatedAction
@@ -328,7 +329,7 @@ class Deployment(ABC, Generic[S]):
         """Steps done, steps in all."""
         return Progress(pours=min(self._counted, self._plan.pours), of_pours=self._plan.pours)
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold | Believed:
         """How far the first pours bore out what was predicted."""
         return trust(weighed)
 

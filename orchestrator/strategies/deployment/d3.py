@@ -2,124 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from actors.optimizer.core.mismatch import Mismatch
 from actors.optimizer.core.problem import AcquisitionName, Data, MeanName, Suggestion, SuggestProblem
-from orchestrator.config.yaml.sections import Count, CountOrFree
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
+from orchestrator.strategies.deployment.adaptive import (
+    Believed,
+    Trust,
+)
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment.d3_settings import D3Settings
+from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.play import play_of
 from orchestrator.strategies.deployment.pours import Foretold, PourTrial
-from orchestrator.strategies.deployment.prices import PricesSettings
-from orchestrator.strategies.deployment.settings import SearchSettings
-from orchestrator.strategies.deployment.trust import Compared, TrustCheck, TrustOrAlways, TrustSettings
+from orchestrator.strategies.deployment.trust import Compared, TrustCheck
 from orchestrator.strategies.progress import Progress
-from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.settings import Complaints, Premises
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
-    from orchestrator.flights import Order
+    pass
 
 MEANS: dict[str, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
 """How the optimiser calls the models."""
 
 WIDENING = 3.0
 """Factor on the noise that simulations are expected to have, once they were found wrong."""
-
-
-class D3Settings(SearchSettings):
-    """D3: real pours with a simulated prior."""
-
-    required: ClassVar[dict[str, str]] = {"strategy": "D3"}
-
-    strategy: Literal["D3"] = "D3"
-    """Real pours with a simulated prior."""
-
-    prior_simulations: Count = 37
-    """Simulations before the first pour; with 'per_pour: free' at most so many."""
-
-    per_pour: CountOrFree = 2
-    """Simulations told between two pours; 'free': for as long as they are worth it."""
-
-    prices: PricesSettings | None = None
-    """With 'per_pour: free': what a pour and a simulation cost."""
-
-    model: Literal["adaptive", "residual", "pooled", "scaled"] = "adaptive"
-    """How simulations enter the surrogate of pours; 'adaptive' averages over ways in which the simulator may be wrong,
-    'residual' is the paper's."""
-
-    trust: TrustOrAlways | None = None
-    """For the other models: when the first pours say that the simulator is wrong, and what follows; 'always' believes
-    it, as the paper."""
-
-    @property
-    def beside(self) -> int | None:
-        """Simulations told between two pours; None: for as long as a pour takes."""
-        return None if self.per_pour == "free" else int(self.per_pour)
-
-    @property
-    def adaptive(self) -> bool:
-        """Whether it averages over the ways in which the simulator may be wrong."""
-        return self.model == "adaptive"
-
-    @property
-    def checked(self) -> TrustSettings | None:
-        """When the simulator is called wrong; None if it never is, or if every pour weighs it."""
-        if self.adaptive or self.trust == "always":
-            return None
-        return self.trust if isinstance(self.trust, TrustSettings) else TrustSettings()
-
-    @property
-    def plain(self) -> bool:
-        """Simulations before the first pour are chosen as in the paper, with a constant κ, and warn of nothing."""
-        return self.model == "residual"
-
-    @property
-    def order(self) -> Order:
-        """Only where simulations go on for as long as a pour takes does the clock decide what is asked for."""
-        return "completion" if self.beside is None else "logical"
-
-    @property
-    def simulations(self) -> int:
-        """Those before the first pour and beside all."""
-        return self.prior_simulations + (self.pours or 0) * self.simulations_beside
-
-    @property
-    def simulations_before(self) -> int:
-        """Those of the prior."""
-        return self.prior_simulations
-
-    @property
-    def simulations_beside(self) -> int:
-        """Those told between two pours."""
-        return self.beside or 0
-
-    @property
-    def spending(self) -> str:
-        """What it spends into one receiver, in words."""
-        return f"{self.prior_simulations} simulations, then {self.pours} pours with {self.per_pour} beside each"
-
-    def check(self, premises: Premises, complaints: Complaints) -> None:
-        """Prices decide only where simulations go on for as long as they are worth it."""
-        super().check(premises, complaints)
-        if self.prices is not None and self.beside is not None:
-            text = f"decides nothing with 'per_pour: {self.per_pour}'; write 'per_pour: free', or remove it"
-            complaints.add(text, "prices", key=True)
-        if self.trust is not None and self.adaptive:
-            complaints.add(
-                "decides nothing with 'model: adaptive', which weighs the simulator by every pour", "trust", key=True
-            )
-
-    def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
-        """The strategy itself."""
-        from orchestrator.strategies.deployment.d3_free import FreeHybrid
-
-        return (FreeHybrid if self.beside is None else Hybrid)(plan, scene, parameters, seed)
 
 
 class Hybrid(Deployment[D3Settings]):
@@ -145,6 +56,10 @@ class Hybrid(Deployment[D3Settings]):
         super().__init__(plan, scene, parameters, seed)
         checked = self._settings.checked
         self._check = None if checked is None else TrustCheck(checked, self._costing.worst)
+        self._rules = self._settings.rules(self._costing.worst)
+        self._trust = Trust(self._rules, plan.actions, self._costing.worst) if self._settings.adaptive else None
+        self._then: Callable[[str], None] | None = None
+        self._ended: str | None = None
         self._unasked: Ask | None = None
         self._asked: Ask | None = None
 
@@ -162,10 +77,13 @@ class Hybrid(Deployment[D3Settings]):
         if not isinstance(request, Ask):
             super().tell(request, outcome)
             return
-        if request != self._asked or self._check is None or not isinstance(outcome, Answered):
+        if request != self._asked or not isinstance(outcome, Answered):
             raise ValueError(f"this was not asked, or not answered: {request.question}")
-        self._asked = None
-        self._settle(self._check, outcome.answer)
+        self._asked, then, self._then = None, self._then, None
+        if then is not None:
+            then(outcome.answer)
+        elif self._check is not None:
+            self._settle(self._check, outcome.answer)
 
     def _next(self, free_simulations: int) -> None:
         if self._check is not None and self._pouring is None and (pours := self._check.due(self._pours)):
@@ -179,7 +97,7 @@ class Hybrid(Deployment[D3Settings]):
             if self._trials.idle or (self._settings.beside is None and self._pours):
                 self._next_pour()
         elif self._trials.idle:
-            self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
+            self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
 
     def _compare(self, check: TrustCheck, pours: list[PourTrial]) -> None:
         """Ask what the simulations alone say of the actions poured, and go by it."""
@@ -232,11 +150,55 @@ class Hybrid(Deployment[D3Settings]):
             self._pour_first(suggestion)
             self._simulate(suggestion, "refine", first=1)
 
-        self._questions.put(problem, "pour", pour)
+        self._questions.put(problem, "pour", lambda suggestion: self._judged(suggestion, pour))
+
+    def _judged(self, suggestion: Suggestion, pour: Callable[[Suggestion], None]) -> None:
+        """Say what the latest pour has told of the simulator; then the next one is made, or it is not."""
+        if self._trust is None or suggestion.mismatch is None:
+            pour(suggestion)
+            return
+        self._trust.hear(suggestion.mismatch, self._pours)
+        verdict = self._trust.judge(suggestion, self._pours, self._plan.pours - self._counted)
+        self._said()
+        if verdict.ask is not None:
+
+            def answered(answer: str) -> None:
+                assert self._trust is not None
+                end = self._trust.answer(answer, limit=verdict.limit)
+                self._said()
+                if end:
+                    self._end(end)
+                else:
+                    self._judged(suggestion, pour)
+
+            self._unasked, self._then = verdict.ask, answered
+        elif verdict.end:
+            self._end(verdict.end)
+        else:
+            pour(suggestion)
+
+    def _said(self) -> None:
+        assert self._trust is not None
+        self.decisions += self._trust.decisions
+        self._trust.decisions.clear()
+
+    def _end(self, why: str) -> None:
+        """No further pour: conclude with what is known."""
+        self._ended = why
+
+    def _concluded(self, suggestion: Suggestion) -> None:
+        if self._trust is not None and suggestion.mismatch is not None:
+            self._trust.hear(suggestion.mismatch, self._pours)
+            self._said()
+        self._conclude(suggestion)
+
+    @property
+    def _pours_left(self) -> bool:
+        return super()._pours_left and self._ended is None
 
     @property
     def _acquisition(self) -> AcquisitionName:
-        """Of the next pour."""
+        """What chooses the next pour."""
         if self._settings.adaptive and not self._compromise.exploring:
             return "least_loss"
         return "lcb" if self._pours or self._former else "posterior_minimum"
@@ -273,7 +235,12 @@ class Hybrid(Deployment[D3Settings]):
     def _mismatch(self) -> Mismatch:
         """How the simulator may be wrong."""
         left = max(self._plan.pours - self._counted - 1, 0)
-        return Mismatch(play_of(self._plan.actions), worst=self._costing.worst, left=left)
+        limit = self._rules.limit
+        if limit is not None and not any(p.cost is not None and p.cost <= limit.loss for p in self._pours):
+            limit = None  # nothing good is in hand that could be poured again
+        return Mismatch(
+            play_of(self._plan.actions), self._plan.bench, worst=self._costing.worst, left=left, limit=limit
+        )
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
         return self._informed(poured, simulated)
@@ -284,14 +251,22 @@ class Hybrid(Deployment[D3Settings]):
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold | Believed:
+        if self._trust is not None:
+            return self._trust.result()
         return super()._trusted(weighed) if self._check is None else self._check.result()
+
+    def result(self) -> Deployed:
+        """What was learnt so far, of the bench too."""
+        bench = None if self._trust is None else self._trust.bench()
+        return super().result().model_copy(update={"ended": self._ended, "bench": bench})
 
     def progress(self) -> Progress:
         """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
         simulations = self._settings.prior_simulations + self._plan.pours * self._settings.simulations_beside
         answered = self._trials.answered - self._unspent
         done = min(answered, simulations) if self._settings.beside is None else answered
-        if self._followed == "D2":  # those that will not be made any more
+        if self._followed == "D2" or self._ended is not None:  # those that will not be made any more
             simulations = done
-        return Progress(done, simulations, min(self._counted, self._plan.pours), self._plan.pours)
+        pours = self._counted if self._ended is not None else self._plan.pours
+        return Progress(done, simulations, min(self._counted, pours), pours)

@@ -114,7 +114,7 @@ class FreeHybrid(Hybrid):
     def _wind_up(self) -> None:
         self._trials.withdraw()
         if self._trials.idle and not self._out:
-            self._put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
+            self._put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
 
     def _look_ahead(self) -> None:
         """Choose simulations before there is a slot for them."""
@@ -191,7 +191,7 @@ class FreeHybrid(Hybrid):
         if self._followed == "D2":
             self._put(self._hybrid(count=1, acquisition=acquisition, map_resolution=MAP_RESOLUTION), "pour", pour)
         else:
-            self._ask_quickly("pour", pour, count=1, acquisition=acquisition)
+            self._ask_quickly("pour", lambda answer: self._judged(answer, pour), count=1, acquisition=acquisition)
 
     def _foresee(self) -> bool:
         """Ask what the simulations alone say of the pours to be compared next; whether that was necessary."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from orchestrator.strategies.deployment.adaptive import Believed, BenchFound
 from orchestrator.strategies.deployment.pours import Foretold, PourRow
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
@@ -126,11 +127,17 @@ class Deployed(Learnt):
     failed_pours: int
     """Pours that went wrong."""
 
-    trust: Compared | Foretold
-    """How far the first pours were from what was simulated, or else predicted."""
+    trust: Compared | Foretold | Believed
+    """How far the first pours were from what was simulated or predicted, or what all of them say of the simulator."""
 
     gave_up: str | None = None
     """Why it ended early."""
+
+    ended: str | None = None
+    """Why it ended before all pours were made: nothing more to gain, or a limit."""
+
+    bench: BenchFound | None = None
+    """How the bench differs from the simulator, for the next receiver."""
 
     objectives: tuple[str, ...] = ()
     """Names of several objectives; empty with a plain loss."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
-from actors.optimizer.core.mismatch import Play
+from actors.optimizer.core.mismatch import Displacement, Play
 from sim_engine.action import ACTION_DIMENSIONS, DEG
+from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 
 LENGTH = 0.010
@@ -22,8 +23,38 @@ UNKNOWN = 0.1
 
 
 def play_of(actions: Space) -> tuple[Play, ...]:
-    """Of each searched dimension."""
+    """The play of each searched dimension."""
     return tuple(_play(axis) for axis in actions.axes)
+
+
+def displacement(believed: SimulationParameters, bench: SimulationParameters, actions: Space) -> Displacement:
+    """Where a simulator with one set of nuisances does what a bench with another one does.
+
+    Nuisances of dimensions that are not searched are left to the rest of the model.
+
+    Args:
+        believed: what the simulator has.
+        bench: what the bench may have.
+    """
+    scales, shifts = [], []
+    moved = {
+        "x_offset": bench.receiver_x - believed.receiver_x,
+        "y_offset": believed.receiver_y - bench.receiver_y,  # the receiver moves, so the pourer is off the other way
+        "height": believed.receiver_z - bench.receiver_z,
+        "max_angle": bench.tilt_zero - believed.tilt_zero,
+    }
+    for axis in actions.axes:
+        factor = bench.speed_factor / believed.speed_factor if axis.name == "angular_velocity" else 1.0
+        if axis.scale == "log":
+            middle = axis.decode(0.5)
+            factor *= max(1.0 + moved.get(axis.name, 0.0) / middle, 0.1)
+            scales.append(1.0)
+            shifts.append(math.log(factor) / math.log(axis.upper / axis.lower))
+        else:
+            width = axis.upper - axis.lower
+            scales.append(factor)
+            shifts.append(((factor - 1.0) * axis.lower + moved.get(axis.name, 0.0)) / width)
+    return Displacement(tuple(scales), tuple(shifts))
 
 
 def _play(axis: Axis) -> Play:

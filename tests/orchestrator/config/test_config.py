@@ -17,7 +17,7 @@ from orchestrator.fingerprint import fingerprint
 from orchestrator.strategies.calibration.c4 import C4Settings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.settings import DeploymentSettings
 from sim_engine.action import DEG

@@ -20,7 +20,8 @@ from orchestrator.plan import CampaignPlan, DeploymentPlan
 from orchestrator.requests import Suggest
 from orchestrator.stages import calibration_stages
 from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.study.cell_process import run_cell
 from orchestrator.study.cells import cells_of
 from orchestrator.study.folder import finished_results, read_result

@@ -1,4 +1,4 @@
-"""One pour: the operator's steps, consent, the arm's ways, the weighings, and the way back from a stop.
+"""One pour: the operator's steps, consent, the arm's ways and the weighings, in their order.
 
 Two rules hold throughout. While somebody is asked to put hands into the cell, no program runs on the controller, which
 is read back first. And nothing moves unless somebody has just said that it may, and been told how long they have.
@@ -9,34 +9,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
-from actors.arm.actor import DeviceArm
-from actors.arm.errors import ArmError, ArmLostError, ArmRefusedError, ArmStoppedError
+from actors.arm.errors import ArmLostError, ArmRefusedError, ArmStoppedError
 from actors.arm.protocol import ArmFacts, ArmState, Executed, PlannedPour
-from actors.arm.spec import ArmSpec
-from actors.balance.actor import DeviceBalance
 from actors.balance.errors import BalanceError
 from actors.balance.placement import Weighed
-from actors.balance.spec import BalanceSpec
 from actors.balance.weighing import Weighings
+from actors.bench.consent import STUCK, Consent, Setup
 from actors.bench.progress import PourReport
-from actors.bench.questions import Questions
-from actors.bench.virtual_bench import Nature, PourAsk
+from actors.bench.virtual_bench import PourAsk
 from actors.bench.words import (
     grams,
     start_question,
-    stopped_question,
-    unsafe_question,
-    upright_question,
-    way_home_question,
 )
 from actors.device import DeviceLostError
-from actors.operator import Question
 from actors.protocols import (
-    BenchLostError,
     InvalidActionError,
     LaboratoryError,
     Notice,
@@ -60,29 +49,9 @@ LOOK_INTERVAL = 0.1
 """Between two looks at the balance's display [s of the clock]."""
 
 _BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
-_STUCK = (ArmError, DeviceLostError)
 
 
-class RefusedError(LaboratoryError):
-    """The operator said no."""
-
-
-@dataclass(frozen=True)
-class Setup:
-    """What all pours on a bench share; see `pouring_bench.PouringBench`."""
-
-    mode: str
-    spec: ArmSpec
-    balance_spec: BalanceSpec
-    operator_time: float
-    arm: DeviceArm
-    balance: DeviceBalance | None
-    questions: Questions
-    nature: Nature
-    tell: Callable[[Notice], None]
-
-
-class OnePour:
+class PourProcedure:
     """One pour, from the first question to the last weight.
 
     Args:
@@ -106,8 +75,9 @@ class OnePour:
         progress: ProgressCallback | None,
     ) -> None:
         self._setup, self._scene, self._action, self._path, self._seed = setup, scene, action, path, seed
+        self._consent = Consent(setup, path)
         self._weighings = Weighings(
-            setup.balance_spec, setup.balance, self._ask, known, self._note_weight, nominal=scene.liquid.mass
+            setup.balance_spec, setup.balance, self._consent.ask, known, self._note_weight, nominal=scene.liquid.mass
         )
         self._report = PourReport(progress, _expected(setup, path), path.pour_time)
         self._begun = False
@@ -134,19 +104,19 @@ class OnePour:
             await self._move()
             return await self._after()
         except asyncio.CancelledError as error:
-            await self._leave_safe()
+            await self._consent.leave_safe()
             if self._begun:
                 weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
                 self._setup.tell(Notice("warning", weighed))
                 raise
             raise NotPouredError("the pour was given up before it began; nothing was poured") from error
         except (InvalidActionError, PourFailedError):
-            await self._leave_safe()
+            await self._consent.leave_safe()
             raise
         except LaboratoryError as error:
             if self._begun and not isinstance(error, BalanceError):
                 await self._keep_what_shows()
-            await self._leave_safe()
+            await self._consent.leave_safe()
             raise self._said(error) from error
         finally:
             watching.cancel()
@@ -159,7 +129,7 @@ class OnePour:
         setup = self._setup
         self._report.enter("operator")
         self._facts = await setup.arm.ready()
-        await self._make_safe()
+        await self._consent.make_safe()
         if setup.balance is not None:
             await setup.balance.device.revive()
             await setup.balance.resume()
@@ -170,7 +140,7 @@ class OnePour:
     async def _move(self) -> None:
         """Out, pour, home: all of it after one consent, unless something stops it."""
         setup, path = self._setup, self._path
-        await self._consent(start_question(setup.spec, path))
+        await self._consent.given(start_question(setup.spec, path))
         async with self._setup.nature.followed():
             await self._out_and_home()
 
@@ -179,8 +149,8 @@ class OnePour:
         self._report.enter("approach")
         try:
             await setup.nature.lasting(setup.arm.move_to_start(path, self._seen), path.approach_time)
-        except _STUCK as error:
-            await self._bring_home(error)
+        except STUCK as error:
+            await self._consent.bring_home(error, begun=self._begun)
             raise
         await setup.nature.note()
         await setup.nature.tilts()
@@ -190,22 +160,22 @@ class OnePour:
             self._executed = await setup.nature.lasting(setup.arm.execute(path, self._follow), path.pour_time)
         except ArmRefusedError as error:  # before anything moved
             self._begun = False
-            await self._bring_home(error)
+            await self._consent.bring_home(error, begun=self._begun)
             raise
         except _BROKEN_OFF as error:
             self._broken, self._executed = error, getattr(error, "executed", None)
-            await self._bring_upright(error)
+            await self._consent.bring_upright(error)
         await setup.nature.note()
         try:
             if self._broken is not None:
                 await setup.arm.release()  # agreed to with the un-tilting
             await setup.arm.retreat(path, self._seen)
-        except _STUCK as error:
-            await self._bring_home(error)
+        except STUCK as error:
+            await self._consent.bring_home(error, begun=self._begun)
         await self._let_it_land()
 
     async def _after(self) -> PourMeasurement:
-        await self._make_safe()
+        await self._consent.make_safe()
         self._report.enter("settle")
         await self._setup.nature.settle(SETTLING_TIME)
         self._report.enter("weigh")
@@ -215,114 +185,6 @@ class OnePour:
         if self._broken is not None:
             raise self._broken
         return PourMeasurement(measured.loaded, measured.spilled, measured.retained, self._notes(measured))
-
-    # ---- the operator
-
-    async def _ask(self, question: Question) -> str:
-        """Put a question; one that invites hands into the cell only while nothing can move."""
-        if question.hands:
-            await self._make_safe()
-        return await self._setup.questions.ask(question)
-
-    async def _make_safe(self) -> None:
-        """See that nothing moves and nothing can; where that can't be seen, nobody is invited into the cell.
-
-        Raises:
-            RefusedError: it can't, and the operator leaves it at that.
-        """
-        problem = ""
-        while True:
-            try:
-                if problem:
-                    await self._setup.arm.ready()
-                await self._setup.arm.hands_in()
-                return
-            except BenchLostError:
-                raise
-            except _STUCK as error:
-                if not problem:
-                    problem = str(error)  # the connection may be made anew without anybody's help
-                    continue
-                problem = str(error)
-            if not await self._agreed(unsafe_question(problem)):
-                raise RefusedError(f"it can't be seen that the arm keeps still: {problem}")
-
-    async def _agreed(self, question: Question) -> bool:
-        return (await self._ask(question)).strip().lower() in ("yes", "y")
-
-    async def _consent(self, question: Question) -> None:
-        """Have somebody say that the arm may move, announce it, and release it.
-
-        Raises:
-            RefusedError: they said no.
-        """
-        if not await self._agreed(question):
-            raise RefusedError("the operator did not let the arm move")
-        spec = self._setup.spec
-        text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
-        # The driver waits for as long from the release to the first movement.
-        await self._setup.questions.announce(text, spec.on_clock(spec.announcement))
-        await self._setup.arm.release()
-
-    # ---- the way back from a stop
-
-    async def _bring_upright(self, error: Exception) -> None:
-        """After a stop with the pourer tilted: nothing moves before somebody has looked at it and said so, twice."""
-        while True:
-            await self._recover(error)
-            await self._consent(upright_question(self._setup.spec))
-            try:
-                await self._setup.arm.untilt(self._path)
-                return
-            except _STUCK as again:
-                error = again
-
-    async def _bring_home(self, error: Exception) -> None:
-        """After a stop on the way to the pour or from it."""
-        while True:
-            await self._recover(error)
-            await self._consent(way_home_question(self._setup.spec))
-            try:
-                await self._setup.arm.retreat(self._path)
-                return
-            except _STUCK as again:
-                error = again
-
-    async def _recover(self, error: Exception) -> None:
-        """Make the robot ready again, once somebody has seen to the cause; nothing moves yet.
-
-        Raises:
-            RefusedError: they would rather leave it as it is.
-        """
-        if isinstance(error, BenchLostError):
-            raise error  # nobody can mend it from here
-        problem = str(error)
-        while await self._agreed(stopped_question(error, problem, begun=self._begun)):
-            try:
-                done = await self._setup.arm.recover()
-            except BenchLostError:
-                raise
-            except _STUCK as again:
-                problem = str(again)
-                continue
-            self._setup.tell(Notice("info", f"the arm is ready again: {done or 'nothing had to be done'}"))
-            return
-        raise RefusedError(f"{error}; the operator leaves the arm as it stands")
-
-    async def _leave_safe(self) -> None:
-        """Stop what moves, whatever has failed: also when this task itself is being cancelled."""
-        setup = self._setup
-
-        async def stop() -> None:
-            with contextlib.suppress(LaboratoryError):
-                await setup.arm.stop()
-            if setup.balance is not None:
-                with contextlib.suppress(LaboratoryError):
-                    await setup.balance.interrupt()
-
-        stopping = asyncio.ensure_future(stop())
-        with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.shield(stopping)
 
     # ---- the liquid
 

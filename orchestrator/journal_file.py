@@ -1,0 +1,128 @@
+"""The file that a journal is: its tables, its header, its lock. SQLite is known here and in `journal.py` alone."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sqlite3
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from orchestrator.codec import canonical
+from orchestrator.errors import RunError
+from orchestrator.reserve import MB, free_space
+
+FORMAT = 2
+"""Version of the tables and of the entries' bodies. A journal of another version is refused, never guessed at."""
+
+_SCHEMA = """
+create table header (
+    format integer not null, name text not null, fingerprint text not null check (json_valid(fingerprint)),
+    created real not null
+) strict;
+create table event (
+    seq integer primary key, stage text not null, t real not null, kind text not null,
+    body text not null check (json_valid(body))
+) strict;
+create index event_by_stage on event (stage, seq);
+create trigger event_is_never_changed before update on event
+    begin select raise(abort, 'the journal is append-only'); end;
+create trigger event_is_never_deleted before delete on event
+    begin select raise(abort, 'the journal is append-only'); end;
+"""
+
+
+class JournalError(RunError):
+    """The journal can't be used; the text says why and what to do."""
+
+
+class JournalLockedError(JournalError):
+    """Another process is writing this journal."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """Which campaign the journal belongs to.
+
+    Attributes:
+        name: of the campaign.
+        fingerprint: JSON-ready; everything in the plan that decides what is asked for.
+        created: seconds since 1970.
+    """
+
+    name: str
+    fingerprint: dict[str, Any]
+    created: float = 0.0
+
+
+def connect(uri: str) -> sqlite3.Connection:
+    """Open a journal; every transaction is one that its user begins."""
+    # Autocommit, so that every transaction in this file is one that it begins itself.
+    return sqlite3.connect(uri, uri=True, isolation_level=None, timeout=10.0)
+
+
+def connect_writer(path: Path) -> sqlite3.Connection:
+    """Open a journal for its one writer.
+
+    Raises:
+        JournalError: it is something else.
+    """
+    connection = connect(path.absolute().as_uri())
+    try:
+        connection.execute("pragma journal_mode = wal")
+        connection.execute("pragma synchronous = normal")
+    except sqlite3.DatabaseError as error:
+        connection.close()
+        raise JournalError(f"{path}: not a journal of Decant ({error})") from error
+    return connection
+
+
+def has_tables(connection: sqlite3.Connection, path: Path) -> bool:
+    """Whether anything was laid out in it.
+
+    Raises:
+        JournalError: it is something else.
+    """
+    try:
+        with closing(connection.execute("select count(*) from sqlite_master")) as cursor:
+            return bool(cursor.fetchone()[0])
+    except sqlite3.DatabaseError as error:
+        raise JournalError(f"{path}: not a journal of Decant ({error})") from error
+
+
+def lay_out(connection: sqlite3.Connection, header: Header, path: Path) -> None:
+    """Write tables and header.
+
+    Raises:
+        JournalError: it can't be written.
+    """
+    row = (FORMAT, header.name, canonical(header.fingerprint), header.created or time.time())
+    # One transaction: a file with tables always has its header.
+    try:
+        connection.executescript(f"begin immediate; {_SCHEMA}")
+        connection.execute("insert into header values (?, ?, ?, ?)", row)
+        connection.execute("commit")
+    except sqlite3.OperationalError as error:
+        raise JournalError(f"{path}: can't be written ({error}; {free_space(path) / MB:.1f} MB are free)") from error
+
+
+def take_lock(path: Path) -> IO[str]:
+    """Hold the run for this process; the system lets go of it when the process ends, however it ends."""
+    file = path.with_suffix(".lock").open("a+", encoding="utf-8")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        owner = file.read().strip()
+        file.close()
+        who = f"process {owner}" if owner else "another process"
+        raise JournalLockedError(
+            f"{path.parent}: {who} is running this campaign; wait for it, or stop it before you resume"
+        ) from None
+    file.truncate(0)
+    file.write(str(os.getpid()))
+    file.flush()
+    return file

@@ -1,0 +1,217 @@
+"""D3 with its own model: what it says of the simulator, limits that it keeps, and when it ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orchestrator.requests import Answered, Ask, Suggest
+from orchestrator.stages import DEPLOYMENT, with_bench
+from orchestrator.strategies.deployment.adaptive import (
+    Believed,
+    IgnoranceSettings,
+    RiskLimitSettings,
+    StopSettings,
+)
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.learnt import Deployed
+from orchestrator.strategies.deployment.play import displacement, play_of
+from orchestrator.strategies.learnt import Learnt
+from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis, Space
+from tests.orchestrator import plans
+from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan
+from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
+
+
+def upside_down(action: Any, theta: Any, rng: Any) -> float:
+    return 1.0 - 0.8 * narrow_cup(action, theta, rng)
+
+
+def adaptive(seed: int = 1, **changes: Any) -> Hybrid:
+    plan = deployment_plan(**{"model": "adaptive", "trust": None, "per_pour": 1, **changes})
+    strategy = plan.settings.build(plan, SCENE, THETA, seed)
+    assert isinstance(strategy, Hybrid)
+    return strategy
+
+
+def losses(strategy: Hybrid) -> list[float]:
+    return [pour.loss for pour in strategy.result().weighed if pour.loss is not None]
+
+
+def said(strategy: Hybrid) -> list[str]:
+    return [decision.text for decision in strategy.decisions if decision.urgent]
+
+
+def believed(strategy: Hybrid) -> Believed:
+    trust = strategy.result().trust
+    assert isinstance(trust, Believed)
+    return trust
+
+
+@pytest.mark.parametrize("per_pour", [1, "free"])
+def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(per_pour: Any) -> None:
+    strategy = adaptive(pours=3, per_pour=per_pour)
+    Play(narrow_cup_biased, narrow_cup, beside=2)(strategy)
+    after = [text for text in said(strategy) if text.startswith("after pour")]
+    assert [text.split(" the simulator ")[0] for text in after] == ["after pour 1", "after pour 2", "after pour 3"]
+    assert "that it says nothing of this bench" in after[-1]
+    trust = believed(strategy)
+    assert [one.pour for one in trust.after][-3:] == [1, 2, 3]
+    assert not trust.alarm
+    assert trust.after[-1].ignorance < 0.08
+
+
+def test_a_result_with_what_was_said_survives_its_file() -> None:
+    strategy = adaptive(pours=2)
+    Play(narrow_cup)(strategy)
+    result = strategy.result()
+    assert Learnt.KINDS[result.kind].model_validate_json(result.model_dump_json()) == result
+
+
+def test_a_simulator_that_says_nothing_of_the_bench_is_found_out_and_gone_on_without() -> None:
+    strategy = adaptive(pours=6, ignorance=IgnoranceSettings(limit=0.7))
+    Play(upside_down, narrow_cup)(strategy)
+    trust = believed(strategy)
+    assert trust.alarm
+    assert trust.followed == "go on"
+    assert "wrong here" in trust.text
+    assert len(losses(strategy)) == 6
+
+
+def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
+    strategy = adaptive(pours=6, ignorance=IgnoranceSettings(limit=0.7, policy="stop"))
+    Play(upside_down, narrow_cup)(strategy)
+    result = strategy.result()
+    assert len(losses(strategy)) < 6
+    assert result.ended is not None
+    assert "says nothing of this bench" in result.ended
+    assert result.recommended is not None
+
+
+@pytest.mark.parametrize("answer", ["go on", "stop"])
+def test_by_its_policy_it_asks_a_person(answer: str) -> None:
+    strategy = adaptive(pours=6, ignorance=IgnoranceSettings(limit=0.7, policy="ask"))
+    play = Play(upside_down, narrow_cup, answer=lambda r: Answered(answer) if isinstance(r, Ask) else None)(strategy)
+    asked = [request for request in play.asked if isinstance(request, Ask)]
+    assert len(asked) == 1
+    assert asked[0].options == ("go on", "stop")
+    assert (len(losses(strategy)) == 6) == (answer == "go on")
+    assert believed(strategy).followed == answer
+
+
+def test_it_ends_when_no_further_pour_is_worth_it_and_says_how_many_were_saved() -> None:
+    strategy = adaptive(pours=12, stop=StopSettings(gain_below=0.01))
+    Play(narrow_cup)(strategy)
+    made = len(losses(strategy))
+    assert made < 12
+    assert min(losses(strategy)) < 0.05
+    assert any(f"{12 - made} pours saved" in text for text in said(strategy))
+    assert strategy.progress().pours == strategy.progress().of_pours == made
+    without = adaptive(pours=12)
+    Play(narrow_cup)(without)
+    assert len(losses(without)) == 12
+
+
+def test_good_enough_is_the_end() -> None:
+    strategy = adaptive(pours=12, good_enough=0.06)
+    Play(narrow_cup)(strategy)
+    ended = strategy.result().ended
+    assert ended is not None
+    assert ended.startswith("good enough")
+    recommended = strategy.result().recommended
+    assert recommended is not None
+    assert recommended.predicted_loss <= 0.06
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> None:
+    strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05))
+    Play(narrow_cup_biased, narrow_cup)(strategy)
+    found = losses(strategy)
+    good = next(i for i, loss in enumerate(found) if loss <= 0.15)
+    assert max(found[good:]) <= 0.15
+
+
+@pytest.mark.parametrize("otherwise", ["stop", "go on"])
+def test_a_limit_that_can_not_be_kept_is_said_before_the_pour(otherwise: Any) -> None:
+    limit = RiskLimitSettings(loss=0.02, probability=0.001, otherwise=otherwise)
+    strategy = adaptive(pours=6, risk_limit=limit)
+    Play(narrow_cup, lambda a, t, r: 0.0)(strategy)  # good once, and too noisy to promise it again
+    told = [text for text in said(strategy) if "no action is known to keep the limit" in text]
+    assert told
+    assert (len(losses(strategy)) == 6) == (otherwise == "go on")
+
+
+def test_rules_of_one_model_are_refused_with_another() -> None:
+    class Heard:
+        any = False
+
+        def __init__(self) -> None:
+            self.at: list[Any] = []
+
+        def add(self, text: str, *at: Any, key: bool = False, of: str = "") -> None:
+            self.at.append(at)
+
+    from orchestrator.strategies.settings import Premises
+
+    heard = Heard()
+    deployment_plan(model="scaled", stop=StopSettings(), good_enough=0.01).settings.check(Premises(None, False), heard)
+    assert heard.at == [("stop",), ("good_enough",)]
+    heard = Heard()
+    deployment_plan(model="adaptive", trust="always").settings.check(Premises(None, False), heard)
+    assert heard.at == [("trust",)]
+
+
+# -- the bench -------------------------------------------------------------------------------------------------------
+
+
+def test_how_far_a_bench_may_be_off_follows_from_units() -> None:
+    speed, offset = play_of(ACTIONS)
+    assert offset.shift == pytest.approx(0.010 / 0.07)
+    assert (speed.shift, speed.factor) == (0.0, 0.05)
+    assert speed.origin == pytest.approx(15 / 105)
+
+
+def test_a_displacement_is_where_the_simulator_does_what_the_bench_does() -> None:
+    bench = SimulationParameters(receiver_x=0.007, receiver_z=0.002, tilt_zero=0.01, speed_factor=1.1)
+    actions = Space((*ACTIONS.axes, Axis("height", 0.03, 0.1), Axis("max_angle", 1.0, 2.0)))
+    moved = displacement(SimulationParameters(), bench, actions)
+    commanded = {"angular_velocity": 1.0, "x_offset": 0.1, "height": 0.05, "max_angle": 1.5}
+    unit = actions.encode(commanded) * np.array(moved.scales) + np.array(moved.shifts)
+    done = actions.decode(unit)
+    assert done == pytest.approx({"angular_velocity": 1.1, "x_offset": 0.107, "height": 0.048, "max_angle": 1.51})
+
+
+def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
+    plan = deployment_plan(model="adaptive", trust=None, pours=4, per_pour=1)
+    first = adaptive(pours=4)
+    Play(narrow_cup_biased, narrow_cup)(first)
+    learnt = first.result()
+    assert isinstance(learnt, Deployed)
+    again = Deployed.model_validate_json(learnt.model_dump_json())
+    told = with_bench(plan, {DEPLOYMENT + "first": again}, THETA)
+    assert len(told.bench) == 64
+    second = Hybrid(told, SCENE, THETA, 2)
+    played = Play(narrow_cup_biased, narrow_cup)(second)
+    pour = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
+    assert pour.mismatch is not None
+    assert pour.mismatch.drawn == told.bench
+    assert with_bench(replace(plan, settings=plan.settings.model_copy(update={"model": "scaled"})),
+                      {DEPLOYMENT + "first": again}, THETA).bench == ()  # fmt: skip
+
+
+def test_a_calibration_that_searched_where_the_receiver_stands_is_known_too() -> None:
+    best = SimulationParameters(receiver_x=0.004)
+    rows = [{"receiver_x": 0.004 + d} for d in (-0.001, 0.0, 0.001)]
+    found = plans.calibrated(best, rows)
+    assert found.found is not None
+    found = found.model_copy(update={"found": found.found.model_copy(update={"searched": ("receiver_x",)})})
+    told = with_bench(deployment_plan(model="adaptive", trust=None), {"calibration": found}, best)
+    shifts = np.array([one.shifts[1] for one in told.bench]) * 0.07
+    assert np.abs(shifts).max() == pytest.approx(0.001)
+    nothing = plans.calibrated(best, rows)  # it searched something else
+    assert with_bench(deployment_plan(model="adaptive", trust=None), {"calibration": nothing}, best).bench == ()
