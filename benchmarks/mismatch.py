@@ -16,8 +16,8 @@ what is lost is without scatter, means over at least 20 seeds with 95 % bootstra
 3. The action it recommends in the end: never more than 0.01 worse than that of D2 or of `alarm`?
 4. With an anti-correlated simulator: its pours from the fourth on no worse than D2's; best of the first three at most
    0.4?
-5. (`--receivers`, six pours each.) With what was learnt of the bench before: fewer pours into receiver 3 until one loses
-   less than 1 % than afresh?
+5. (`--receivers`, six pours each.) With what was learnt of the bench before: fewer pours into receiver 3 until one
+   loses less than 1 % than afresh?
 """
 
 from __future__ import annotations
