@@ -12,6 +12,7 @@ from fastapi import FastAPI, Response
 from orchestrator.daemon import deeds, looks
 from orchestrator.daemon.auth import Tokens
 from orchestrator.daemon.guard import Daemon, Guard
+from orchestrator.daemon.page import page_router
 from orchestrator.daemon.shapes import HealthOut, ProblemOut
 from orchestrator.daemon.supervisor import Supervisor
 
@@ -55,6 +56,7 @@ def create_app() -> FastAPI:
         response_model=HealthOut,
         responses={503: {"model": HealthOut, "description": "Not ready; the problems say why."}},
     )
+    app.include_router(page_router())
     app.state.live = _nowhere
     app.state.shutdown = _nothing
     return app

@@ -6,6 +6,7 @@ import os
 import resource
 import threading
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -32,6 +33,11 @@ class _Collector:
         for name, lane in daemon.lanes.items():
             busy.add_metric([name], float(lane.running is not None))
         yield busy
+        words = GaugeMetricFamily("decant_words", "Messages to people elsewhere.", labels=["receiver", "outcome"])
+        for receiver, counts in daemon.words.items():
+            for outcome, count in asdict(counts).items():
+                words.add_metric([receiver, outcome], count)
+        yield words
         single = {
             "decant_questions_open": ("Questions that wait for an answer.", len(daemon.store.questions())),
             "decant_emergency_stop": ("Whether the emergency stop is latched.", daemon.emergency is not None),

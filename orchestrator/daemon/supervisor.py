@@ -19,6 +19,7 @@ from actors.warm import WarmSimulators
 from orchestrator.campaign import CampaignResult
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.daemon.feed import Feed
+from orchestrator.daemon.notify import Counts
 from orchestrator.daemon.people import Asking
 from orchestrator.daemon.retention import prune_recordings
 from orchestrator.daemon.running import Common, Running
@@ -61,6 +62,7 @@ class Supervisor:
         self._common = Common(settings, self.store, self.feed, self.asking, self.warm, live)
         self.lanes = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
         self.problems: dict[str, str] = {}
+        self.words: dict[str, Counts] = {}
         self.stopping = False
         self.ended = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []

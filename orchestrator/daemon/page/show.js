@@ -1,0 +1,158 @@
+// What is on the page. Everything that comes from the daemon is set as text, never as HTML.
+
+const MODES = { hardware: "REAL", virtual: "VIRTUAL", none: "no bench" };
+const STATES = { "waiting for operator": "waits for an answer", unknown: "UNKNOWN pour" };
+
+/** An element: name, its attributes (on… are listeners), children. */
+export function el(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else made.setAttribute(key, value === true ? "" : value);
+  }
+  made.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined && child !== ""));
+  return made;
+}
+
+/** A button that can't be pressed twice at once, and keeps the focus when its neighbourhood is drawn anew. */
+export function button(key, text, act, look = "") {
+  return el("button", {
+    type: "button", class: look, "data-key": key,
+    onclick: async (event) => {
+      const pressed = event.currentTarget;
+      if (pressed.getAttribute("aria-busy")) return;
+      pressed.setAttribute("aria-busy", "true");
+      try { await act(); } finally { pressed.removeAttribute("aria-busy"); }
+    },
+  }, text);
+}
+
+/** Draw a section anew where its data have changed; whoever stood on a button in it stands there still. */
+export function draw(section, data, build) {
+  const now = JSON.stringify(data);
+  if (section.was === now) return;
+  section.was = now;
+  const key = section.contains(document.activeElement) ? document.activeElement.dataset.key : null;
+  section.replaceChildren(...[build(data)].flat(Infinity).filter(Boolean));
+  if (key) section.querySelector(`[data-key="${CSS.escape(key)}"]`)?.focus();
+}
+
+export const modeBadge = (mode) => el("strong", { class: `badge ${mode}` }, MODES[mode] || mode);
+export const stateText = (state) => STATES[state] || state;
+export const percent = (share) => `${(100 * share).toFixed(2)} %`;
+export const clock = (seconds) => new Date(1000 * seconds).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+
+export function lasting(seconds) {
+  if (seconds < 90) return `${Math.round(seconds)} s`;
+  return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
+}
+
+export function rigCard(rig, campaign, acts) {
+  const idle = !campaign;
+  const progress = campaign?.progress;
+  return el("article", { class: `card ${rig.mode}`, "aria-label": `rig ${rig.name}` },
+    el("h3", {}, rig.name, " ", modeBadge(rig.mode)),
+    idle ? el("p", { class: "quiet" }, "Nothing runs here.") : [
+      el("p", { class: "what" }, el("b", {}, campaign.name), ` ${stateText(campaign.state)}`,
+        campaign.wish !== "run" ? ` (asked to ${campaign.wish})` : ""),
+      progress ? [
+        el("p", {}, progress.stage ? `${progress.stage} (stage ${progress.stage_index} of ${progress.stage_count})` : "",
+          progress.seconds_left ? `, about ${lasting(progress.seconds_left)} left` : ""),
+        progress.pour ? el("p", { class: "pour" }, progress.pour) : null,
+        progress.checkpoint ? el("p", { class: "step" }, progress.checkpoint_words || progress.checkpoint) : null,
+        bar("pours", progress.pours, progress.of_pours), bar("simulations", progress.simulations, progress.of_simulations),
+        el("p", { class: "quiet" }, progress.line),
+      ] : campaign.reason ? el("p", {}, campaign.reason) : null,
+      el("p", { class: "links" },
+        campaign.live ? el("a", { href: campaign.live, target: "_blank", rel: "noreferrer", "data-key": `live ${campaign.id}` },
+          "Live view") : null,
+        campaign.report ? button(`report ${campaign.id}`, "Save report", () => acts.report(campaign.id), "plain") : null),
+    ]);
+}
+
+function bar(what, done, of) {
+  if (!of) return null;
+  return el("label", { class: "bar" }, `${what} ${done} of ${of}`, el("progress", { value: Math.min(done, of), max: of }));
+}
+
+const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: nobody knows", repeat: "Pour it again" };
+
+/** A question with answers that a wet finger hits. `send` takes the answer and throws what is wrong with it. */
+export function questionCard(question, campaign, mode, send) {
+  const problem = el("p", { class: "problem", role: "alert" }, question.problem || "");
+  const answer = async (text) => {
+    problem.textContent = "";
+    try { await send(question, text); } catch (error) { problem.textContent = error.message; }
+  };
+  const head = `question-${question.id}`;
+  const card = el("article", { class: "question", "aria-labelledby": head, "data-question": question.id },
+    el("p", { class: "quiet" }, modeBadge(mode), ` ${campaign} at ${question.rig}, asked at ${clock(question.asked)}`),
+    el("h2", { id: head, tabindex: "-1" }, question.text), problem,
+    question.hands ? el("p", { class: "hands" }, "Hands go into the cell: the arm stands still until you answer.") : null,
+    details(question.details), el("div", { class: "answers" }, answers(question, answer)));
+  if (question.kind === "bench") card.append(el("details", {}, el("summary", {}, "This pour can't be made"),
+    button(`give-up-${question.id}`, "Give it up", () => answer("give up"), "plain danger")));
+  return card;
+}
+
+function details(table) {
+  const rows = Object.entries(table || {}).map(([key, value]) =>
+    el("div", {}, el("dt", {}, key), el("dd", {}, typeof value === "number" ? String(+value.toPrecision(5)) : String(value))));
+  return rows.length ? el("dl", {}, rows) : null;
+}
+
+function answers(question, answer) {
+  const big = (text) => button(`answer-${question.id}-${text}`, NAMES[text] || text, () => answer(text),
+    `big ${text === "done" || text === "yes" ? "go" : ""}`);
+  if (question.wants === "done") return big("done");
+  if (question.wants === "yes or no") return [big("yes"), big("no")];
+  if (question.wants === "weight") return weights(question, ["Weight"], ([weight]) => answer(`${weight} g`));
+  return question.options.map((option) => option.startsWith("weighed") ?
+    weights(question, ["Spilled", "Left in the pourer"], (found) => answer(`weighed ${found.join(" ")}`)) : big(option));
+}
+
+function weights(question, names, send) {
+  const inputs = names.map((name, index) => el("input", {
+    id: `weight-${question.id}-${index}`, inputmode: "decimal", autocomplete: "off", required: true, size: 6,
+    pattern: "\\s*[0-9]+([.,][0-9]+)?\\s*", title: "a number of grams", "data-key": `weight-${question.id}-${index}`,
+  }));
+  return el("form", {
+    class: "weights",
+    onsubmit: (event) => { event.preventDefault(); send(inputs.map((input) => input.value.trim().replace(",", "."))); },
+  }, inputs.map((input, index) => el("label", {}, names[index], el("span", {}, input, " g"))),
+  el("button", { class: "big go" }, names.length > 1 ? "It was weighed" : "Send the weight"));
+}
+
+export function poursTable(pours) {
+  if (!pours.length) return el("p", { class: "quiet" }, "None yet.");
+  return el("table", {},
+    el("thead", {}, el("tr", {}, ["Pour", "Into", "Action", "Expected", "Measured", "Spilled"].map((head) =>
+      el("th", { scope: "col" }, head)))),
+    el("tbody", {}, pours.map((pour) => el("tr", { class: pour.state.replace(" ", "-") },
+      cell("Pour", pour.number), cell("Into", pour.receiver), cell("Action", pour.action), cell("Expected", pour.predicted || "—"),
+      cell("Measured", pour.measured || pour.state), cell("Spilled", pour.spillage === null ? "—" : percent(pour.spillage))))));
+}
+
+const cell = (head, text) => el("td", { "data-head": head }, String(text));
+
+export function queueList(items, paused, acts) {
+  return [
+    el("p", {}, paused ? el("b", {}, "The queue is held: nothing begins. ") : "", items.length ? "" : "Nothing waits. ",
+      button("hold", paused ? "Let it go on" : "Hold the queue", () => acts.hold(!paused), "plain")),
+    items.length ? el("ol", {}, items.map((item, index) => el("li", {}, el("span", {}, el("b", {}, item.name), " ",
+      modeBadge(item.mode), ` for ${item.rig}`, item.needs_arming ? ", waits for `decant arm`" : ""),
+    index ? button(`up ${item.id}`, "Earlier", () => acts.earlier(item, items[index - 1]), "plain") : null,
+    button(`drop ${item.id}`, "Take out", () => acts.end(item, "stop"), "plain danger")))) : null,
+  ];
+}
+
+export function endedList(items, acts) {
+  if (!items.length) return el("p", { class: "quiet" }, "None.");
+  return el("ul", {}, items.map((item) => el("li", {},
+    el("span", {}, el("b", {}, item.name), " ", modeBadge(item.mode), ` ${stateText(item.state)}`,
+      item.reason ? `: ${item.reason}` : "", item.ended ? `, ${clock(item.ended)}` : ""),
+    ["paused", "failed", "unknown", "stopped"].includes(item.state) ?
+      button(`resume ${item.id}`, "Go on", () => acts.resume(item), "plain") : null,
+    item.report ? button(`report ${item.id}`, "Save report", () => acts.report(item.id), "plain") : null)));
+}

@@ -1,0 +1,339 @@
+"""The operator's page in a real Chromium: what somebody with wet hands, a keyboard or a screen reader finds there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from actors.operator import Question
+from actors.spec import LaboratorySpec
+from orchestrator.daemon.auth import Role
+from orchestrator.daemon.settings import Rig
+from tests.orchestrator.daemon.browsing import OnPort, browser, on_port
+from tests.orchestrator.daemon.served import HeldBench, HeldLaboratory
+from tests.orchestrator.toy import ToyOptimizer, ToySimulators
+
+pytest.importorskip("playwright")
+
+WAIT = 20_000
+"""Of the browser for what a test waits for [ms]."""
+
+SIZES = {"small phone": (320, 640), "phone": (390, 844), "tablet": (1024, 768), "desk": (1440, 900)}
+
+
+@pytest.fixture(scope="module")
+def chrome() -> Iterator[Any]:
+    with browser() as found:
+        yield found
+
+
+@pytest.fixture
+def page(chrome: Any) -> Iterator[Any]:
+    """A tab in which nothing may go wrong unnoticed; `requests` has all addresses that it asked for."""
+    context = chrome.new_context(viewport={"width": 1024, "height": 768}, locale="en-GB")
+    context.set_default_timeout(WAIT)
+    tab = context.new_page()
+    tab.problems, tab.requests = [], []
+    tab.on("pageerror", lambda error: tab.problems.append(str(error)))
+    tab.on("request", lambda request: tab.requests.append(request.url))
+    tab.on(
+        "console",
+        lambda line: (
+            tab.problems.append(line.text) if line.type == "error" and "Failed to load" not in line.text else 0
+        ),
+    )
+    yield tab
+    context.close()
+    assert tab.problems == []
+
+
+def is_problem(line: Any) -> bool:
+    """Whether the browser complains; of answers that are refusals it says so itself, which is meant here."""
+    return line.type == "error" and not line.text.startswith("Failed to load resource")
+
+
+def asking(**question: Any) -> Any:
+    """Makes laboratories whose first pour asks something."""
+
+    def make() -> HeldLaboratory:
+        bench = HeldBench()
+        bench.question = Question(**question)
+        return HeldLaboratory(ToySimulators(), bench, ToyOptimizer())
+
+    return make
+
+
+REFILL = {"text": "Fill the pourer and put it on the tray.", "wants": "done", "about": "pourer_full"}
+
+
+def asked(lab: OnPort) -> str:
+    """A campaign that has come to its question."""
+    key = lab.do(lab.served.submit())
+    lab.do(lab.served.question())
+    return key
+
+
+def test_who_has_no_token_is_asked_for_one_and_it_stays_in_the_tab(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        page.goto(lab.url)
+        page.get_by_label("Token").fill("a wrong one, but long enough")
+        page.get_by_role("button", name="Come in").click()
+        page.get_by_text("this token is not known").wait_for()
+        page.get_by_label("Token").fill(lab.served.tokens[Role.VIEWER])
+        page.keyboard.press("Enter")
+        page.get_by_text("Nothing runs here.").wait_for()
+        assert page.evaluate("Object.keys(localStorage).length + document.cookie.length") == 0
+        page.goto(lab.address())
+        wait_until(page, lambda: page.url == f"{lab.url}/")
+        page.get_by_text("Nothing runs here.").wait_for()
+
+
+def test_a_question_is_answered_with_one_press_and_the_pour_goes_on(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, asking(**REFILL)) as lab:
+        page.goto(lab.address(Role.OPERATOR))
+        page.get_by_text("Nothing runs here.").wait_for()
+        key = asked(lab)
+        page.get_by_role("heading", name="Fill the pourer and put it on the tray.").wait_for()
+        page.get_by_text("A question: Fill the pourer").wait_for(state="attached")
+        assert page.locator("#call").get_attribute("aria-live") == "assertive"
+        assert "(1) question" in page.title()
+        page.get_by_role("button", name="Done").click()
+        wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["done"])
+        wait_until(page, lambda: lab.do(lab.served.get(f"/campaigns/{key}"))["pours_made"][0]["state"] == "weighed")
+
+
+def test_a_keyboard_alone_answers_and_stops(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, asking(**REFILL | {"wants": "yes or no", "text": "May the arm move?"})) as lab:
+        asked(lab)
+        page.goto(lab.address(Role.OPERATOR))
+        page.get_by_role("button", name="Yes").wait_for()
+        names = []
+        for _ in range(14):
+            page.keyboard.press("Tab")
+            names.append(page.evaluate("document.activeElement.textContent.trim()"))
+            if names[-1] == "No":
+                page.keyboard.press("Enter")
+                break
+        assert names[-2:] == ["Yes", "No"]
+        page.wait_for_timeout(300)
+        while page.evaluate("document.activeElement.id") != "stop-all":
+            page.keyboard.press("Tab")
+        page.keyboard.press("Enter")
+        page.get_by_role("heading", name="Emergency stop").wait_for()
+        assert lab.served.laboratories[0].bench.answers[0] == "no"
+
+
+def test_a_weight_is_typed_as_people_type_it_and_a_wrong_one_is_told(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, asking(text="Weigh the tray.", wants="weight", hands=False)) as lab:
+        asked(lab)
+        page.goto(lab.address(Role.OPERATOR))
+        weight = page.get_by_label("Weight")
+        weight.fill("twelve")
+        page.get_by_role("button", name="Send the weight").click()
+        assert not page.evaluate("document.querySelector('.weights').checkValidity()")
+        assert lab.served.laboratories[0].bench.answers == []
+        weight.fill("12,3")
+        page.get_by_role("button", name="Send the weight").click()
+        lab.do(lab.served.pouring())
+        wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["12.3 g"])
+
+
+def test_what_somebody_types_survives_all_news(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, asking(text="Weigh the tray.", wants="weight")) as lab:
+        key = asked(lab)
+        page.goto(lab.address(Role.OPERATOR))
+        page.get_by_label("Weight").fill("3.")
+        lab.do(lab.served.submit(priority=5))
+        page.get_by_text("Take out").wait_for()
+        assert page.get_by_label("Weight").input_value() == "3."
+        assert page.evaluate("document.activeElement.tagName") == "INPUT"
+        assert key
+
+
+def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        key = lab.do(lab.served.submit())
+        laboratory = lab.do(lab.served.pouring())
+        page.goto(lab.address())
+        page.get_by_text("tilting").wait_for()
+        page.get_by_role("button", name="EMERGENCY STOP").click()
+        page.get_by_role("heading", name="Emergency stop").wait_for()
+        assert laboratory.arm_stops == 1
+        assert lab.do(lab.served.until(key, "unknown"))["state"] == "unknown"
+        assert page.get_by_role("button", name="EMERGENCY STOP").is_disabled()
+        page.get_by_text("Clear it").click()
+        page.get_by_role("button", name="Yes: take work again").click()
+        page.get_by_role("heading", name="Emergency stop").wait_for(state="hidden")
+        assert lab.do(lab.served.get("/status"))["emergency"] is None
+
+
+def test_a_viewer_may_stop_everything_but_answers_nothing(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, asking(**REFILL)) as lab:
+        asked(lab)
+        page.goto(lab.address(Role.VIEWER))
+        page.get_by_role("button", name="Done").click()
+        page.get_by_text("viewer is a viewer; this takes operator").wait_for()
+        page.get_by_role("button", name="EMERGENCY STOP").click()
+        page.get_by_role("heading", name="Emergency stop").wait_for()
+
+
+def test_real_and_virtual_cannot_be_mistaken(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        page.goto(lab.address())
+        page.get_by_text("nothing real moves").wait_for()
+        assert page.locator("header").get_by_text("VIRTUAL", exact=True).is_visible()
+        virtual = page.evaluate("getComputedStyle(document.querySelector('header')).background")
+    real = Rig("north", tmp_path / "north.yaml", LaboratorySpec("north", mode="hardware"))
+    with on_port(tmp_path / "other", rigs=(real,)) as lab:
+        page.goto(lab.address())
+        page.get_by_text("north: the arm moves").wait_for()
+        assert page.locator("header").get_by_text("REAL", exact=True).is_visible()
+        assert page.locator("article").get_by_text("REAL", exact=True).is_visible()
+        assert page.evaluate("getComputedStyle(document.querySelector('header')).background") != virtual
+
+
+def test_the_queue_is_held_reordered_and_emptied(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        lab.do(lab.served.submit())
+        lab.do(lab.served.pouring())
+        second, third = lab.do(lab.served.submit()), lab.do(lab.served.submit())
+        page.goto(lab.address(Role.OPERATOR))
+        page.get_by_role("button", name="Earlier").click()
+        wait_until(page, lambda: queued(lab) == [third, second])
+        page.get_by_role("button", name="Hold the queue").click()
+        page.get_by_text("The queue is held").wait_for()
+        assert lab.do(lab.served.get("/status"))["queue_paused"]
+        page.get_by_role("button", name="Take out").first.click()
+        wait_until(page, lambda: queued(lab) == [second])
+        page.get_by_role("button", name="Pause", exact=True).click()
+        wait_until(page, lambda: lab.do(lab.served.get("/campaigns"))[0]["wish"] == "pause")
+
+
+def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, HeldLaboratory) as lab:
+        key = lab.do(lab.served.submit())
+        found = lab.do(lab.served.until(key, "finished"))
+        page.goto(lab.address())
+        page.locator("#pours tbody tr").first.wait_for()
+        rows = page.locator("#pours tbody tr").all_inner_texts()
+        assert len(rows) == len(found["pours_made"]) == 3
+        assert f"{100 * found['pours_made'][-1]['spillage']:.2f} %" in rows[0]
+        assert found["pours_made"][-1]["predicted"] in rows[0]
+
+
+def test_a_lost_connection_is_told_with_what_to_do(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        page.goto(lab.address())
+        page.get_by_text("Nothing runs here.").wait_for()
+        page.context.set_offline(True)
+        page.get_by_text("To stop the arm, use its own emergency stop.").wait_for()
+        page.context.set_offline(False)
+        page.get_by_text("No connection to the daemon").wait_for(state="hidden")
+
+
+def test_it_asks_nobody_else_and_shows_texts_as_texts(page: Any, tmp_path: Path) -> None:
+    nasty = "<img src=x onerror=\"document.title='broken in'\"><script>document.title='broken in'</script>"
+    with on_port(tmp_path, asking(text=nasty, wants="done", details={"note": nasty})) as lab:
+        asked(lab)
+        response = page.goto(lab.address())
+        page.get_by_role("heading", name="<img src=x").wait_for()
+        assert page.locator("#questions img, #questions script").count() == 0
+        assert page.title() != "broken in"
+        policy = response.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert {url for url in page.requests if not url.startswith((lab.url, "data:"))} == set()
+
+
+LEGIBLE = """() => {
+  const parse = (text) => { const m = text.match(/[\\d.]+/g).map(Number); return [...m.slice(0, 3), m[3] ?? 1]; };
+  const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
+    .map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const bad = [];
+  for (const one of document.querySelectorAll("body *")) {
+    const own = [...one.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
+    if (!own || !one.checkVisibility() || one.closest(".unseen, .skip, noscript, :disabled")) continue;
+    let ground = one;
+    while (ground && parse(getComputedStyle(ground).backgroundColor)[3] === 0) ground = ground.parentElement;
+    const style = getComputedStyle(one);
+    const back = ground ? parse(getComputedStyle(ground).backgroundColor) : [255, 255, 255, 1];
+    const [a, b] = [light(parse(style.color)), light(back)].sort((x, y) => y - x);
+    const big = parseFloat(style.fontSize) >= 24 || (parseFloat(style.fontSize) >= 18.6 && +style.fontWeight >= 700);
+    if ((a + 0.05) / (b + 0.05) < (big ? 3 : 4.5)) bad.push(`${one.tagName} '${one.textContent.slice(0, 30)}'`);
+  }
+  for (const one of document.querySelectorAll("button, input, summary")) {
+    const box = one.getBoundingClientRect();
+    if (one.checkVisibility() && (box.height < 44 || box.width < 44)) bad.push(`small: ${one.textContent || one.id}`);
+  }
+  return bad;
+}"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_everything_is_legible_and_large_enough(page: Any, tmp_path: Path, scheme: str) -> None:
+    """Contrast 4.5 : 1 (3 : 1 for large letters; WCAG 2.2 AA), targets of 44 px."""
+    page.emulate_media(color_scheme=scheme)
+    with on_port(tmp_path, asking(**REFILL | {"problem": "the balance shows 3 g"})) as lab:
+        page.goto(lab.url)
+        page.get_by_label("Token").wait_for()
+        assert page.evaluate(LEGIBLE) == []
+        asked(lab)
+        lab.do(lab.served.submit())
+        page.goto(lab.address())
+        page.get_by_role("button", name="Done").wait_for()
+        page.get_by_text("Take out").wait_for()
+        page.get_by_text("This pour can't be made").click()
+        assert page.evaluate(LEGIBLE) == []
+        page.get_by_role("button", name="EMERGENCY STOP").click()
+        page.get_by_role("heading", name="Emergency stop").wait_for()
+        page.get_by_text("Clear it").click()
+        assert page.evaluate(LEGIBLE) == []
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_it_fits_every_screen_with_the_stop_in_reach(page: Any, tmp_path: Path, size: str) -> None:
+    width, height = SIZES[size]
+    page.set_viewport_size({"width": width, "height": height})
+    with on_port(tmp_path, asking(**REFILL)) as lab:
+        asked(lab)
+        page.goto(lab.address())
+        page.get_by_role("button", name="Done").wait_for()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        for place in ("0", "document.body.scrollHeight"):
+            page.evaluate(f"scrollTo(0, {place})")
+            box = page.get_by_role("button", name="EMERGENCY STOP").bounding_box()
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= width
+            assert box["y"] + box["height"] <= height
+        answer = page.get_by_role("button", name="Done").bounding_box()
+        assert answer["height"] >= 72
+
+
+def test_a_screen_reader_finds_its_way(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, asking(**REFILL)) as lab:
+        asked(lab)
+        page.goto(lab.address())
+        page.get_by_role("button", name="Done").wait_for()
+        for role in ("banner", "main"):
+            assert page.get_by_role(role).count() == 1
+        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Stop"):
+            assert page.get_by_role("region", name=name, exact=True).count() == 1
+        assert page.get_by_role("article", name="Fill the pourer").count() == 1
+        assert page.evaluate("document.documentElement.lang") == "en"
+        assert page.evaluate("document.activeElement.tagName") == "H2"  # the question, where nobody stood elsewhere
+
+
+def queued(lab: OnPort) -> list[str]:
+    return [one["id"] for one in lab.do(lab.served.get("/campaigns", state="queued"))]
+
+
+def wait_until(page: Any, met: Any) -> None:
+    for _ in range(int(WAIT / 50)):
+        if met():
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError("it did not happen")
