@@ -18,7 +18,9 @@ async function refresh() {
     Object.assign(now, { status, campaigns, questions, seen: Date.now() });
     const shown = campaigns.find((one) => RUNNING.includes(one.state) && one.run) || campaigns.find((one) => one.run);
     const detail = shown ? await call(`campaigns/${encodeURIComponent(shown.id)}`) : null;
-    now.pours = detail ? detail.pours_made.filter((pour) => pour.state !== "asked").slice(-8).reverse() : [];
+    const open = shown && !RUNNING.includes(shown.state) ? "UNKNOWN" : "under way";
+    now.pours = (detail ? detail.pours_made : []).filter((pour) => pour.state !== "asked").slice(-8).reverse()
+      .map((pour) => ({ ...pour, state: pour.state === "under way" ? open : pour.state }));
     show();
     link(true);
   } catch (error) {
@@ -30,8 +32,15 @@ async function refresh() {
   }
 }
 
-let timer = 0;
-function soon(delay) { clearTimeout(timer); timer = setTimeout(refresh, delay); }
+let timer = 0, due = Infinity;
+
+/** Look again after so long [ms], or earlier where that is planned: news that never pause postpone nothing. */
+function soon(delay) {
+  if (performance.now() + delay >= due) return;
+  clearTimeout(timer);
+  due = performance.now() + delay;
+  timer = setTimeout(() => { due = Infinity; refresh(); }, delay);
+}
 
 function told(type, data) {
   if (type === "QuestionAsked") announce("call", `A question: ${data.question.text}`);
@@ -62,7 +71,7 @@ function show() {
   const { status, campaigns } = now;
   const real = status.rigs.filter((rig) => rig.mode === "hardware");
   draw($("mode"), real.map((rig) => rig.name), (names) => names.length ?
-    [modeBadge("hardware"), ` ${names.join(", ")}: the arm moves`] : [modeBadge("virtual"), " nothing real moves"]);
+    [modeBadge("hardware"), ` ${names.join(", ")}: a real arm`] : [modeBadge("virtual"), " nothing real moves"]);
   document.body.classList.toggle("real", real.length > 0);
   showEmergency(status.emergency);
   showQuestions();
