@@ -2,6 +2,7 @@
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper alarm adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--out FILE]
+                                  [--receivers]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
@@ -15,6 +16,8 @@ what is lost is without scatter, means over at least 20 seeds with 95 % bootstra
 3. The action it recommends in the end: never more than 0.01 worse than that of D2 or of `alarm`?
 4. With an anti-correlated simulator: its pours from the fourth on no worse than D2's; best of the first three at most
    0.4?
+5. (`--receivers`, six pours each.) With what was learnt of the bench before: fewer pours into receiver 3 until one
+   loses less than 1 % than afresh?
 """
 
 from __future__ import annotations
@@ -33,10 +36,12 @@ from mismatch_worlds import LEVELS, SIMULATED_SCATTER, Valley
 from actors.optimizer.core.propose import propose
 from orchestrator.plan import DeploymentPlan
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
+from orchestrator.stages import DEPLOYMENT, with_bench
 from orchestrator.strategies.deployment.base import Deployment
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.trust import TrustSettings
+from orchestrator.strategies.learnt import Learnt
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement, PourOutcome
@@ -112,6 +117,45 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> d
     return {"arm": arm, "level": level, "seed": seed, "poured": numbers.poured, "reported": reported}
 
 
+def receivers(level: str, bench: int, carried: bool, pours: int, simulations: int) -> list[dict[str, float]]:
+    """Three receivers one after the other on one bench: what each loses, with what was learnt before or without."""
+    results: dict[str, Learnt] = {}
+    found = []
+    for number in range(3):
+        valley = Valley(level, 4 * bench + number, bench)
+        plan = DeploymentPlan(ARMS["adaptive"](pours, simulations), (SCENE,), valley.space, Loss())
+        plan = with_bench(plan, results if carried else {}, SimulationParameters())
+        strategy, numbers = plan.settings.build(plan, SCENE, SimulationParameters(), bench), Numbers(valley)
+        numbers.play(strategy)
+        results[f"{DEPLOYMENT}{number}"] = strategy.result()
+        good = [i for i, lost in enumerate(numbers.poured, start=1) if lost < GOOD]
+        found.append(
+            {
+                "first pour": numbers.poured[0],
+                "mean": float(np.mean(numbers.poured)),
+                "pours until below 1 %": float(good[0] if good else pours + 1),
+            }
+        )
+    return found
+
+
+def receivers_table(levels: list[str], benches: range, pours: int, simulations: int) -> str:
+    """Markdown: a row for each receiver, with what was learnt before and without."""
+    lines = ["| simulator | receiver | | first pour | mean | pours until below 1 % |", "|---|---|---|---|---|---|"]
+    for level in levels:
+        for carried in (False, True):
+            runs = [receivers(level, bench, carried, pours, simulations) for bench in benches]
+            for number in range(3):
+                cells = []
+                for key in runs[0][number]:
+                    mean, low, high = interval([run[number][key] for run in runs])
+                    cells.append(f"{mean:.2f} ({low:.2f} … {high:.2f})")
+                begins = "with what was learnt before" if carried else "afresh"
+                lines.append(f"| {level} | {number + 1} | {begins} | {' | '.join(cells)} |")
+            print("\n".join(lines[-3:]), file=sys.stderr)
+    return "\n".join(lines)
+
+
 def figures(run: dict[str, Any]) -> dict[str, float]:
     """What is asked of a campaign."""
     poured = np.array(run["poured"])
@@ -164,7 +208,12 @@ def main() -> None:
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--simulations", type=int, default=37)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--receivers", action="store_true", help="three receivers one after the other on one bench")
     asked = parser.parse_args()
+    if asked.receivers:
+        benches = range(asked.first, asked.first + asked.seeds)
+        print(receivers_table(asked.levels, benches, asked.pours, asked.simulations))
+        return
     runs: list[dict[str, Any]] = []
     if asked.out is not None and asked.out.exists():
         runs = [json.loads(line) for line in asked.out.read_text().splitlines()]

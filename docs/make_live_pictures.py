@@ -27,7 +27,7 @@ FOLDER = ROOT / "docs" / "images" / "live"
 
 SIZE = {"width": 1920, "height": 1080}
 
-SETTLING = 30.0
+SETTLING = 40.0
 """A software rasteriser takes so long to draw what it was sent [s]."""
 
 

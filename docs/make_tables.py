@@ -30,6 +30,8 @@ from orchestrator.config.study import sections as study
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Choice, Section
 from orchestrator.config.yaml.validate import sections_in
+from orchestrator.daemon import settings as daemon
+from orchestrator.daemon.notify import NotifySection
 from orchestrator.report.physics import kept_records
 from orchestrator.states import State
 from orchestrator.strategies.deployment.adaptive import IgnoranceSettings, RiskLimitSettings, StopSettings
@@ -80,6 +82,12 @@ SECTIONS: dict[str, type[Section]] = {
     "level": study.LevelSection,
     "compared-calibrations": study.CalibrationsSection,
     "compared-deployments": study.DeploymentsSection,
+    "daemon": daemon.DaemonFile,
+    "listen": daemon.ListenSection,
+    "tls": daemon.TlsSection,
+    "live": daemon.LiveSection,
+    "recordings": daemon.RecordingsSection,
+    "notify": NotifySection,
 }
 
 OF_SECTIONS = {

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb, vessel_verb, view
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -260,6 +260,7 @@ app.command(
 )(bench_verbs.pour)
 
 app.command(epilog=report.EXAMPLES)(report.report)
+app.command(epilog=view.EXAMPLES)(view.view)
 app.add_typer(runs_verbs.runs)
 
 
@@ -306,6 +307,7 @@ def physics(
 
 
 daemon_verbs.register(app)
+vessel_verb.register(app)
 
 
 def main() -> None:

@@ -65,7 +65,7 @@ class Score:
 
     @property
     def share_held(self) -> float | None:
-        """Of the pours, those inside their band."""
+        """The share of the pours that lie inside their band."""
         return self.held / self.pours if self.pours else None
 
     def as_json(self) -> dict[str, Any]:

@@ -160,7 +160,7 @@ def band_of(outcomes: Sequence[PourOutcome], discrepancy: float | None = None) -
 
 
 def _quantile(places: Sequence[float], width: float, share: float) -> float:
-    """Of an even mixture of normal distributions, by bisection."""
+    """The quantile of an even mixture of normal distributions, by bisection."""
     low, high = -_WIDEST, _WIDEST
     for _ in range(60):
         middle = 0.5 * (low + high)

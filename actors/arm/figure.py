@@ -126,10 +126,10 @@ class LinkFigure:
 
     def pourer(self, joints: FloatArray) -> FloatArray:
         """See `ArmFigure.pourer`."""
-        from actors.arm.path.transforms import pourer_motion
+        from actors.arm.path.transforms import cell_transforms, pourer_transforms, quaternions
 
-        q = np.asarray(joints, dtype=float)
-        return pourer_motion(q, np.arange(len(q), dtype=float), self.spec).poses
+        held = cell_transforms(self.spec).world.inverse @ pourer_transforms(np.asarray(joints, float), self.spec)
+        return np.concatenate([held.position, quaternions(held.rotation)], axis=-1)
 
     def tool_of(self, poses: FloatArray) -> FloatArray:
         """See `ArmFigure.tool_of`."""

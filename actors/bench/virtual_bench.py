@@ -72,7 +72,7 @@ class PourAsk:
 
     @property
     def record_rate(self) -> float:
-        """Of the hidden liquid's particles [1/s]; 0 where nobody watches. Changes nothing about where they go."""
+        """Frames of the hidden liquid's particles [1/s]; 0 where nobody watches. It changes nothing of their ways."""
         return 0.0 if self.show is None else WATCHED_RATE
 
     def shown(self, frames: RecordedFrames | None) -> None:

@@ -84,7 +84,7 @@ class Share:
 
     @property
     def size(self) -> int:
-        """Of the whole pool: where nobody else wants it, all of it."""
+        """Members of the whole pool: where nobody else wants it, all of it."""
         return self._fair.pool.size
 
     @property

@@ -69,7 +69,7 @@ def _expected(pour: Row) -> str:
 
 
 def loss(value: float | None, name: str | None, deviation: float | None = None) -> str:
-    """Of a pour or a prediction, in its unit: '3.4 %', '3.4 ± 1.2 %'."""
+    """The loss of a pour or a prediction, in its unit: '3.4 %', '3.4 ± 1.2 %'."""
     from orchestrator.report.units import named_loss_unit
 
     return "" if value is None else named_loss_unit(str(name)).text(value, deviation)

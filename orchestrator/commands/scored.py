@@ -35,7 +35,7 @@ class ScoringOptions:
     receiver: Path | None
     """In place of the scene's."""
     thetas: int | None
-    """Of the posterior, that the simulations of a pour take turns with; None: as many as `seeds`, if it has one."""
+    """Draws of the posterior that a pour's simulations take turns with; None: as many as `seeds`, if there is one."""
     seed: int
     seeds: int
     """Simulations of each pour; as many as `thetas` where those are more."""

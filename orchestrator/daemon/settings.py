@@ -37,7 +37,7 @@ class TlsSection(Section):
     required: ClassVar[dict[str, str]] = {"certificate": "decant.crt", "key": "decant.key"}
 
     certificate: FilePath | None = None
-    """Of the server, with its chain (PEM)."""
+    """The server's certificate, with its chain (PEM)."""
 
     key: FilePath | None = None
     """Its private key (PEM)."""

@@ -206,7 +206,7 @@ class RigOut(_Out):
     """That has it now."""
 
     checkpoint: str
-    """Of the pour that is under way."""
+    """Where the pour that is under way stands."""
 
 
 class WhatMovesOut(_Out):

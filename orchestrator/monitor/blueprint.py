@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from orchestrator.report.style import safe_name
@@ -32,45 +32,69 @@ def campaign_blueprint(moment: Moment, receivers: Mapping[str, str], loss_label:
     """
     import rerun.blueprint as rrb
 
-    told = rrb.Vertical(_status(), _log(), row_shares=[3, 2])
     losses = [_loss(safe_name(scene), f"{name}: {loss_label}") for scene, name in receivers.items()]
     maps = [
         _picture(f"/learning/{safe_name(scene)}/surrogate", f"{name}: expected loss")
         for scene, name in receivers.items()
     ]
-    calibration = [
+    theta = [
         _picture("/learning/calibration/surrogate", "Discrepancy over θ"),
         _picture("/learning/calibration/theta", "θ* and which θ fit the pours"),
     ]
-    match moment:
-        case "calibrating":
-            stage = rrb.Vertical(
-                rrb.Horizontal(_cell(), _simulation()),
-                rrb.Horizontal(_loss("calibration", "Calibration pours: spilled / poured [%]"), _shares()),
-                _lanes(),
-                row_shares=[5, 3, 2],
-            )
-            middle = rrb.Vertical(*calibration, row_shares=[1, 1])
-            shares = [5, 4, 2]
-        case "deploying":
-            stage = rrb.Vertical(
-                rrb.Horizontal(_cell(), _simulation()),
-                _weight(),
-                _lanes(),
-                row_shares=[5, 3, 2],
-            )
-            middle = rrb.Vertical(rrb.Tabs(*losses), rrb.Tabs(*maps, *calibration), row_shares=[1, 1])
-            shares = [5, 4, 2]
-        case "replaying":
-            stage = rrb.Vertical(
-                rrb.Horizontal(_cell(), _simulation()),
-                rrb.Horizontal(_weighed_pour(), _shares()),
-                row_shares=[3, 2],
-            )
-            results = rrb.Tabs(*losses, _loss("calibration", "Calibration pours: spilled / poured [%]"), _machine())
-            middle = rrb.Vertical(rrb.Tabs(*maps, *calibration), results, row_shares=[1, 1])
-            shares = [5, 4, 2]
-    return _blueprint(rrb.Horizontal(stage, middle, told, column_shares=shares), moment)
+    calibrated = _loss("calibration", "Calibration pours: spilled / poured [%]")
+    calibrating = rrb.Horizontal(
+        rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
+        rrb.Vertical(*theta, rrb.Horizontal(calibrated, _shares()), row_shares=[5, 4, 4]),
+        rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+        column_shares=[5, 7, 4],
+        name="Calibrating",
+    )
+    deploying = rrb.Horizontal(
+        rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
+        rrb.Vertical(rrb.Tabs(*maps), rrb.Tabs(*losses), _weight(), row_shares=[5, 4, 4]),
+        rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+        column_shares=[5, 7, 4],
+        name="Deploying",
+    )
+    replaying = rrb.Horizontal(
+        rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
+        rrb.Vertical(
+            rrb.Horizontal(_weighed_pour(), _shares()),
+            rrb.Tabs(*losses, calibrated),
+            rrb.Tabs(*maps, *theta),
+            row_shares=[4, 4, 5],
+        ),
+        rrb.Vertical(_status(), _log(), row_shares=[5, 4]),
+        column_shares=[5, 7, 4],
+        name="Replaying",
+    )
+    # All three stand in every arrangement, behind tabs: whoever looks late may be shown an earlier moment first.
+    tabs = {"calibrating": calibrating, "deploying": deploying, "replaying": replaying}
+    if not receivers:
+        del tabs["deploying"]
+        moment = "calibrating" if moment == "deploying" else moment
+    return _blueprint(rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(moment)), moment)
+
+
+def beside_blueprint(names: Sequence[str]) -> rrb.Blueprint:
+    """For several recordings in one, each below its name.
+
+    Args:
+        names: first parts of the entities' paths.
+    """
+    import rerun.blueprint as rrb
+
+    columns = [
+        rrb.Vertical(
+            _cell(f"/{name}", f"{name}: the cell"),
+            _simulation(f"/{name}", f"{name}: simulated pour"),
+            _weighed_pour(f"/{name}", f"{name}: spilled [g], weighed and simulated"),
+            _status(f"/{name}"),
+            row_shares=[4, 4, 3, 3],
+        )
+        for name in names
+    ]
+    return _blueprint(rrb.Horizontal(*columns), "replaying")
 
 
 def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
@@ -88,28 +112,28 @@ def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
     )
 
 
-def _cell() -> Any:
+def _cell(under: str = "", name: str = "The cell: planned (orange), done (blue)") -> Any:
     import rerun.blueprint as rrb
 
     eye = rrb.EyeControls3D(position=(0.55, -1.25, 0.75), look_target=(0.1, 0.15, 0.2), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
-        origin="/cell",
-        name="The cell: what was planned (orange), what was done (blue)",
+        origin=f"{under}/cell",
+        name=name,
         background=BACKGROUND,
         eye_controls=eye,
         line_grid=rrb.LineGrid3D(visible=False),
     )
 
 
-def _simulation() -> Any:
+def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its liquid") -> Any:
     import rerun.blueprint as rrb
 
     # From the side, a little above: the picture in docs/frames.md.
     eye = rrb.EyeControls3D(position=(-0.05, -0.5, 0.26), look_target=(-0.03, 0.0, 0.1), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
-        origin="/simulation",
-        contents=["/simulation/pourer/**", "/simulation/receiver/**", "/simulation/liquid"],
-        name="Simulated pour: in the pourer, falling, received, spilled",
+        origin=f"{under}/simulation",
+        contents=[f"{under}/simulation/{what}" for what in ("pourer/**", "receiver/**", "liquid")],
+        name=name,
         background=BACKGROUND,
         eye_controls=eye,
         line_grid=rrb.LineGrid3D(visible=False),
@@ -138,12 +162,10 @@ def _weight() -> Any:
     )
 
 
-def _weighed_pour() -> Any:
+def _weighed_pour(under: str = "", name: str = "Pour: spilled [g], weighed and simulated") -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TimeSeriesView(
-        origin="/balance/pour", name="Pour: spilled [g], weighed and simulated", plot_legend=rrb.Corner2D.LeftTop
-    )
+    return rrb.TimeSeriesView(origin=f"{under}/balance/pour", name=name, plot_legend=rrb.Corner2D.LeftTop)
 
 
 def _loss(place: str, name: str) -> Any:
@@ -175,13 +197,14 @@ def _machine() -> Any:
     )
 
 
-def _status() -> Any:
+def _status(under: str = "") -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(origin="/status", name="What is going on")
+    return rrb.TextDocumentView(origin=f"{under}/status", name="What is going on")
 
 
 def _log() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TextLogView(origin="/log", name="Events and decisions")
+    columns = rrb.TextLogColumns(text_log_columns=[rrb.encodings.TextLogColumn("Body")], timeline_columns=[])
+    return rrb.TextLogView(origin="/log", name="Events and decisions", columns=columns)

@@ -67,7 +67,8 @@ def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence
     """
     return [
         *(rerun_program(), "--serve-web", "--bind", address, "--port", str(port), "--web-viewer-port", str(web_port)),
-        *("--server-memory-limit", memory, "--newest-first", *shown),
+        # Not with --newest-first: the viewer in the browser (0.41) stays empty then.
+        *("--server-memory-limit", memory, *shown),
     ]
 
 

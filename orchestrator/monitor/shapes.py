@@ -88,6 +88,7 @@ def bars(figure: ArmFigure, ends: FloatArray) -> Any:
         colors=[METAL if i % 2 else (*rgb("#56b4e9"), 255) for i in range(len(figure.bars))],
         labels=[bar.name for bar in figure.bars],
         show_labels=False,
+        fill_mode="solid",
     )
 
 

@@ -21,6 +21,24 @@ from tests.orchestrator.late_viewer import seen, viewer
 from tests.orchestrator.recorded import Contents
 from tests.patience import PATIENCE
 
+EXPECTED = (
+    ("/cell/receiver/mesh", "Mesh3D:vertex_positions"),
+    ("/cell/pourer/mesh", "Mesh3D:vertex_positions"),
+    ("/cell/path/planned", "LineStrips3D:strips"),
+    ("/cell/table", "Boxes3D:half_sizes"),
+    ("/simulation/receiver/mesh", "Mesh3D:vertex_positions"),
+    ("/simulation/liquid", "Points3D:class_ids"),
+    ("/balance/shown", "Scalars:scalars"),
+    ("/balance/verdict", "Scalars:scalars"),
+    ("/learning/narrow_cup/loss/predicted", "Scalars:scalars"),
+    ("/learning/narrow_cup/surrogate", "EncodedImage:blob"),
+    ("/learning/calibration/surrogate", "EncodedImage:blob"),
+    ("/machine/lanes/simulator_1", "StateChange:state"),
+    ("/machine/load/busy", "Scalars:scalars"),
+    ("/log/narrow_cup", "TextLog:text"),
+    ("/status", "TextDocument:text"),
+)
+
 
 def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
     plan = watched.campaign()
@@ -31,8 +49,12 @@ def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
         for event in watched.events(plan):
             monitor(event)
         with viewer(live.stream, tmp_path / "seen.rrd"):
-            contents = seen(tmp_path / "seen.rrd", lambda c: c.rows("/learning/narrow_cup/loss/measured") == 3)
-        assert contents.values("/simulation/receiver/mesh", "Mesh3D:vertex_positions")
+            contents = seen(
+                tmp_path / "seen.rrd",  # the newest comes first
+                lambda c: c.rows("/learning/narrow_cup/loss/measured") == 3 and c.rows("/simulation/liquid") == 62,
+            )
+        for entity, component in EXPECTED:
+            assert contents.values(entity, component), entity
         assert monitor.close(PATIENCE)
         with viewer(live.stream, tmp_path / "after.rrd"):
             seen(tmp_path / "after.rrd", lambda c: ["ended: finished"] in c.values("/log/campaign", "TextLog:text"))

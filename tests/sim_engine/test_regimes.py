@@ -55,7 +55,7 @@ def kinds(found: Regimes) -> set[str]:
 
 
 def ratio(first: FlowNumbers | None, second: FlowNumbers | None) -> dict[str, tuple[float, float]]:
-    """Of every number of two flows: smallest by smallest, largest by largest."""
+    """The ratio of every number of two flows: smallest by smallest, largest by largest."""
     assert first is not None
     assert second is not None
     pairs = {name: (getattr(first, name), getattr(second, name)) for name in NUMBERS}

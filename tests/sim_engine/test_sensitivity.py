@@ -34,7 +34,7 @@ NOISE = 0.01
 
 
 def analysed(curve: Any, *, points: int = 7, seeds: int = 5, noise: float = NOISE, seed: int = 1) -> Sensitivity:
-    """Of a spillage that is a function of the parameter, plus noise from seed to seed."""
+    """The analysis of a spillage that is a function of the parameter, plus noise from seed to seed."""
     rng = np.random.default_rng(seed)
     values = np.linspace(0.0, 1.0, points)
     samples = [curve(v) + noise * rng.standard_normal(seeds) for v in values]

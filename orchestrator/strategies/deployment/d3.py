@@ -198,7 +198,7 @@ class Hybrid(Deployment[D3Settings]):
 
     @property
     def _acquisition(self) -> AcquisitionName:
-        """Of the next pour."""
+        """What chooses the next pour."""
         if self._settings.adaptive and not self._compromise.exploring:
             return "least_loss"
         return "lcb" if self._pours or self._former else "posterior_minimum"

@@ -23,7 +23,7 @@ UNKNOWN = 0.1
 
 
 def play_of(actions: Space) -> tuple[Play, ...]:
-    """Of each searched dimension."""
+    """The play of each searched dimension."""
     return tuple(_play(axis) for axis in actions.axes)
 
 

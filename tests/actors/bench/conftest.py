@@ -157,7 +157,7 @@ class Stage:
         return 0.0 if len(joints) < 2 else float(np.max(np.ptp(joints, axis=0)))
 
     async def now(self) -> float:
-        """Of the controller [s]; it goes on counting when the controller's clock begins anew."""
+        """The controller's time [s]; it goes on counting when the controller's clock begins anew."""
         return self.unwrapped(float((await self._seen())["time"]))
 
     def unwrapped(self, clock: float) -> float:

@@ -16,7 +16,7 @@ from orchestrator.config.yaml.source import Document
 from tests.orchestrator.good_files import CAMPAIGN, CSV, RECORDED, report, write
 
 CPU_SECONDS = 3.0
-"""Of refusing any of them: a few times what it takes."""
+"""What refusing may take, for any of them: a few times what it takes."""
 
 TEXTS = {
     "maps in maps": ("a: " + "{a: " * 600 + "1" + "}" * 600, "bad.yaml:1:117: is nested more than 30 deep"),

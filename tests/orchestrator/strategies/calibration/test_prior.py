@@ -23,7 +23,7 @@ from tests.orchestrator.play import CALIBRATION_ACTIONS, Play, calibration_plan
 from tests.orchestrator.toys import calibration_spill, weighed
 
 SLOW = NormalPrior("angular_velocity", 30 * DEG, 10 * DEG)
-"""Of 15 … 120 deg/s: a deviation and a half above the lowest."""
+"""A prior on 15 … 120 deg/s: a deviation and a half above the lowest."""
 
 WRITTEN = "prior: {mean: 30 deg/s, deviation: 10 deg/s}"
 RANGE = "angular_velocity: [15 deg/s, 120 deg/s]"
@@ -34,7 +34,7 @@ WITH_PRIOR = CAMPAIGN.replace(RANGE, f"angular_velocity: {{range: [15 deg/s, 120
 
 
 def values(space: Space, name: str, count: int = 256, **arguments: Any) -> np.ndarray:
-    """Of one dimension of a sequence of actions."""
+    """Values of one dimension of a sequence of actions."""
     return np.array([space.decode(point)[name] for point in actions_of_prior(space, count, 7, **arguments)])
 
 
@@ -76,7 +76,7 @@ def calibration(**changes: Any) -> CalibrationPlan:
 
 
 def speeds(**changes: Any) -> tuple[list[float], list[float]]:
-    """Of all weighed and all simulated pours of a calibration [deg/s]."""
+    """Speeds of all weighed and all simulated pours of a calibration [deg/s]."""
     results: dict[str, Any] = {}
     for stage in calibration_stages(calibration(**changes))[:2]:
         played = Play(calibration_spill, weighed)(strategy := stage.build(results, 3))

@@ -216,7 +216,7 @@ BOX = Space((*PARAMETERS.axes, Axis("viscosity", 0.0, 1.0), Axis("friction", 0.0
 
 
 def spill_by_two(action, theta, rng):
-    """Of four searched parameters cohesion and friction matter."""
+    """A liquid to which of four searched parameters cohesion and friction matter."""
     u, v = unit(action, CALIBRATION_ACTIONS)
     return 0.2 * u + 0.1 * v + 5.0 * abs(theta.cohesion - 0.04) ** 1.5 + 0.8 * (theta.friction - 0.2) ** 2
 

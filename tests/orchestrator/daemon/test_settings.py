@@ -1,0 +1,58 @@
+"""The daemon's settings: strict, with places, and safe unless somebody says otherwise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.daemon.settings import Settings, load_settings
+
+LABORATORY = "{name: numbers, bench: {liquid: {particles: 400}}}\n"
+
+
+def load(folder: Path, text: str) -> Settings:
+    (folder / "left.yaml").write_text(LABORATORY)
+    (folder / "desk.yaml").write_text("{name: thinking}\n")
+    path = folder / "decant.yaml"
+    path.write_text(text)
+    return load_settings(path)
+
+
+def test_without_a_file_only_this_machine_is_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path))
+    found = load_settings(None)
+    assert (found.state, found.host, found.certificate, found.roots) == (tmp_path, "127.0.0.1", None, ())
+    assert [rig.name for rig in found.rigs] == ["virtual"]
+
+
+def test_a_file_says_what_is_different(tmp_path: Path) -> None:
+    found = load(
+        tmp_path,
+        "state: there\nrigs: {left: left.yaml}\nroots: [.]\nlisten: {port: 9, body: 2 MB}\n"
+        "recordings: {keep: 3, age: 2 days}\nkeep_free: 1 GB\n",
+    )
+    assert found.state == tmp_path / "there"
+    assert [(rig.name, rig.mode) for rig in found.rigs] == [("left", "virtual")]
+    assert (found.port, found.body_limit, found.keep_free) == (9, 2_000_000, 1_000_000_000)
+    assert (found.keep_recordings, found.recording_age) == (3, 172_800.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("listen: {host: 0.0.0.0}\n", "decant.yaml:1:16: listen.host: other machines reach this address"),
+        ("listen: {host: 0.0.0.0, tls: {key: left.yaml}}\n", "listen.tls: key 'certificate' is missing"),
+        ("prot: 3\n", "decant.yaml:1:1: prot: unknown key"),
+        ("rigs: {left: lefft.yaml}\n", "did you mean 'left.yaml'?"),
+        ("rigs: {left: desk.yaml}\n", "has no bench; campaigns that pour nothing need no rig"),
+        ("rigs: {desk: left.yaml}\n", "give the rig another name"),
+        ("roots: [nowhere]\n", "is not a folder"),
+        ("recordings: {age: 30}\n", "decant.yaml:1:19: recordings.age"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_place(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load(tmp_path, text)
+    assert said in str(refused.value)
