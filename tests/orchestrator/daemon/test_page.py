@@ -228,9 +228,9 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
 def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
     """An arm tells where it is many times a second; what else happens is seen all the same."""
     with on_port(tmp_path) as lab:
+        page.add_init_script("window.setInterval = () => 0")  # it also looks every few seconds, which would hide it
         page.goto(lab.address())
         page.get_by_text("Nothing runs here.").wait_for()
-        page.evaluate("window.setInterval = () => 0")
 
         async def chatter() -> None:
             key = await lab.served.submit()
@@ -242,7 +242,7 @@ def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
         page.locator(".step", has_text="tilting").wait_for()
         page.wait_for_timeout(300)
         lab.do(lab.served.post("/queue/pause"))
-        page.get_by_text("The queue is held").wait_for(timeout=4000)
+        page.get_by_text("The queue is held").wait_for()
         lab.sockets.clear()
 
 
