@@ -46,6 +46,7 @@ function told(type, data) {
   if (type === "QuestionAsked") announce("call", `A question: ${data.question.text}`);
   if (type === "Announced") announce("call", `In ${Math.round(data.seconds)} seconds: ${data.text}`);
   if (type === "CampaignRests") announce("say", `${data.campaign}: ${data.state}`);
+  if (type === "LogLine" && data.level === "error") alarm(data.text);
   if (type === "PourProgressed") { soon(700); return; }
   soon(150);
 }
@@ -53,6 +54,13 @@ function told(type, data) {
 function announce(where, text) {
   $(where).textContent = "";
   setTimeout(() => { $(where).textContent = text; }, 50); // a change is read out, what stood there is not
+}
+
+/** What must not be missed stands until somebody takes it away: an arm that did not confirm a stop, say. */
+function alarm(text) {
+  const line = el("p", {}, `${clock(Date.now() / 1000)} ${text} `, button(`read ${text}`, "Read", async () => line.remove(), "plain"));
+  $("alarms").append(line);
+  while ($("alarms").children.length > 5) $("alarms").firstChild.remove();
 }
 
 function link(stands, why = "") {
@@ -99,7 +107,7 @@ function showEmergency(emergency) {
   $("emergency").hidden = !emergency;
   draw($("emergency"), emergency, (latched) => latched && [
     el("h2", { id: "emergency-head" }, "Emergency stop"),
-    el("p", {}, `By ${latched.by} at ${clock(latched.time)}${latched.reason ? `: ${latched.reason}` : ""}. All arms are stopped, `,
+    el("p", {}, `By ${latched.by} at ${clock(latched.time)}${latched.reason ? `: ${latched.reason}` : ""}. All arms were told to stop, `,
       "and nothing begins before it is cleared. A pour that was under way is UNKNOWN: somebody will be asked about it."),
     el("details", {}, el("summary", {}, "Clear it"),
       el("p", {}, "Is nobody in the cell, and does nothing stand or hang where it should not?"),

@@ -171,6 +171,21 @@ def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page
         assert lab.do(lab.served.get("/status"))["emergency"] is None
 
 
+def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path: Path) -> None:
+    text = "the arm of north did not confirm that it was stopped (no answer): use its own button"
+    with on_port(tmp_path) as lab:
+        page.goto(lab.address(Role.VIEWER))
+        page.get_by_text("Nothing runs here.").wait_for()
+        wait_until(page, lambda: lab.served.daemon.feed.readers > 0)
+        lab.loop.call_soon_threadsafe(
+            lab.served.daemon.feed.tell, "LogLine", {"level": "error", "text": text, "stage": ""}
+        )
+        page.get_by_role("alert").get_by_text(text).wait_for()
+        assert page.evaluate(LEGIBLE) == []
+        page.get_by_role("button", name="Read").click()
+        page.get_by_text(text).wait_for(state="detached")
+
+
 def test_a_viewer_may_stop_everything_but_answers_nothing(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(**REFILL)) as lab:
         asked(lab)
