@@ -2,8 +2,10 @@
 
 A daemon of its own, on a bench of numbers at twice real time. Each time a campaign is stopped while its arm tilts:
 'pause' and 'stop' are measured until the daemon has taken note (they wait for the pour by intention), 'abort' and the
-emergency stop until the arm has confirmed that it stands. Saturated: twice as many busy processes as cores, and 200
-readers of all events. Run from the project's root: python -m benchmarks.daemon_stops [--times N] > stops.json
+emergency stop until the arm has confirmed that it stands. Saturated: a busy process for each core beside all
+that, and 200 readers of all events. Run from the project's root:
+
+    python -m benchmarks.daemon_stops [--times N] > stops.json
 """
 
 from __future__ import annotations
@@ -95,9 +97,9 @@ def await_(happened: Any) -> Any:
 
 @contextlib.contextmanager
 def saturated(client: Client, folder: Path) -> Iterator[None]:
-    """Every core has twice as much to do as it can, and many watch."""
+    """Every core has more to do than it can, and many watch."""
     token = next(line.split()[2] for line in (folder / "state/tokens").read_text().splitlines() if "viewer" in line)
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
     busy.append(subprocess.Popen([sys.executable, "-c", READER, client.url, token, str(READERS)]))
     try:
         await_(lambda: _readers(client) >= READERS)
@@ -144,6 +146,8 @@ def warm(client: Client, text: str) -> float:
             client.post(f"/campaigns/{key}/stop")
             await_(lambda: client.get(f"/campaigns/{key}")["state"] in ("stopped", "finished"))
             return float(told.data["time"]) - begin
+        if told.type == "CampaignRests" and told.data["campaign"] == key:
+            raise AssertionError(f"it came to nothing: {told.data['reason']}")
     raise AssertionError("unreachable")
 
 

@@ -2,7 +2,7 @@
 
     python benchmarks/dyna.py [--worlds right half ...] [--problem spill2] [--arms fixed priced ...] [--seeds 30]
                               [--first 0] [--simulation 1.5] [--slots 2] [--pour 90] [--pours 15] [--prior 37]
-                              [--no-trust] [--json]
+                              [--model scaled] [--no-trust] [--json]
 
 Toy worlds (`optimiser_problems.py`, and simulators that know them more or less as in `hybrid_models.py`) behind the
 real strategy, scheduler, journal and optimiser, in one process, on a clock that leaves waiting out
@@ -80,7 +80,13 @@ TRUST = TrustSettings()
 def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
     """What is compared."""
     trust = "always" if asked.no_trust else TRUST
-    settings = D3Settings(pours=asked.pours, prior_simulations=asked.prior, per_pour="free", trust=trust)
+    settings = D3Settings(
+        pours=asked.pours,
+        prior_simulations=asked.prior,
+        per_pour="free",
+        model=asked.model,
+        trust=None if asked.model == "adaptive" else trust,
+    )
     free, prices = DeploymentPlan(settings, (SCENE,), space, Loss()), PricesSettings(pour=asked.pour)
     return {
         "D2": replace(free, settings=D2Settings(pours=asked.pours)),
@@ -252,6 +258,7 @@ def main() -> None:
     parser.add_argument("--pour", type=float, default=90.0)
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--prior", type=int, default=37)
+    parser.add_argument("--model", choices=["adaptive", "residual", "pooled", "scaled"], default="scaled")
     parser.add_argument("--no-trust", action="store_true", help="never fall back on pours alone")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()

@@ -68,12 +68,13 @@ LEVELS: dict[str, Wrong] = {
 class Valley:
     """One seed's world: what is lost on the bench, and what its simulator says."""
 
-    def __init__(self, level: str, seed: int) -> None:
+    def __init__(self, level: str, seed: int, bench: int | None = None) -> None:
         """Draw.
 
         Args:
             level: of `LEVELS`.
             seed: its remainder by four is the shape.
+            bench: seed of the errors' signs, the same for all receivers on a bench; None: the seed's own.
         """
         self.shape = list(SHAPES)[seed % len(SHAPES)]
         self.space, self._wrong = SHAPES[self.shape], LEVELS[level]
@@ -84,6 +85,8 @@ class Valley:
         self._signs = rng.choice([-1.0, 1.0], 4)
         self._bumps = rng.standard_normal((6, 4))
         self._noise = rng.standard_normal(64)
+        if bench is not None:
+            self._signs = np.random.default_rng([bench, 20261122]).choice([-1.0, 1.0], 4)
 
     def true(self, unit: Floats) -> float:
         """What is lost on the bench at a point of the unit cube (dimension,), without scatter."""

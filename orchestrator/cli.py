@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb, view
+from orchestrator.commands import bench_verbs, daemon_verbs, report, runs_verbs, simulate_verb, vessel_verb, view
 from orchestrator.commands.options import (
     Answer,
     Arm,
@@ -307,6 +307,7 @@ def physics(
 
 
 daemon_verbs.register(app)
+vessel_verb.register(app)
 
 
 def main() -> None:

@@ -16,6 +16,8 @@ EXTRAS = {
     "prometheus_client": "daemon",
     "pythonjsonlogger": "daemon",
     "uvicorn": "daemon",
+    "manifold3d": "vessels",
+    "skimage": "vessels",
     "pandas": "tables",
     "pyarrow": "tables",
 }

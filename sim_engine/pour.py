@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sim_engine.backend import Backend
 from sim_engine.calm import calm_until, liquid_velocity
@@ -67,6 +66,8 @@ def inside_mask(vessel: Vessel) -> NDArray[np.uint8]:
 
     The cavity, continued into the wall up to its middle: a particle that leans on the wall stays inside.
     """
+    from scipy import ndimage  # brings a third of a second of imports, for those who only check a motion
+
     solid = vessel.grid.values <= 0.0
     nearest = ndimage.distance_transform_edt(solid, return_distances=False, return_indices=True)
     return np.ascontiguousarray(vessel.grid.cavity[tuple(nearest)].astype(np.uint8))
@@ -93,7 +94,6 @@ class PourSimulator:
         """
         if spec not in self._vessels:
             self._vessels[spec] = build_vessel(spec)
-            self._masks[spec] = inside_mask(self._vessels[spec])
         return self._vessels[spec]
 
     def prepare(self, task: PourTask) -> Motion:
@@ -246,6 +246,8 @@ class PourSimulator:
         if key not in self._planes:
             if len(self._planes) >= PLANES_KEPT:
                 self._planes.pop(next(iter(self._planes)))
+            if spec not in self._masks:
+                self._masks[spec] = inside_mask(vessel)
             self._planes[key] = equivalent_distance(vessel.grid, self._masks[spec], vessel.rim_height, support)
         return SolidWalls(vessel.grid, self._planes[key], self._masks[spec], vessel.wall_thickness, vessel.rim_height)
 

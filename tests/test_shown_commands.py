@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from typer.testing import CliRunner
 from orchestrator.cli import app
 from orchestrator.commands import speaking
 from tests.shown_commands import PAGES, REASONS, ROOT, TESTED, Block, arguments_of, blocks_of, write_scratch
+
+QUICKSTART = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 
@@ -66,6 +69,22 @@ def test_a_block_is_executed_or_says_what_it_needs(block: Block) -> None:
     assert set(reasons) <= set(REASONS), f"{block.place}: '{block.needs}' is not a known need\n{HOW}"
     assert block.test or not TESTED & set(reasons), f"{block.place}: name the test that runs it instead\n{HOW}"
     assert not block.test or (ROOT / block.test).is_file(), f"{block.place}: {block.test} is not there\n{HOW}"
+
+
+def test_the_campaign_that_is_told_is_the_shipped_one() -> None:
+    told = (ROOT / "docs" / "from-yaml-to-report.md").read_text(encoding="utf-8")
+    shipped = [line.partition(" #")[0].rstrip() for line in QUICKSTART.read_text(encoding="utf-8").splitlines()]
+    lines = [line for block in re.findall(r"```yaml\n(.*?)```", told, re.DOTALL) for line in block.splitlines()]
+    assert len(lines) > 12
+    assert [line for line in lines if line not in shipped] == []
+
+
+def test_the_downloads_are_reports_that_need_nothing_beside_them() -> None:
+    pages = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs" / "reports").glob("*.html"))]
+    assert len(pages) == 2
+    for page in pages:
+        assert not re.search(r'(?:src|href)="(?!data:)', page)
+        assert "VIRTUAL" in page
 
 
 def test_pages_show_commands_of_both_kinds() -> None:

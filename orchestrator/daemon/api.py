@@ -28,6 +28,7 @@ _ERRORS: dict[int | str, dict[str, Any]] = {
         409: "Not now: the detail says why.",
         413: "Too large.",
         421: "Called by a name that this machine does not have.",
+        422: "What was sent can't be used; the detail says what is wrong, where, and what would be right.",
         429: "Too many wrong tokens from this address.",
     }.items()
 }

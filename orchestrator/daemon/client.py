@@ -56,7 +56,7 @@ class Client:
         token = token or os.environ.get("DECANT_TOKEN") or _token(state)
         self._http = httpx.Client(
             base_url=self.url, headers={"Authorization": f"Bearer {token}"}, timeout=TIMEOUT, trust_env=False,
-            verify=os.environ.get("DECANT_CA") or True,
+            verify=self.url.startswith("https") and (os.environ.get("DECANT_CA") or True),
         )  # fmt: skip
 
     def __enter__(self) -> Client:

@@ -1,6 +1,6 @@
 """Everything that happens, in order and numbered, for whoever watches: from now on, or from where they left off.
 
-Readers wait for nothing that they have not asked for and keep nobody waiting: each has a place in the sequence and
+Readers wait for nothing that they have not asked for and keep nobody waiting: each has seen so much of the sequence and
 takes from there what is still kept. One that is too slow is told how much it has missed.
 """
 
@@ -145,16 +145,16 @@ class Feed:
         Args:
             after: the last one that was seen; None: only what comes from now on.
             campaign: only what belongs to it.
-            beat: after so long without news [s] None comes in their place.
+            beat: after so long without news [s] None comes instead.
         """
-        place = self.last if after is None else min(after, self.last)
+        seen = self.last if after is None else min(after, self.last)
         self.readers += 1
         try:
             while self._db is not None:
                 news = self._news
-                found = self._after(place)
+                found = self._after(seen)
                 for sent in found:
-                    place = sent.id
+                    seen = sent.id
                     if campaign is None or sent.campaign == campaign:
                         yield sent
                 if not found:
@@ -166,17 +166,17 @@ class Feed:
         finally:
             self.readers -= 1
 
-    def _after(self, place: int) -> list[Sent]:
-        """The next few events behind a place."""
-        if self._ring and place + 1 >= self._ring[0].id:
+    def _after(self, seen: int) -> list[Sent]:
+        """The next few events behind a number."""
+        if self._ring and seen + 1 >= self._ring[0].id:
             # Numbers in the ring have no gaps.
-            begin = place + 1 - self._ring[0].id
+            begin = seen + 1 - self._ring[0].id
             return [self._ring[i] for i in range(begin, min(begin + _BATCH, len(self._ring)))]
         self.flush()
         if self._db is None:
             return []
         rows = self._db.execute(
-            "select id, t, campaign, type, data from event where id > ? order by id limit ?", [place, _BATCH]
+            "select id, t, campaign, type, data from event where id > ? order by id limit ?", [seen, _BATCH]
         )
         found = [Sent(*row) for row in rows]
         return found or ([self._ring[0]] if self._ring else [])

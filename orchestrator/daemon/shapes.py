@@ -67,7 +67,8 @@ class ReasonIn(_In):
 class ProblemOut(_Out):
     """What is wrong, where, and what would be right."""
 
-    detail: str
+    detail: str | list[dict[str, Any]]
+    """In words; a list where fields of the request are not what they should be."""
 
 
 class HealthOut(_Out):

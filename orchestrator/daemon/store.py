@@ -23,7 +23,7 @@ FORMAT = 1
 _SCHEMA = """
 create table campaign (
     id text primary key, name text not null, verb text not null, rig text not null, mode text not null,
-    priority integer not null, place real not null, state text not null, wish text not null, reason text not null,
+    priority integer not null, rank real not null, state text not null, wish text not null, reason text not null,
     by text not null, created real not null, begun real, ended real, run text, armed integer not null,
     answers text not null check (json_valid(answers))
 ) strict;
@@ -78,7 +78,7 @@ class Item:
         rig: that it leases; 'desk' where it pours nothing.
         mode: of that rig: 'virtual', 'hardware' or 'none'.
         priority: higher ones come first.
-        place: among those of one priority, the smallest first.
+        rank: among those of one priority, the smallest first.
         state: of the run (`orchestrator.states`), or 'stopped', 'withdrawn'.
         wish: what people want.
         reason: of the state, in words.
@@ -93,7 +93,7 @@ class Item:
     rig: str
     mode: str
     priority: int
-    place: float
+    rank: float
     state: str
     wish: str
     reason: str
@@ -224,15 +224,15 @@ class Store:
         rows = self._db.execute(
             f"select * from campaign {where} order by "
             f"case when state = 'queued' then 1 when state in ({_quoted(AT_REST)}) then 2 else 0 end, "
-            "case when state = 'queued' then -priority else 0 end, case when state = 'queued' then place else 0 end, "
+            "case when state = 'queued' then -priority else 0 end, case when state = 'queued' then rank else 0 end, "
             "created desc limit ?",
             [*wanted, limit],
         )
         return [_item(row) for row in rows]
 
-    def last_place(self) -> float:
-        """The largest place in the queue; 0 in an empty one."""
-        return float(self._db.execute("select coalesce(max(place), 0) from campaign").fetchone()[0])
+    def last_rank(self) -> float:
+        """The largest rank so far; 0 before the first campaign."""
+        return float(self._db.execute("select coalesce(max(rank), 0) from campaign").fetchone()[0])
 
     def counts(self) -> dict[str, int]:
         """How many campaigns there are in each state."""

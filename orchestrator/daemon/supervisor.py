@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import secrets
+import shutil
 import time
 from dataclasses import replace
 from typing import Any
@@ -26,7 +27,7 @@ from orchestrator.daemon.running import Common, Running
 from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
 from orchestrator.errors import RunError
-from orchestrator.lanes import PourUnknownError
+from orchestrator.lanes import LaneError, PourUnknownError
 from orchestrator.monitor.live import LiveView
 from orchestrator.reserve import MB, free_space
 from orchestrator.unknown import OperatorNeededError
@@ -64,12 +65,15 @@ class Supervisor:
         self.problems: dict[str, str] = {}
         self.words: dict[str, Counts] = {}
         self.stopping = False
+        self.suspect = False
+        """Whether the simulators may be past mending: they are started anew when nobody uses them."""
         self.ended = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
         self.began = time.time()
 
     async def start(self) -> None:
         """Take up what was left, and begin."""
+        await asyncio.to_thread(self._forget_half_submitted, {item.id for item in self.store.items(limit=1_000_000)})
         for item in self.store.items():
             if item.state not in AT_REST:
                 found = f"found {item.state} after the daemon had ended without a word"
@@ -80,6 +84,12 @@ class Supervisor:
         if self.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         self.feed.tell("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})
+
+    def _forget_half_submitted(self, known: set[str]) -> None:
+        """Snapshots of campaigns that were being checked when the daemon died: nobody was told that they are queued."""
+        for folder in self.settings.snapshots.iterdir():
+            if folder.name not in known:
+                shutil.rmtree(folder, ignore_errors=True)
 
     async def _warm_up(self) -> None:
         try:
@@ -123,7 +133,7 @@ class Supervisor:
             RefusedError: nothing new is taken.
         """
         self.refuse_new_work()
-        item = replace(item, place=self.store.last_place() + 1.0, created=time.time())
+        item = replace(item, rank=self.store.last_rank() + 1.0, created=time.time())
         self.store.add(item)
         self.note(item.by, "submit", item.id)
         self.wake()
@@ -164,9 +174,9 @@ class Supervisor:
             if at is None:
                 raise RefusedError(f"{before} is not in the queue")
             level = queue[at].priority if queue else item.priority
-            behind = queue[at].place if queue else 1.0
-            ahead = queue[at - 1].place if at > 0 and queue[at - 1].priority == level else behind - 2.0
-            self.store.change(item.id, priority=level, place=0.5 * (ahead + behind))
+            behind = queue[at].rank if queue else 1.0
+            ahead = queue[at - 1].rank if at > 0 and queue[at - 1].priority == level else behind - 2.0
+            self.store.change(item.id, priority=level, rank=0.5 * (ahead + behind))
         self.note(by, "move", item.id)
         self.wake()
         return self.item(item.id)
@@ -390,6 +400,9 @@ class Lane:
         self.running = running = Running(self._common, item, self.rig)
         store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), armed=False)
         feed.tell("CampaignLeased", {"rig": self.rig.name}, item.id)
+        if self._daemon.suspect and not any(one.running for one in self._daemon.lanes.values() if one is not self):
+            self._daemon.suspect = False
+            await self._common.warm.close()
         state, reason, wish = "failed", "", Wish.PAUSE
         result: CampaignResult | None = None
         try:
@@ -406,6 +419,7 @@ class Lane:
             state, reason, wish = "unknown", str(error), self._kept_wish(item)
         except (RunError, LaboratoryError, ConfigError, OSError) as error:
             needs_person = getattr(error, "exit_code", 1) == 3
+            self._daemon.suspect |= isinstance(error, LaboratoryError | LaneError)
             state, reason = ("paused" if needs_person else "failed"), str(error)
         except Exception as error:
             state, reason = "failed", f"{type(error).__name__}: {error}"

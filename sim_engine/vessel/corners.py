@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
 
 from sim_engine.vessel.sdf import SignedDistanceGrid
 
@@ -37,6 +36,8 @@ def _convolved(values: Floats, kernel: Floats) -> Floats:
     Returns:
         (a − k + 1, b − k + 1, c − k + 1).
     """
+    from scipy import fft
+
     shape = tuple(fft.next_fast_len(n + k - 1, real=True) for n, k in zip(values.shape, kernel.shape, strict=True))
     product = fft.rfftn(values, shape) * fft.rfftn(kernel, shape)
     inside = tuple(slice(k - 1, n) for n, k in zip(values.shape, kernel.shape, strict=True))
@@ -59,6 +60,8 @@ def equivalent_distance(
     Returns:
         Shape of the grid [m].
     """
+    from scipy import ndimage
+
     step = grid.spacing
     reach = int(np.ceil(support / step))
     z = grid.axes()[2]

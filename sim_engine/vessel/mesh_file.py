@@ -69,7 +69,7 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
     loaded.update_faces(loaded.nondegenerate_faces())
     _check_closed(loaded, shape.path)
     scale = _scale(float(np.max(loaded.extents)), shape)
-    vertices = np.asarray(loaded.vertices, dtype=float) @ _to_z(shape.up).T * scale
+    vertices = np.asarray(loaded.vertices, dtype=float) @ to_z(shape.up).T * scale
     return vertices, np.asarray(loaded.faces, dtype=np.int64)
 
 
@@ -122,7 +122,7 @@ def _likely(extent: float) -> str:
     return " or ".join(f"'{u}' ({1e3 * extent * UNITS[u]:.4g} mm)" for u in fitting) or "none of m, cm, mm, in fits"
 
 
-def _to_z(up: str) -> Floats:
+def to_z(up: str) -> Floats:
     """Rotation that turns an axis of the mesh, such as '-y', to z."""
     target = np.zeros(3)
     target["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0

@@ -156,11 +156,11 @@ def outer_profile(inner: Floats, wall: float, floor: float) -> Floats:
         within = (part >= 0.0) & (part <= 1.0) & (np.abs(rise) >= 1e-12)
         on = start[:, 0] + part * (end[:, 0] - start[:, 0])
         radius = np.maximum(radius, np.where(within, on, 0.0).max(axis=1))
-    curve = _simplify(np.column_stack([radius, levels]), 2e-6)
+    curve = simplified(np.column_stack([radius, levels]), 2e-6)
     return np.vstack([[curve[0, 0], -floor], curve])
 
 
-def _simplify(curve: Floats, tolerance: float) -> Floats:
+def simplified(curve: Floats, tolerance: float) -> Floats:
     """Douglas–Peucker: drop points that lie within a tolerance of the chord."""
     keep = np.zeros(len(curve), dtype=bool)
     keep[[0, -1]] = True

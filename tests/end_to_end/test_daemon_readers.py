@@ -3,74 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 
-from orchestrator.daemon.api import serve_app
-from orchestrator.daemon.auth import Role, Tokens, token_of
-from orchestrator.daemon.client import Client
-from orchestrator.daemon.settings import Settings
-from orchestrator.daemon.supervisor import Supervisor
+from tests.end_to_end.daemon_thread import Real
 from tests.patience import PATIENCE
-
-
-class Real:
-    """A daemon in a thread, with a socket that anybody on this machine can reach."""
-
-    def __init__(self, state: Path) -> None:
-        self.settings = Settings(state, in_process=True, keep_free=0, quick_start=False)
-        state.mkdir(exist_ok=True)
-        self.tokens = Tokens(self.settings.tokens)
-        self.socket = socket.socket()
-        self.socket.bind(("127.0.0.1", 0))
-        self.url = f"http://127.0.0.1:{self.socket.getsockname()[1]}"
-        self.up = threading.Event()
-        self.thread = threading.Thread(target=lambda: asyncio.run(self.work()))
-        self.thread.start()
-        assert self.up.wait(PATIENCE)
-
-    async def work(self) -> None:
-        self.daemon = Supervisor(self.settings)
-        app = serve_app(self.daemon, self.tokens, lambda: None)
-        self.server = uvicorn.Server(
-            uvicorn.Config(app, log_config=None, lifespan="off", timeout_graceful_shutdown=1, access_log=False)
-        )
-        self.server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign, assignment]
-        self.loop = asyncio.get_running_loop()
-        await self.daemon.start()
-        serving = asyncio.create_task(self.server.serve([self.socket]))
-        while not self.server.started:
-            await asyncio.sleep(0.01)
-        self.up.set()
-        await serving
-        await self.daemon.close()
-
-    def tell(self, count: int, size: int = 10) -> None:
-        async def tell() -> None:
-            for number in range(count):
-                self.daemon.feed.tell("LogLine", {"level": "info", "text": f"{number} " + "x" * size})
-                if number % 100 == 0:
-                    await asyncio.sleep(0)
-
-        asyncio.run_coroutine_threadsafe(tell(), self.loop).result(PATIENCE)
-
-    def client(self) -> Client:
-        return Client(self.url, self.settings.state)
-
-    def token(self) -> str:
-        return token_of(self.settings.tokens, Role.VIEWER) or ""
-
-    def close(self) -> None:
-        self.server.should_exit = True
-        self.thread.join(PATIENCE)
 
 
 @pytest.fixture

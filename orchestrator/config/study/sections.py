@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
-
-from pydantic import Field, create_model
+from typing import ClassVar
 
 from orchestrator.config.laboratory.sections import HiddenLiquid, LaboratoryFile
 from orchestrator.config.load import load_campaign
 from orchestrator.config.motion import Parameters, ParametersBase
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
+from orchestrator.config.study.arms import CalibrationsSection, DeploymentsSection
 from orchestrator.config.study.resolve import bench_of, calibration_arms, deployment_arms, levels_of, written_levels
 from orchestrator.config.yaml.dump import as_file
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import MADE, Count, Name, PathOr, PositiveCount, Section, Text
+from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
-from orchestrator.strategies.calibration.c1 import C1Settings
-from orchestrator.strategies.calibration.c2 import C2Settings
-from orchestrator.strategies.calibration.c3 import C3Settings
-from orchestrator.strategies.calibration.c4 import C4Settings
-from orchestrator.strategies.deployment.d1 import D1Settings
-from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from orchestrator.strategies.doors import calibrations, deployments
-from orchestrator.strategies.settings import StrategySettings
-from orchestrator.study.plan import StudyPlan
+from orchestrator.study.plan import ALL, StudyPlan
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
 
@@ -53,109 +42,6 @@ class LevelSection(Section):
 
     pose_noise: PoseNoiseSection = PoseNoiseSection()
     """Its scatter, drawn anew for each pour."""
-
-
-class ArmSection(Section):
-    """A strategy that is compared: how often, and what it may spend."""
-
-    required: ClassVar[dict[str, str]] = {"repetitions": "10"}
-
-    repetitions: PositiveCount | None = None
-    """How often it is run: a calibration each time on pours of its own, a deployment into each receiver."""
-
-    def changes(self) -> dict[str, Any]:
-        """Settings of the strategy that are given here."""
-        own = type(self).model_fields.keys() - ArmSection.model_fields.keys()
-        return {name: value for name in own if (value := getattr(self, name)) is not None}
-
-
-def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
-    """The section of an arm: some of its strategy's settings, none of which has to be given but the required ones."""
-    fields: Any = {}
-    for key in keys:
-        info = settings.model_fields[key]
-        value: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
-        fields[key] = (value | None, Field(None, description=info.description))
-    name = f"{settings.model_fields['strategy'].default}ArmSection"
-    model = create_model(name, __base__=ArmSection, __doc__=ArmSection.__doc__, **fields)
-    model.required = ArmSection.required | required
-    model.variant = settings.model_fields["strategy"].default
-    return model
-
-
-C1Arm: Any = _arm(C1Settings, "per_axis", per_axis="10")
-C2Arm: Any = _arm(C2Settings, "samples", samples="18")
-C3Arm: Any = _arm(C3Settings, "iterations", "initial", "kappa", iterations="59")
-C4Arm: Any = _arm(C4Settings, "simulations", "initial", "kappa", simulations="108")
-D2Arm: Any = _arm(D2Settings, "pours", "mean", "initial", "kappa", pours="15")
-
-
-class D1ArmSection(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
-    """A strategy that is compared: how often, and what it may spend."""
-
-    iterations: list[PositiveCount] = Field(default=[15])
-    """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
-
-
-class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
-    """A strategy that is compared: how often, and what it may spend."""
-
-    per_pour: Count | None = None
-    """Simulations told between two pours; not 'free', for then the clock would decide what is asked for."""
-
-
-class CalibrationsBase(Section):
-    """The calibrations that are compared."""
-
-    C1: C1Arm | None = None
-    """Uniform grid."""
-
-    C2: C2Arm | None = None
-    """Stratified sampling."""
-
-    C3: C3Arm | None = None
-    """Bayesian optimisation, each θ on all training pours."""
-
-    C4: C4Arm | None = None
-    """Bayesian optimisation, one simulation an iteration; its θ* are what D1 and D3 simulate with."""
-
-    C4_paper: C4Arm | None = None
-    """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""
-
-
-class DeploymentsBase(Section):
-    """The deployments that are compared, into each of the base campaign's receivers."""
-
-    D1: D1ArmSection | None = None
-    """Plan in simulation, pour once."""
-
-    D2: D2Arm | None = None
-    """Learn on real pours."""
-
-    D2_paper: D2Arm | None = None
-    """D2 as in the paper: a surrogate with a zero mean."""
-
-    D3: D3ArmSection | None = None
-    """Real pours with a simulated prior, the campaign's model of it and check of trust."""
-
-    D3_paper: D3ArmSection | None = None
-    """D3 as in the paper: a GP of the residual around the simulations' mean, always trusted."""
-
-
-def _with_others(base: type[Section], installed: Mapping[str, type[StrategySettings]]) -> Any:
-    """The section with a key for each strategy that a package adds; its settings are those of the strategy."""
-    fields: Any = {}
-    for name, settings in installed.items():
-        if name not in base.model_fields:
-            own = settings.model_fields.keys() - {"strategy"}
-            meaning = settings.model_fields["strategy"].description
-            fields[name] = (_arm(settings, *sorted(own)) | None, Field(None, description=meaning))
-    name = base.__name__.replace("Base", "Section")
-    return create_model(name, __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields)
-
-
-CalibrationsSection: Any = _with_others(CalibrationsBase, calibrations())
-DeploymentsSection: Any = _with_others(DeploymentsBase, deployments())
 
 
 class StudyFile(Section):
@@ -196,7 +82,10 @@ class StudyFile(Section):
     name."""
 
     compared: Text | None = None
-    """Level at which C1 to C4 are compared; the first unless given. C4 is run at all levels, for D1 and D3."""
+    """Level at which C1 to C4 are compared, or 'all'; the first unless given. C4 is run at all levels."""
+
+    random_baseline: Count = 0
+    """Random parameters that each calibration is scored beside."""
 
     calibration: CalibrationsSection | None = None
     """The calibrations."""
@@ -253,8 +142,8 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     levels = levels_of(written, base.laboratory.name, bench)
     names = tuple(level.name for level in levels)
     compared = file.compared or (names[0] if names else "")
-    if names and compared not in names:
-        report.add(root.at("compared"), f"no such level; there are {', '.join(names)}")
+    if names and compared not in (*names, ALL):
+        report.add(root.at("compared"), f"no such level; there are {', '.join(names)}, and all")
     if (
         file.calibration is None
         and file.deployment is None
@@ -269,7 +158,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         parameter_prior=tuple(prior for prior in calibration.parameter_prior if prior.name in searched.names),
         pour_count=0,
         holdout=0,
-        random_baseline=0,
+        random_baseline=file.random_baseline,
         fixed_parameters={
             name: value for name, value in base.parameters.model_dump().items() if name not in searched.names
         },

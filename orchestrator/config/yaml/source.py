@@ -7,6 +7,7 @@ key, tag and merge is to be reported at once and with its place.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,12 @@ class Mark:
     inline: bool
 
 
+@lru_cache(maxsize=64)
+def _known(text: str, path: Path) -> Document:
+    """Vessels and laboratories are named by many files. Nobody changes a document once it has been read."""
+    return Document.parse(text, path)
+
+
 @dataclass
 class Document:
     """One YAML file.
@@ -64,7 +71,7 @@ class Document:
             ConfigError: it can't be read, is not YAML, or is empty.
         """
         try:
-            return cls.parse(read_text(path), path)
+            return _known(read_text(path), path)
         except UnreadableError as error:
             raise ConfigError([Problem(path, 0, 0, "", str(error))]) from None
 

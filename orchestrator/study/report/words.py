@@ -29,11 +29,10 @@ def plain_words(shown: Sequence[Table]) -> list[str]:
 def _sentence(compared: str, of: str, level: str, receiver: str, difference: Estimate, better: str) -> str:
     first, _, second = compared.partition(" − ")
     into = {ALL: ", over all receivers", "—": ""}.get(receiver, f", into {receiver}")
-    where = f"At {level} mismatch{into}, {of}"
-    size = difference.text().lstrip("-−").replace("[", "[difference ", 1)
+    where = f"At {level} mismatch{into}, {of}{' pours' if of[-1:].isdigit() else ''}"
+    size = f"{compared}: {difference.text()}, better in {better}"
     if math.isnan(difference.low):
-        return f"{where}: {first} − {second} is {difference.text()}; there are too few repetitions for an interval."
+        return f"{where}: there are too few repetitions for an interval ({size})."
     if difference.low <= 0.0 <= difference.high:
-        return f"{where}: nothing tells {first} from {second} ({size}, better in {better})."
-    word = "better" if difference.high < 0.0 else "worse"
-    return f"{where}: {first} is {word} than {second} by {size}, better in {better} repetitions."
+        return f"{where}: nothing tells {first} from {second} ({size})."
+    return f"{where}: {first} is {'better' if difference.high < 0.0 else 'worse'} than {second} ({size})."

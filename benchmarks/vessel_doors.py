@@ -1,0 +1,140 @@
+"""How well `decant vessel` does: shipped vessels through each of its doors, with the errors of real tools.
+
+Writes the table of docs/vessels.md. Run from the project's root: python benchmarks/vessel_doors.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from orchestrator.commands.vessel import Sources, vessel
+from orchestrator.config.load import load_vessel
+from sim_engine.action import DEG, Action
+from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.pour import PourSimulator
+from sim_engine.task import PourTask, Scene
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.spec import VesselSpec
+from sim_engine.vessel.vessel import Vessel
+from tests.measured import Bench
+
+NAMES = ("beaker", "tumbler", "cone", "bowl", "narrow")
+PAGE = Path("docs/vessels.md")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One vessel through one door."""
+
+    vessel: str
+    door: str
+    profile: float
+    largest: float
+    capacity: float
+    spillage: tuple[float, float]
+
+
+def doors(of: Bench, folder: Path) -> dict[str, Sources]:
+    """What is given for each."""
+    tall, wall, floor = f"{of.height} m", f"{of.shape.wall} m", f"{of.shape.floor} m"
+    outside = f"{of.height + of.shape.floor} m"
+    diameters = of.diameters(6)
+    fill, tilt = of.fill(folder / "fill.csv"), of.tilt(folder / "tilt.csv")
+    photo = of.photo(folder / "side.png")
+    of.solid().export(folder / "scan.stl")
+    return {
+        "callipers": Sources(height=tall, diameters=diameters, wall=wall, floor=floor),
+        "photograph": Sources(photo=photo, known_height=outside, wall=wall, floor=floor),
+        "points": Sources(points=of.save_cloud(folder / "cloud.csv"), unit="mm", wall=wall, floor=floor),
+        "fill table": Sources(height=tall, fill=fill, wall=wall, floor=floor),
+        "tilt table": Sources(height=tall, tilt=tilt, wall=wall, floor=floor),
+        "all tables and callipers": Sources(
+            height=tall, diameters=diameters, fill=fill, tilt=tilt, wall=wall, floor=floor
+        ),
+        "mesh": Sources(mesh=folder / "scan.stl"),
+    }
+
+
+def profile_of(built: Vessel, z: np.ndarray) -> np.ndarray:
+    """Inner radius at heights above the inner floor, mean over the directions [m]."""
+    found = [
+        np.interp(z, curve[1:, 2] - built.inner_floor, np.hypot(curve[1:, 0], curve[1:, 1]))
+        for curve in built.meridians[::12]
+    ]
+    return np.asarray(np.mean(found, axis=0))
+
+
+def spillages(receiver: VesselSpec, simulator: PourSimulator, seeds: int) -> tuple[float, float]:
+    """Spilled share of two pours into it from the shipped beaker."""
+    beaker = load_vessel(Path("configs/vessels/beaker.yaml"))
+    scene = Scene("pour", beaker, receiver, Liquid(mass=0.2))
+    found = []
+    for speed, offset in ((40.0, 0.075), (90.0, 0.085)):
+        action = Action(angular_velocity=speed * DEG, max_angle=120.0 * DEG, x_offset=offset, height=0.09)
+        outcomes = [
+            simulator.simulate(PourTask(scene, action, SimulationParameters(particles=1000), seed)).outcome.fractions
+            for seed in range(seeds)
+        ]
+        found.append(float(np.mean([outcome.spilled / outcome.poured for outcome in outcomes])))
+    return found[0], found[1]
+
+
+def measure(seeds: int) -> list[Row]:
+    """All vessels through all doors."""
+    rows, simulator = [], PourSimulator()
+    for name in NAMES:
+        of = Bench(load_vessel(Path(f"configs/vessels/{name}.yaml")))
+        z = np.linspace(0.02, 0.99, 200) * of.height
+        true = of.radius(z)
+        right = spillages(of.spec, simulator, seeds)
+        with tempfile.TemporaryDirectory() as scratch:
+            for number, (door, sources) in enumerate(doors(of, Path(scratch)).items()):
+                out = Path(scratch) / f"{number}.yaml"
+                vessel(out, sources, name=None, as_json=False)
+                spec = load_vessel(out)
+                built = build_vessel(spec, use_cache=False)
+                off = np.abs(profile_of(built, z) - true)
+                spilled = spillages(spec, simulator, seeds)
+                rows.append(
+                    Row(
+                        name,
+                        door,
+                        float(off.mean()),
+                        float(off.max()),
+                        built.capacity / of.vessel.capacity - 1.0,
+                        (spilled[0] - right[0], spilled[1] - right[1]),
+                    )
+                )
+                print(rows[-1], flush=True)
+    return rows
+
+
+def main() -> None:
+    """Measure, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=4, help="of each simulated pour")
+    asked = parser.parse_args()
+    lines = [
+        "| vessel | door | profile, mean / largest [mm] | capacity [%] | spillage of two pours |",
+        "|---|---|---|---|---|",
+    ]
+    for row in measure(asked.seeds):
+        lines.append(
+            f"| {row.vessel} | {row.door} | {1e3 * row.profile:.2f} / {1e3 * row.largest:.2f} | "
+            f"{100 * row.capacity:+.1f} | {row.spillage[0]:+.3f}, {row.spillage[1]:+.3f} |"
+        )
+    text = "\n".join(lines)
+    page = PAGE.read_text()
+    PAGE.write_text(
+        re.sub(r"(<!-- doors -->\n).*?(<!-- end of doors -->)", lambda m: f"{m[1]}{text}\n{m[2]}", page, flags=re.S)
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""What `decant vessel` reads: pairs of lengths, tables of two columns, points, a photograph."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError
+from orchestrator.config.yaml.quantities import QuantityError, parse_quantity
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sim_engine.vessel.spec import LengthUnit
+
+    Floats = NDArray[np.float64]
+
+LARGEST_FILE = 200_000_000
+"""Bytes of a file that is read whole."""
+
+MOST_ROWS = 10_000
+
+MOST_PIXELS = 60_000_000
+
+
+def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
+    """Heights and diameters of '5 mm: 60 mm, 95 mm: 72 mm' [m].
+
+    Raises:
+        RefusalError: a pair is not one, or lies outside of the vessel (exit code 2).
+    """
+    import numpy as np
+
+    heights, widths = [], []
+    for pair in filter(None, (part.strip() for part in text.split(","))):
+        at, colon, wide = pair.partition(":")
+        try:
+            if not colon:
+                raise QuantityError("should be a height and a diameter, such as '95 mm: 72 mm'")
+            heights.append(parse_quantity(at.strip(), "m", "95 mm"))
+            widths.append(parse_quantity(wide.strip(), "m", "72 mm"))
+        except QuantityError as error:
+            raise RefusalError(f"--diameters: '{pair}': {error}", BAD_INPUT) from None
+        if not 0.0 <= heights[-1] <= height + 1e-9:
+            raise RefusalError(
+                f"--diameters: '{pair}': that is not between the inner floor (0 mm) and the rim ({1e3 * height:g} mm)",
+                BAD_INPUT,
+            )
+        if not 0.0 < widths[-1] < 1.0:
+            raise RefusalError(f"--diameters: '{pair}': a diameter should be above 0 and below 1 m", BAD_INPUT)
+    if not heights:
+        raise RefusalError("--diameters: has no pair; write for example '5 mm: 60 mm, 95 mm: 72 mm'", BAD_INPUT)
+    return np.array(heights), np.array(widths)
+
+
+def read_table(path: Path, column: str, *, upper: float) -> tuple[Floats, Floats]:
+    """A column and the masses beside it [g].
+
+    Args:
+        column: 'level_mm' or 'tilt_deg'.
+        upper: largest value that it may have.
+
+    Raises:
+        RefusalError: with the file, the line, and what would be right (exit code 2).
+    """
+    import numpy as np
+
+    _check_size(path)
+    found: list[tuple[float, float]] = []
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        rows = csv.DictReader(file)
+        missing = [name for name in (column, "mass_g") if name not in (rows.fieldnames or ())]
+        if missing:
+            raise RefusalError(f"{path}:1: the column '{missing[0]}' is missing; write '{column},mass_g'", BAD_INPUT)
+        for row in rows:
+            at = f"{path}:{rows.line_num}"
+            try:
+                value, mass = float(row[column]), float(row["mass_g"])
+            except (TypeError, ValueError):
+                raise RefusalError(f"{at}: should be two numbers, {column} and mass_g", BAD_INPUT) from None
+            if not 0.0 < value <= upper * (1.0 + 1e-9):
+                raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}", BAD_INPUT)
+            if not 0.0 <= mass < 1e5:
+                raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0", BAD_INPUT)
+            found.append((value, mass))
+            if len(found) > MOST_ROWS:
+                raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows", BAD_INPUT)
+    if len(found) < 3:
+        raise RefusalError(f"{path}: has {len(found)} row(s); at least 3 say something about a shape", BAD_INPUT)
+    table = np.array(found)
+    return table[:, 0], table[:, 1]
+
+
+def read_points(path: Path, unit: LengthUnit | None, up: str) -> Floats:
+    """Points of a surface, z up, shape (n, 3) [m].
+
+    Raises:
+        RefusalError: they can't be read, or their unit is not clear (exit code 2).
+    """
+    import numpy as np
+
+    from sim_engine.vessel.errors import VesselError
+    from sim_engine.vessel.mesh_file import UNITS, to_z
+    from sim_engine.vessel.sources.mending import likely_unit
+
+    _check_size(path)
+    if up not in ("x", "y", "z", "-x", "-y", "-z"):
+        raise RefusalError(f"--up {up!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
+    try:
+        points = _loaded(path)
+    except Exception as error:  # readers raise whatever the broken byte led to
+        raise RefusalError(f"{path}: can't be read as points ({error})", BAD_INPUT) from None
+    if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points[:, :3]).all():
+        raise RefusalError(f"{path}: should have x, y, z in each row, all of them finite numbers", BAD_INPUT)
+    points = points[:, :3]
+    try:
+        scale = UNITS[unit or likely_unit(float(np.ptp(points, axis=0).max()), path)]
+    except VesselError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    result: Floats = points @ to_z(up).T * scale
+    return result
+
+
+def _loaded(path: Path) -> Any:
+    import numpy as np
+
+    if path.suffix.lower() == ".ply":
+        import trimesh
+
+        return np.asarray(trimesh.load(path, process=False).vertices, dtype=float)
+    if path.suffix.lower() == ".npy":
+        return np.load(path, allow_pickle=False).astype(float)
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    first = text.lstrip().split("\n", 1)[0]
+    comma = "," in first
+    header = any(character.isalpha() for character in first.replace("e", "").replace("E", ""))
+    return np.loadtxt(text.splitlines(), delimiter="," if comma else None, skiprows=int(header), ndmin=2)
+
+
+def read_photograph(path: Path) -> Floats:
+    """Brightness of a picture, rows from the top, shape (rows, columns).
+
+    Raises:
+        RefusalError: it is not a picture that can be read (exit code 2).
+    """
+    import numpy as np
+    from PIL import Image, UnidentifiedImageError
+
+    _check_size(path)
+    try:
+        with Image.open(path) as picture:
+            if picture.width * picture.height > MOST_PIXELS:
+                raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller", BAD_INPUT)
+            return np.asarray(picture.convert("L"), dtype=float)
+    except (UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
+
+
+def _check_size(path: Path) -> None:
+    if not path.is_file():
+        raise RefusalError(f"{path}: there is no such file", BAD_INPUT)
+    if (size := path.stat().st_size) > LARGEST_FILE:
+        raise RefusalError(f"{path}: {size / 1e6:.0f} MB; at most {LARGEST_FILE / 1e6:.0f} MB are read", BAD_INPUT)

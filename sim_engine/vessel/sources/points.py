@@ -1,0 +1,262 @@
+"""A vessel from points on its surface, as scanners and depth cameras give them.
+
+The axis is where the points of every height lie on circles about it best. Where points of both the inner and the outer
+surface were seen, they are told apart by their distance from it. A vessel that is not round becomes a mesh (`surface`).
+
+Limitations: seen from its axis every surface is met once at most (no handle, no bulge that hides another part), and the
+vessel stands roughly upright. Points of the table have to be cut away beforehand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.vessel.errors import VesselError
+from sim_engine.vessel.sources.evidence import Radii
+
+Floats = NDArray[np.float64]
+
+LEAST_POINTS = 300
+LAYERS = 40
+"""Heights at which circles are fitted."""
+
+FEW_POINTS, MOST_POINTS = 2_500, 12_000
+"""Points that the axis is looked for with, and with which it is found."""
+
+APART = 0.0012
+"""Two surfaces are told apart from this distance on [m]."""
+
+ROUND = 0.0006
+"""A vessel is round where its radius varies less than this around it [m], or less than its points scatter."""
+
+LEAST_DEVIATION = 5e-5
+"""No scanner is better than this [m]."""
+
+FOOT = 0.06
+"""Share of the height in which a floor, a foot or a rim is left out of the circles."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Points of one height.
+
+    Attributes:
+        z: mean height [m].
+        inner, outer: radius of each surface; None where it was not seen [m].
+        scatter: standard deviation of the points about it [m].
+        count: of points.
+    """
+
+    z: float
+    inner: float | None
+    outer: float | None
+    scatter: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Points about their axis.
+
+    Attributes:
+        points: z up, x = y = 0 on the axis, underside at z = 0, shape (n, 3) [m].
+        height: from the underside to the rim [m].
+        layers: from below.
+        scatter: of the points about the surface of revolution, median over the layers [m].
+        out_of_round: how much the radius varies around it, standard deviation [m].
+        seen: which surfaces.
+    """
+
+    points: Floats
+    height: float
+    layers: tuple[Layer, ...]
+    scatter: float
+    out_of_round: float
+    seen: Literal["inner", "outer", "both"]
+
+    @property
+    def round(self) -> bool:
+        """Whether it passes for a surface of revolution."""
+        return self.out_of_round <= max(ROUND, 0.5 * self.scatter)
+
+
+def scan_of(points: Floats, surface: Literal["auto", "inner", "outer"] = "auto") -> Scan:
+    """Find the axis and the surfaces of a cloud of points.
+
+    Args:
+        points: z up, shape (n, 3) [m].
+        surface: which one was seen; 'auto': both where there are two, else the outer one.
+
+    Raises:
+        VesselError: too few points, or no axis.
+    """
+    from scipy.optimize import minimize
+
+    if len(points) < LEAST_POINTS:
+        raise VesselError(f"{len(points)} points; a vessel needs at least {LEAST_POINTS}")
+    if not np.isfinite(points).all():
+        raise VesselError("some points are not finite numbers")
+    centred = points - [*(points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2.0, points[:, 2].min()]
+    chosen = centred[np.random.default_rng(0).permutation(len(centred))[:MOST_POINTS]]
+    few = chosen[:FEW_POINTS]
+    size = float(np.ptp(centred, axis=0).max())
+    extent = float(np.hypot(chosen[:, 0], chosen[:, 1]).max())
+
+    def spread(values: Floats, of: Floats) -> float:
+        """Mean scatter of the layers' radii, in shares of the size, after a shift and a lean."""
+        return _scatter(_moved(of, values, size)) / size
+
+    def sought(start: Any, of: Floats, step: float) -> Any:
+        simplex = np.vstack([start, np.asarray(start) + step * np.eye(4)])
+        options: Any = {"xatol": 1e-5, "fatol": 1e-8, "initial_simplex": simplex}
+        return minimize(spread, start, args=(of,), method="Nelder-Mead", options=options)
+
+    # a cloud from one side has its axis behind it: begin at several places
+    aside = 0.5 * extent / size
+    begins = ((0.0, 0.0), (-aside, 0.0), (aside, 0.0), (0.0, -aside), (0.0, aside))
+    tried = sorted((sought((x, y, 0.0, 0.0), few, 0.04) for x, y in begins), key=lambda each: float(each.fun))
+    polished = min((sought(each.x, chosen, 0.01) for each in tried[:2]), key=lambda each: float(each.fun))
+    moved = _moved(centred, polished.x, size)
+    low, high = _ends(moved, min(float(polished.fun) * size, ROUND))
+    moved = moved[(moved[:, 2] >= low - 0.1 * (high - low)) & (moved[:, 2] <= high + 0.1 * (high - low))]
+    moved[:, 2] -= low
+    layers, seen = _layers(moved, surface)
+    if len(layers) < LAYERS // 4:
+        raise VesselError("the points don't lie around an axis; is the vessel upright in them, and alone?")
+    if len(layers) < 0.75 * LAYERS and seen == "both":
+        raise VesselError(
+            f"inner and outer surface can be told apart at only {len(layers)} of {LAYERS} heights: cut a handle away, "
+            "or give the points of one surface"
+        )
+    scatter = float(np.median([layer.scatter for layer in layers]))
+    return Scan(moved, high - low, tuple(layers), scatter, _out_of_round(moved, layers), seen)
+
+
+def _moved(points: Floats, values: Floats, size: float) -> Floats:
+    """Shifted by values[:2] and leant by values[2:], both small; [size] and [rad]."""
+    x, y, lean_x, lean_y = values
+    axis = np.array([lean_x, lean_y, 1.0]) / np.sqrt(1.0 + lean_x**2 + lean_y**2)
+    first = np.cross([0.0, 1.0, 0.0], axis)
+    first /= np.linalg.norm(first)
+    moved: Floats = (points - [x * size, y * size, 0.0]) @ np.column_stack([first, np.cross(axis, first), axis])
+    return moved
+
+
+def _ends(points: Floats, scatter: float) -> tuple[float, float]:
+    """Heights of the underside and of the rim [m]: the outermost points themselves are those measured worst.
+
+    Args:
+        points: on their axis.
+        scatter: of a point, standard deviation [m].
+    """
+    found = []
+    for z in (points[:, 2], -points[:, 2]):
+        first, second = np.quantile(z, [0.01, 0.02])
+        flat = second - first < scatter  # many points at one height: these are the tail of a plane's
+        found.append(float(2.0 * first - second + (1.7 * scatter if flat else 0.0)))
+    return found[0], -found[1]
+
+
+def _slices(points: Floats) -> list[Floats]:
+    ordered = points[np.argsort(points[:, 2])]
+    low, high = ordered[0, 2], ordered[-1, 2]
+    margin = FOOT * (high - low)
+    edges = np.linspace(low + margin, high - 0.5 * margin, LAYERS + 1)
+    return np.split(ordered, np.searchsorted(ordered[:, 2], edges))[1:-1]
+
+
+def _scatter(points: Floats) -> float:
+    found = [
+        np.std(part) * len(part)
+        for layer in _slices(points)
+        if len(layer) >= 6
+        for part in _halved(np.hypot(layer[:, 0], layer[:, 1]))
+    ]
+    return float(np.sum(found)) / len(points) if found else float("inf")
+
+
+def _halved(radii: Floats) -> list[Floats]:
+    """The radii of one or of two surfaces, none left out: cut at the widest gap, if there are enough on both sides."""
+    ordered = np.sort(radii)
+    least = max(len(ordered) // 8, 3)
+    gaps = np.diff(ordered)[least - 1 : len(ordered) - least]
+    if len(gaps) == 0 or gaps.max() < APART:
+        return [ordered]
+    return np.split(ordered, [least + int(np.argmax(gaps))])
+
+
+def surfaces(radii: Floats) -> list[Floats]:
+    """The radii of one or of two surfaces, from inside; what is farther out, or made of few points, is a handle."""
+    ordered = np.sort(radii)
+    parts = np.split(ordered, 1 + np.flatnonzero(np.diff(ordered) > APART))
+    return [part for part in parts if len(part) >= max(len(ordered) // 8, 3)][:2] or [ordered]
+
+
+def _layers(points: Floats, surface: str) -> tuple[list[Layer], Literal["inner", "outer", "both"]]:
+    found: list[Layer] = []
+    slices = [(part, surfaces(np.hypot(part[:, 0], part[:, 1]))) for part in _slices(points) if len(part) >= 6]
+    twice = sum(len(parts) == 2 for _, parts in slices) > len(slices) // 2 and surface == "auto"
+    for part, parts in slices:
+        if twice and len(parts) < 2:
+            continue
+        radii = [float(np.median(each)) for each in parts]
+        if not twice:
+            radii = [float(np.median(parts[0]))]
+        scatter = float(np.median([1.4826 * np.median(np.abs(each - np.median(each))) for each in parts]))
+        inner = radii[0] if twice or surface == "inner" else None
+        outer = radii[-1] if surface != "inner" else None
+        found.append(Layer(float(part[:, 2].mean()), inner, outer, scatter, len(part)))
+    return found, "both" if twice else "inner" if surface == "inner" else "outer"
+
+
+def _out_of_round(points: Floats, layers: list[Layer]) -> float:
+    """Standard deviation of the radius around the vessel, what is due to the points' own scatter taken off [m]."""
+    z = np.array([layer.z for layer in layers])
+    r = np.array([float((la.inner if la.outer is None else la.outer) or 0.0) for la in layers])
+    inside = (points[:, 2] >= z[0]) & (points[:, 2] <= z[-1])
+    radius = np.hypot(points[inside, 0], points[inside, 1])
+    offset = radius - np.interp(points[inside, 2], z, r)
+    near = np.abs(offset) < max(6.0 * float(np.median([layer.scatter for layer in layers])), 0.1 * r.mean())
+    if all(layer.inner is not None and layer.outer is not None for layer in layers):
+        walls = np.interp(points[inside, 2], z, [(la.outer or 0.0) - (la.inner or 0.0) for la in layers])
+        near = np.abs(offset) < walls / 2.0
+    angle = np.arctan2(points[inside, 1], points[inside, 0])[near]
+    place = np.floor((angle + np.pi) / (2.0 * np.pi) * 24.0).astype(int) % 24
+    means, errors = [], []
+    for sector in range(24):
+        part = offset[near][place == sector]
+        if len(part) >= 12:
+            means.append(float(part.mean()))
+            errors.append(float(part.var()) / len(part))
+    return float(np.sqrt(max(float(np.var(means) - np.mean(errors)), 0.0))) if len(means) >= 4 else 0.0
+
+
+def radii_of(scan: Scan, wall: float, floor: float) -> Radii:
+    """What a round scan says about the inner profile; of an outer surface the wall is taken off normal to it.
+
+    Args:
+        wall, floor: thickness [m]. Where the inner surface was seen the wall is not needed.
+    """
+    z = np.array([layer.z for layer in scan.layers])
+    if scan.seen == "outer":
+        outer = np.array([layer.outer for layer in scan.layers], dtype=float)
+        slope = np.gradient(outer, z)
+        inner = outer - wall * np.sqrt(1.0 + np.clip(slope, -3.0, 3.0) ** 2)
+    else:
+        inner = np.array([layer.inner for layer in scan.layers], dtype=float)
+    counts: Floats = np.array([layer.count for layer in scan.layers], dtype=float)
+    scatter = np.array([layer.scatter for layer in scan.layers])
+    deviations = np.hypot(scatter / np.sqrt(counts), max(LEAST_DEVIATION, 0.3 * scan.out_of_round))
+    below = 0.0 if scan.seen == "inner" else floor  # an inner surface begins at the inner floor
+    kept = (z >= below) & (inner > 0.0)
+    return Radii("points", z[kept] - below, inner[kept], deviations[kept])
+
+
+def wall_between(scan: Scan) -> float | None:
+    """Thickness of the wall where both surfaces were seen: median over the layers [m]."""
+    both = [la.outer - la.inner for la in scan.layers if la.inner is not None and la.outer is not None]
+    return float(np.median(both)) if both else None

@@ -1,0 +1,106 @@
+"""What somebody would measure of a turned vessel whose shape is known, with the errors of their tools."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFilter
+
+from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.profile import outer_profile
+from sim_engine.vessel.sources.evidence import held_when_tilted
+from sim_engine.vessel.sources.outline import volume_below
+from sim_engine.vessel.spec import ProfileShape, VesselSpec
+
+Floats = NDArray[np.float64]
+
+WATER = 998.0
+PIXELS_PER_MM = 6.0
+
+
+@dataclass
+class Bench:
+    """Somebody with tools beside a vessel."""
+
+    spec: VesselSpec
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        assert isinstance(self.spec.shape, ProfileShape)
+        self.shape = self.spec.shape
+        self.inner = np.array(self.shape.inner)
+        self.vessel = build_vessel(self.spec)
+        self.rng = np.random.default_rng(self.seed)
+
+    @property
+    def height(self) -> float:
+        return float(self.inner[-1, 1])
+
+    def radius(self, z: Floats) -> Floats:
+        return np.interp(z, self.inner[1:, 1], self.inner[1:, 0])
+
+    def diameters(self, count: int = 5) -> str:
+        heights = np.linspace(0.1, 1.0, count) * self.height
+        wide = 2.0 * (self.radius(heights) + self.rng.normal(0.0, 1e-4, count))
+        return ", ".join(f"{1e3 * z:.2f} mm: {1e3 * d:.2f} mm" for z, d in zip(heights, wide, strict=True))
+
+    def fill(self, path: Path) -> Path:
+        levels = np.linspace(0.1, 1.0, 10) * self.height
+        volumes = volume_below(self.inner[:, 1], self.inner[:, 0], levels)
+        masses = 1e3 * WATER * volumes + self.rng.normal(0.0, 0.3, 10)
+        return _table(path, "level_mm", 1e3 * levels, masses)
+
+    def tilt(self, path: Path) -> Path:
+        z = np.linspace(0.0, self.height, 300)
+        tilts = np.arange(15.0, 91.0, 7.5)
+        volumes = [held_when_tilted(z, self.radius(z), float(np.radians(t))) for t in tilts]
+        masses = np.maximum(1e3 * WATER * np.array(volumes) + self.rng.normal(0.0, 0.3, len(tilts)), 0.0)
+        return _table(path, "tilt_deg", tilts, masses)
+
+    def photo(self, path: Path, *, lean: float = 1.2, handle: bool = False) -> Path:
+        """Dark before a bright wall, a little out of level, blurred and noisy."""
+        outer = outer_profile(self.inner, self.shape.wall, self.shape.floor)
+        corners = [
+            (450.0 + side * PIXELS_PER_MM * 1e3 * r, 750.0 - PIXELS_PER_MM * 1e3 * (z + self.shape.floor))
+            for side, curve in ((1.0, outer), (-1.0, outer[::-1]))
+            for r, z in curve
+        ]
+        picture = Image.new("L", (900, 800), 230)
+        draw = ImageDraw.Draw(picture)
+        draw.polygon(corners, fill=60)
+        if handle:
+            draw.ellipse((650, 300, 840, 600), outline=60, width=40)
+        turned = picture.rotate(lean, resample=Image.Resampling.BICUBIC, fillcolor=230)
+        grey = np.asarray(turned.filter(ImageFilter.GaussianBlur(1.5)), float)
+        noisy = np.clip(grey + self.rng.normal(0.0, 6.0, grey.shape), 0, 255)
+        Image.fromarray(noisy.astype(np.uint8)).save(path)
+        return path
+
+    def solid(self) -> trimesh.Trimesh:
+        """Millimetres."""
+        return trimesh.Trimesh(1e3 * self.vessel.solid_vertices, self.vessel.solid_faces)
+
+    def cloud(self, count: int = 12_000, noise: float = 2e-4, *, hole: bool = False, seen: float = 2.0) -> Floats:
+        """Points of its surface [m], shifted and leaning; `hole`: a patch is missing; `seen`: of its width from −y."""
+        points, _ = trimesh.sample.sample_surface(self.solid(), count, seed=self.seed)
+        found = np.asarray(points) / 1e3
+        if hole:
+            found = found[~((found[:, 0] > 0.0) & (np.abs(found[:, 2] - 0.5 * self.height) < 0.15 * self.height))]
+        found = found[found[:, 1] < (seen - 1.0) * np.abs(found[:, 1]).max()]
+        turn = trimesh.transformations.rotation_matrix(0.02, [1.0, 0.5, 0.0])[:3, :3]
+        result: Floats = (found + self.rng.normal(0.0, noise, found.shape)) @ turn.T + [0.1, -0.2, 0.5]
+        return result
+
+    def save_cloud(self, path: Path) -> Path:
+        np.savetxt(path, 1e3 * self.cloud(), delimiter=",", header="x,y,z", comments="")
+        return path
+
+
+def _table(path: Path, column: str, values: Floats, masses: Floats) -> Path:
+    rows = np.column_stack([values, masses])
+    np.savetxt(path, rows, delimiter=",", header=f"{column},mass_g", comments="", fmt="%.2f")
+    return path

@@ -1,0 +1,182 @@
+"""`decant vessel`: shipped cups, measured with the errors of real tools, through every door."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from orchestrator.commands.speaking import RefusalError
+from orchestrator.commands.vessel import Sources, vessel
+from orchestrator.config.load import load_vessel
+from sim_engine.vessel.build import build_vessel
+from tests.measured import Bench
+
+VESSELS = Path("configs/vessels")
+
+
+def bench(name: str) -> Bench:
+    return Bench(load_vessel(VESSELS / f"{name}.yaml"))
+
+
+def made(tmp_path: Path, sources: Sources) -> float:
+    """Capacity of what is made, from its file [m³]."""
+    out = tmp_path / "made.yaml"
+    vessel(out, sources, name=None, as_json=False)
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    return build_vessel(load_vessel(out), use_cache=False).capacity
+
+
+Door = Callable[[Bench, Path], Sources]
+
+
+def callipers(of: Bench, folder: Path) -> Sources:
+    return Sources(height=f"{of.height} m", diameters=of.diameters(), wall=f"{of.shape.wall} m")
+
+
+def fill(of: Bench, folder: Path) -> Sources:
+    return Sources(height=f"{of.height} m", fill=of.fill(folder / "fill.csv"), wall="3 mm")
+
+
+def tilt(of: Bench, folder: Path) -> Sources:
+    return Sources(height=f"{of.height} m", tilt=of.tilt(folder / "tilt.csv"), wall="3 mm")
+
+
+def photo(of: Bench, folder: Path) -> Sources:
+    tall = of.height + of.shape.floor
+    wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
+    return Sources(photo=of.photo(folder / "side.png"), known_height=f"{tall} m", wall=wall, floor=floor)
+
+
+def points(of: Bench, folder: Path) -> Sources:
+    return Sources(points=of.save_cloud(folder / "cloud.csv"), unit="mm", floor=f"{of.shape.floor} m")
+
+
+def mesh(of: Bench, folder: Path) -> Sources:
+    of.solid().export(folder / "scan.stl")
+    return Sources(mesh=folder / "scan.stl")
+
+
+@pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("door", [callipers, fill, tilt, photo, points, mesh])
+def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
+    of = bench(name)
+    assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
+
+
+@pytest.mark.slow
+def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import json
+
+    of, deviations = bench("bowl"), []
+    for number, sources in enumerate(
+        (
+            fill(of, tmp_path),
+            tilt(of, tmp_path),
+            Sources(
+                height=f"{of.height} m",
+                fill=of.fill(tmp_path / "f.csv"),
+                tilt=of.tilt(tmp_path / "t.csv"),
+                diameters=of.diameters(),
+                wall="3 mm",
+            ),
+        )
+    ):
+        vessel(tmp_path / f"{number}.yaml", sources, name=None, as_json=True)
+        told = json.loads(capsys.readouterr().out)
+        deviations.append(told["capacity_deviation_mL"])
+        assert abs(told["capacity_mL"] - 1e6 * of.vessel.capacity) < 3.0 * told["capacity_deviation_mL"]
+    assert deviations[2] < min(deviations[:2])
+
+
+def test_a_brimful_cup_that_weighs_otherwise_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    of = bench("tumbler")
+    sources = callipers(of, tmp_path)
+    vessel(tmp_path / "right.yaml", Sources(**{**vars(sources), "brimful": "321 g"}), name=None, as_json=False)
+    assert "warning" not in capsys.readouterr().err
+    vessel(tmp_path / "wrong.yaml", Sources(**{**vars(sources), "brimful": "280 g"}), name=None, as_json=False)
+    assert "brimful it held 281 mL, and the shape has 322" in capsys.readouterr().err
+    assert "# Doubtful: brimful" in (tmp_path / "wrong.yaml").read_text()
+
+
+def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
+    of = bench("bowl")
+    sheet = trimesh.creation.revolve(1e3 * of.inner, sections=64)
+    sheet.update_faces(sheet.nondegenerate_faces())
+    keep = np.ones(len(sheet.faces), bool)
+    keep[len(keep) // 2 : len(keep) // 2 + 3] = False
+    sheet.update_faces(keep)
+    sheet.export(tmp_path / "sheet.stl")
+    with pytest.raises(RefusalError, match=r"a sheet without thickness.*--wall 3mm"):
+        made(tmp_path, Sources(mesh=tmp_path / "sheet.stl"))
+    capacity = made(tmp_path, Sources(mesh=tmp_path / "sheet.stl", wall="3 mm"))
+    assert capacity == pytest.approx(of.vessel.capacity, rel=0.02)
+
+
+def test_a_vessel_that_is_not_round_becomes_a_mesh(tmp_path: Path) -> None:
+    of = bench("tumbler")
+    oval = of.cloud(noise=1e-4) * [1.0, 0.8, 1.0]
+    np.savetxt(tmp_path / "oval.csv", 1e3 * oval, delimiter=",", header="x,y,z", comments="")
+    capacity = made(tmp_path, Sources(points=tmp_path / "oval.csv", unit="mm", floor="4 mm"))
+    assert load_vessel(tmp_path / "made.yaml").shape.kind == "mesh"
+    assert capacity == pytest.approx(0.8 * of.vessel.capacity, rel=0.04)
+
+
+def two_cups(of: Bench, folder: Path) -> Sources:
+    other = of.solid().apply_translation([300.0, 0.0, 0.0])
+    trimesh.util.concatenate([of.solid(), other]).export(folder / "two.stl")
+    return Sources(mesh=folder / "two.stl", unit="mm")
+
+
+def tiny(of: Bench, folder: Path) -> Sources:
+    of.solid().apply_scale(1e-6).export(folder / "tiny.stl")
+    return Sources(mesh=folder / "tiny.stl")
+
+
+def written(text: str) -> Door:
+    def door(of: Bench, folder: Path) -> Sources:
+        (folder / "fill.csv").write_text(text)
+        return Sources(height="100 mm", fill=folder / "fill.csv", wall="3 mm")
+
+    return door
+
+
+@pytest.mark.parametrize(
+    ("door", "said"),
+    [
+        (two_cups, r"2 bodies.*a vessel is one"),
+        (tiny, r"is a vessel's in no unit"),
+        (lambda of, folder: Sources(height="95 mm", wall="3 mm"), r"nothing says how wide"),
+        (lambda of, folder: Sources(diameters="5 mm: 60 mm", wall="3 mm"), r"how deep is it inside.*--height"),
+        (lambda of, folder: Sources(height="95 mm", diameters="5 mm: 60 mm"), r"how thick is the wall"),
+        (lambda of, folder: Sources(height="95", diameters="5 mm: 60 mm", wall="3 mm"), r"--height '95'.*no unit"),
+        (lambda of, folder: Sources(height="95 mm", diameters="120 mm: 60 mm", wall="3 mm"), r"not between the inner"),
+        (lambda of, folder: Sources(height="95 mm", diameters="60", wall="3 mm"), r"a height and a diameter"),
+        (lambda of, folder: Sources(photo=folder / "none.png", known_height="9 cm", wall="3 mm"), r"no such file"),
+        (lambda of, folder: Sources(photo=of.photo(folder / "p.png"), wall="3 mm"), r"one known outer length"),
+        (
+            lambda of, folder: Sources(photo=of.photo(folder / "p.png", handle=True), known_height="9 cm", wall="3 mm"),
+            r"not the same on both sides",
+        ),
+        (lambda of, folder: Sources(mesh=folder / "x.stl", tilt=folder / "t.csv"), r"--tilt goes with turned vessels"),
+        (written("level,mass\n1,2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
+        (written("level_mm,mass_g\n10,20\n20,x\n"), r"fill.csv:3: should be two numbers"),
+        (written("level_mm,mass_g\n10,20\n200,30\n"), r"fill.csv:3: level_mm is 200; should be .* at most 100"),
+        (written("level_mm,mass_g\n10,20\n"), r"at least 3"),
+    ],
+)
+def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, door: Door, said: str) -> None:
+    with pytest.raises(RefusalError, match=said) as refused:
+        vessel(tmp_path / "cup.yaml", door(bench("tumbler"), tmp_path), name=None, as_json=False)
+    assert refused.value.code == 2
+    assert not (tmp_path / "cup.yaml").exists()
+    assert not (tmp_path / "cup.stl").exists()
+
+
+def test_no_file_is_written_over(tmp_path: Path) -> None:
+    (tmp_path / "cup.yaml").write_text("name: cup\n")
+    with pytest.raises(RefusalError, match="exists already"):
+        vessel(tmp_path / "cup.yaml", Sources(), name=None, as_json=False)

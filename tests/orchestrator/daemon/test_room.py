@@ -1,0 +1,75 @@
+"""A disk that fills: nothing is begun, what is kept is limited, and nothing is lost."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from orchestrator.daemon import supervisor
+from orchestrator.daemon.retention import prune_recordings
+from orchestrator.daemon.settings import Settings
+from tests.orchestrator.daemon.served import run, serving
+
+
+def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = [700_000_000]
+    monkeypatch.setattr(supervisor, "free_space", lambda path: free[0])
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            served.daemon.settings.__dict__["keep_free"] = 800_000_000
+            key = await served.submit()
+            while not (await served.get("/status"))["problems"]:
+                pass
+            status = await served.get("/status")
+            assert "700 MB are free" in status["problems"][0]
+            assert "keep_free" in status["problems"][0]
+            assert (await served.get(f"/campaigns/{key}"))["state"] == "queued"
+            assert (await served.http.get("/readyz")).status_code == 503
+            free[0] = 900_000_000
+            served.daemon.wake()
+            await served.until(key, "finished")
+            assert (await served.get("/status"))["problems"] == []
+
+    run(work())
+
+
+def recorded(settings: Settings, name: str, age: float) -> Path:
+    path = settings.runs / name / "campaign.rrd"
+    path.parent.mkdir(parents=True)
+    for one in (path, path.with_name("journal.sqlite")):
+        one.write_bytes(b"x")
+    os.utime(path, (1e9 - age, 1e9 - age))
+    return path
+
+
+def test_recordings_are_kept_as_long_as_they_are_to_be_and_journals_always(tmp_path: Path) -> None:
+    settings = Settings(tmp_path, keep_recordings=2, recording_age=100.0)
+    new, newer, many, old = (recorded(settings, n, a) for n, a in (("a", 10), ("b", 5), ("c", 50), ("d", 200)))
+    assert prune_recordings(settings, busy={"d"}, now=1e9) == [many]
+    assert prune_recordings(settings, now=1e9) == [old]
+    assert new.exists()
+    assert newer.exists()
+    assert len(list(settings.runs.glob("*/journal.sqlite"))) == 4
+
+
+def test_all_recordings_are_kept_unless_somebody_says_otherwise(tmp_path: Path) -> None:
+    settings = Settings(tmp_path)
+    recorded(settings, "a", 1e8)
+    assert prune_recordings(settings, now=1e9) == []
+
+
+def test_a_snapshot_that_nobody_was_told_of_is_forgotten(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            await served.post("/queue/pause")
+            key = await served.submit()
+        (tmp_path / "state/campaigns/abc123/files").mkdir(parents=True)
+        async with serving(tmp_path):
+            assert [path.name for path in (tmp_path / "state/campaigns").iterdir()] == [key]
+
+    run(work())
