@@ -2,11 +2,11 @@
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper alarm adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--out FILE]
-                                  [--receivers]
+                                  [--receivers] [--write]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
-interrupted comparison goes on.
+interrupted comparison goes on; `--write` makes none, and puts the table of FILE into docs/optimiser.md.
 
 Primary questions, written before any of it was run. Seeds below 1000 are for tuning, those from 1000 on for answers;
 what is lost is without scatter, means over at least 20 seeds with 95 % bootstrap intervals:
@@ -63,6 +63,9 @@ NAMES = {
     "adaptive": "D3, `adaptive`",
 }
 GOOD, BAD = 0.01, 0.10
+PAGE = Path(__file__).parents[1] / "docs" / "optimiser.md"
+FEWEST = 20
+"""Seeds of a row on the page."""
 SCENE = Scene(
     "cup",
     cylinder("beaker", inner_radius=0.04, inner_height=0.1),
@@ -176,8 +179,8 @@ def interval(values: list[float]) -> tuple[float, float, float]:
     return float(np.mean(values)), means[50], means[1949]
 
 
-def table(runs: list[dict[str, Any]]) -> str:
-    """Markdown: a row for each level and arm."""
+def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
+    """Markdown: a row for each level and arm with that many seeds; D2 knows no simulator and has one row."""
     lines = [
         "| simulator | | mean of 15 pours | pours above 10 % after the first below 1 % | best of 3 | pours 4 to 15 "
         "| action in the end |",
@@ -186,16 +189,20 @@ def table(runs: list[dict[str, Any]]) -> str:
     for level in LEVELS:
         for arm, name in NAMES.items():
             found = [figures(run) for run in runs if (run["level"], run["arm"]) == (level, arm)]
-            if found:
+            if len(found) >= fewest:
                 cells = []
-                for key in found[0]:
+                for key in ("mean", "bad", "best of 3", "from the fourth", "reported"):
                     mean, low, high = interval([one[key] for one in found])
                     cells.append(f"{mean:.3f} ({low:.3f} … {high:.3f})")
-                order = [
-                    cells[list(found[0]).index(k)] for k in ("mean", "bad", "best of 3", "from the fourth", "reported")
-                ]
-                lines.append(f"| {level} | {name} | {' | '.join(order)} |")
+                lines.append(f"| {'any' if arm == 'D2' else level} | {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def write(text: str) -> None:
+    """Put a table into the page."""
+    begin, end = "<!-- measured: mismatch -->\n", "<!-- end of measured -->"
+    before, rest = PAGE.read_text().split(begin)
+    PAGE.write_text(f"{before}{begin}{text}\n{end}{rest.split(end, 1)[1]}")
 
 
 def main() -> None:
@@ -208,6 +215,7 @@ def main() -> None:
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--simulations", type=int, default=37)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/optimiser.md")
     parser.add_argument("--receivers", action="store_true", help="three receivers one after the other on one bench")
     asked = parser.parse_args()
     if asked.receivers:
@@ -218,7 +226,7 @@ def main() -> None:
     if asked.out is not None and asked.out.exists():
         runs = [json.loads(line) for line in asked.out.read_text().splitlines()]
     known = {(run["arm"], run["level"], run["seed"]) for run in runs}
-    for level in asked.levels:
+    for level in () if asked.write else asked.levels:
         for arm in asked.arms:
             for seed in range(asked.first, asked.first + asked.seeds):
                 if (arm, level, seed) in known:
@@ -229,7 +237,10 @@ def main() -> None:
                         file.write(json.dumps(runs[-1]) + "\n")
             print(f"{level}, {arm}: done", file=sys.stderr)
     seeds = range(asked.first, asked.first + asked.seeds)
-    print(table([run for run in runs if run["seed"] in seeds]))
+    found = table([run for run in runs if run["seed"] in seeds], FEWEST if asked.write else 1)
+    print(found)
+    if asked.write:
+        write(found)
 
 
 if __name__ == "__main__":

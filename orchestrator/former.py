@@ -94,7 +94,7 @@ def scenes_in(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     calibration, deployment = header.get("calibration") or {}, header.get("deployment") or {}
     if calibration:
         yield calibration["scene"]
-        yield from calibration.get("further", ())
+        yield from (*calibration.get("further", ()), *calibration.get("tested", ()))
     for records in (calibration.get("records"), calibration.get("transfer")):
         if records:
             yield records["scene"]

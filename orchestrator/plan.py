@@ -158,6 +158,7 @@ class CalibrationPlan(StagePlan):
         prior: dimensions along which g is not uniform.
         parameter_prior: searched parameters that were measured beforehand, each with its tolerance.
         further: scenes beside the first one, with other receivers, into which pours are made by turns.
+        tested: scenes that the pours kept for testing are made in; none: in the same.
         design: how the pours are chosen.
         design_simulations: made to choose them, where they are chosen actively.
         known: simulations that were made before, filled in when the calibration begins.
@@ -177,14 +178,20 @@ class CalibrationPlan(StagePlan):
     prior: tuple[NormalPrior, ...] = ()
     parameter_prior: tuple[NormalPrior, ...] = ()
     further: tuple[Scene, ...] = ()
+    tested: tuple[Scene, ...] = ()
     design: Design = "stratified"
     design_simulations: int = 0
     known: tuple[KnownSimulation, ...] = ()
 
     @property
     def scenes(self) -> tuple[Scene, ...]:
-        """All scenes that calibration pours are made in."""
+        """All scenes that calibration learns in."""
         return (self.scene, *self.further)
+
+    @property
+    def poured(self) -> tuple[Scene, ...]:
+        """All scenes that calibration pours are made in, those that only score it too."""
+        return (*self.scenes, *self.tested)
 
     @property
     def simulations(self) -> int:

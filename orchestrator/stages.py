@@ -71,7 +71,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     """
     found: list[Scene] = []
     if plan.calibration is not None:
-        found += plan.calibration.scenes
+        found += plan.calibration.poured
         found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
     if plan.deployment is not None:
         found += plan.deployment.scenes
@@ -105,7 +105,13 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
             if plan.design == "active":
                 return ActivePours(plan, deployment, seed)
             return DesignedPours(
-                plan.scenes, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints
+                plan.scenes,
+                plan.actions,
+                plan.pour_count,
+                plan.holdout,
+                seed,
+                constraints=plan.constraints,
+                tested=plan.tested,
             )
 
         stages.append(StageDefinition(POURS, pours, pours=True))
@@ -267,7 +273,7 @@ def calibrated_theta(results: Results) -> CalibratedTheta:
 
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
     """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
-    made, scenes = [], {scene.name: scene for scene in plan.scenes}
+    made, scenes = [], {scene.name: scene for scene in plan.poured}
     for pour in learnt_by(results, POURS, DesignPoured).measured if POURS in results else ():
         scene = scenes.get(pour.scene, plan.scene)
         action = scene.action(dict(pour.action_si))
@@ -277,8 +283,10 @@ def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
 
 
 def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSimulation, ...]:
-    """What the stage that made the pours has simulated in the calibration's scenes."""
-    simulated = learnt_by(results, POURS, DesignPoured).simulated if POURS in results else ()
+    """What the stage that made the pours has simulated in the calibration's scenes; what is known without one."""
+    if POURS not in results:
+        return plan.known
+    simulated = learnt_by(results, POURS, DesignPoured).simulated
     scenes = {scene.name: scene for scene in plan.scenes}
     return tuple(
         KnownSimulation(dict(one.theta), one.scene, scenes[one.scene].action(dict(one.action_si)), one.spillage)

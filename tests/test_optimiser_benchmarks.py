@@ -123,3 +123,30 @@ def test_the_table_of_models_is_of_the_campaigns_that_were_made(
             assert row[key] == pytest.approx(np.mean(values), abs=1e-3)
             assert row[f"{key}_error"] == pytest.approx(np.std(values, ddof=1) / 2**0.5, abs=1e-3)
             assert 0.0 <= row[key] <= 1.0
+
+
+def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    import mismatch
+
+    kept, page = tmp_path / "runs.jsonl", tmp_path / "page.md"
+    asked = ["--levels", "small", "--arms", "adaptive", "--first", "0", "--seeds", "1", "--pours", "3"]
+    monkeypatch.setattr(sys, "argv", ["mismatch.py", *asked, "--simulations", "8", "--out", str(kept)])
+    mismatch.main()
+    made = kept.read_text()
+    run = json.loads(made)
+    assert (run["level"], run["arm"], run["seed"], len(run["poured"])) == ("small", "adaptive", 0, 3)
+    monkeypatch.setattr(mismatch, "campaign", None)  # nothing is made again
+    mismatch.main()
+    page.write_text("before\n<!-- measured: mismatch -->\nold\n<!-- end of measured -->\nafter\n")
+    monkeypatch.setattr(mismatch, "PAGE", page)
+    monkeypatch.setattr(mismatch, "FEWEST", 1)
+    monkeypatch.setattr(sys, "argv", ["mismatch.py", "--first", "0", "--seeds", "1", "--out", str(kept), "--write"])
+    mismatch.main()
+    assert kept.read_text() == made
+    written = page.read_text()
+    assert f"| small | D3, `adaptive` | {np.mean(run['poured']):.3f} (" in written
+    assert "old" not in written
+    assert written.startswith("before")
+    assert written.endswith("after\n")

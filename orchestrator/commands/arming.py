@@ -89,7 +89,7 @@ def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> lis
     calibrating, deploying = _pouring(stages)
     cases: list[tuple[Scene, Action]] = []
     if plan.calibration is not None and calibrating:
-        for scene in plan.calibration.scenes:
+        for scene in plan.calibration.poured:
             cases += _from_all_over(scene, plan.calibration.actions, plan.calibration.constraints)
     if plan.deployment is not None and deploying:
         for scene in plan.deployment.scenes:

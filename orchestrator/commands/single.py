@@ -206,7 +206,7 @@ def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scen
     if plan.deployment is not None:
         scenes |= {scene.receiver.name: (scene, plan.deployment.actions) for scene in plan.deployment.scenes}
     if plan.calibration is not None:
-        scenes |= {scene.name: (scene, plan.calibration.actions) for scene in plan.calibration.scenes}
+        scenes |= {scene.name: (scene, plan.calibration.actions) for scene in plan.calibration.poured}
         if plan.calibration.transfer is not None:
             scenes["transfer"] = plan.calibration.transfer.scene, plan.calibration.actions
     if name is None:

@@ -227,7 +227,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
         for records in (plan.calibration.records, plan.calibration.transfer):
             if records is not None:
                 scenes[records.scene.name] = records.scene
-        scenes[plan.calibration.scene.name] = plan.calibration.scene
+        scenes.update({scene.name: scene for scene in plan.calibration.poured})
     if plan.deployment is not None:
         scenes.update({scene.name: scene for scene in plan.deployment.scenes})
     return scenes

@@ -14,7 +14,7 @@ from sim_engine.task import Scene
 def what_was_asked(plan: CampaignPlan) -> list[tuple[str, str]]:
     """Names and values: what is poured, how the simulator is calibrated, how pours are found."""
     found: list[tuple[str, str]] = []
-    scenes = (list(plan.calibration.scenes) if plan.calibration is not None else []) + (
+    scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
         list(plan.deployment.scenes) if plan.deployment is not None else []
     )
     if scenes:

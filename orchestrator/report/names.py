@@ -16,7 +16,7 @@ def receiver_names(plan: CampaignPlan) -> dict[str, str]:
         for known in (plan.calibration.records, plan.calibration.transfer):
             if known is not None:
                 names.setdefault(known.scene.name, known.scene.receiver.name)
-        for scene in plan.calibration.scenes:
+        for scene in plan.calibration.poured:
             names.setdefault(scene.name, scene.receiver.name)
     return names
 

@@ -21,10 +21,12 @@ from orchestrator.stages import (
     calibrated_theta,
     calibration_stages,
     deployment_stages,
+    known_simulations,
     measured_pours,
     stage_seed,
     with_posterior,
 )
+from orchestrator.strategies.calibration.active import ActivePours
 from orchestrator.strategies.calibration.c1 import C1Settings
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, draw_allowed, stratified
@@ -68,6 +70,10 @@ def _planned(study: StudyPlan, cell: Cell, load: Load, directory: Path) -> tuple
         on_unknown="repeat",
     )
     match cell.kind:
+        case "pours" if cell.arm:
+            arm = study.calibration(cell.arm)
+            wanted = study.deployments[0].plan if study.deployments else None
+            plan = replace(plan, calibration=replace(arm.plan, pour_count=arm.pours, holdout=0), deployment=wanted)
         case "grid" | "pours" if plan.calibration is not None:
             designed = replace(plan.calibration, pour_count=study.pour_count, holdout=study.holdout)
             plan = replace(plan, calibration=designed)
@@ -75,7 +81,7 @@ def _planned(study: StudyPlan, cell: Cell, load: Load, directory: Path) -> tuple
         case "grid":
             return plan, [StageDefinition(GRID, lambda results, seed: _table(study, seed))]
         case "pours":
-            return plan, [StageDefinition(POURS, lambda results, seed: _pours(study, seed), pours=True)]
+            return plan, [StageDefinition(POURS, lambda results, seed: _pours(study, plan, cell, seed), pours=True)]
         case "calibration":
             return _calibration(study, cell, plan, load, directory)
         case "uncalibrated":
@@ -115,24 +121,33 @@ def _table(study: StudyPlan, seed: int) -> Strategy:
     return SimulatedTable(plan.scene.name, _actions(study), thetas, seed)
 
 
-def _pours(study: StudyPlan, seed: int) -> Strategy:
-    plan = study.base.calibration
+def _pours(study: StudyPlan, campaign: CampaignPlan, cell: Cell, seed: int) -> Strategy:
+    plan = campaign.calibration
     assert plan is not None
+    if cell.arm:
+        return ActivePours(plan, campaign.deployment, seed)
     points = calibration_actions(study)
-    return DesignedPours(plan.scenes, plan.actions, len(points), study.holdout, seed, points=points)
+    return DesignedPours(plan.scenes, plan.actions, len(points), study.holdout, seed, points=points, tested=plan.tested)
 
 
 def _with_pours(study: StudyPlan, cell: Cell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
-    """The plan with the repetition's weighed pours as records."""
+    """The plan with the repetition's weighed pours as records; of an arm that has its own, those of the test split."""
     calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
     assert calibration is not None
     mass, pours = calibration.scene.liquid.mass, []
-    scenes = {scene.name: scene for scene in calibration.scenes}
-    for pour in learnt_by(load(cell.needs[0]), POURS, DesignPoured).measured:
+    scenes = {scene.name: scene for scene in calibration.poured}
+    own = study.calibration(cell.arm).pours if cell.arm else 0
+    weighed = learnt_by(load(cell.needs[0]), POURS, DesignPoured).measured
+    if own:
+        chosen = load(cell.needs[1])
+        weighed = (*learnt_by(chosen, POURS, DesignPoured).measured, *(p for p in weighed if p.split == "test"))
+        calibration = replace(calibration, known=known_simulations(calibration, chosen))
+    for pour in weighed:
         poured, scene = pour.poured * mass, scenes.get(pour.scene, calibration.scene)
         action, spilled = scene.action(dict(pour.action_si)), (pour.spillage or 0.0) * poured
         pours.append(RecordedPour(action, poured, spilled, mass - poured, pour.split, scene.name))
-    records = RecordSet(calibration.scene, tuple(pours), directory.parent / cell.needs[0] / JOURNAL_NAME)
+    source = cell.needs[1 if own else 0]
+    records = RecordSet(calibration.scene, tuple(pours), directory.parent / source / JOURNAL_NAME)
     return replace(plan, calibration=replace(calibration, records=records))
 
 

@@ -81,12 +81,14 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
             arms = [a for a in study.calibrations if number <= a.repetitions and level.name in a.levels]
             if arms:
                 pours = add("pours", 0, study.pour_count, **place)
-                if level.name == study.compared:
+                if study.compares(level.name):
                     add("uncalibrated", study.pour_count, 0, pours, **place)
             for arm in arms:
                 known = arm.plan.strategy == "C1"
                 spent = 0 if known else arm.plan.settings.simulations_on(train)
                 made_of = (pours, GRID) if known else (pours,)
+                if arm.pours:
+                    made_of = (pours, add("pours", arm.plan.design_simulations, arm.pours, **place, arm=arm.label))
                 add("calibration", spent + study.pour_count, 0, *made_of, **place, arm=arm.label)
             for deployment in (a for a in study.deployments if number <= a.repetitions):
                 plan = deployment.plan

@@ -10,6 +10,9 @@ from actors.bench.spec import VirtualBenchSpec
 from orchestrator.fingerprint import deciding, fingerprint
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 
+ALL = "all"
+"""In place of a level's name: calibrations are compared at all of them."""
+
 
 @dataclass(frozen=True)
 class Level:
@@ -31,12 +34,14 @@ class CalibrationArm:
     Attributes:
         label: the strategy; 'C4-paper' for C4 as in the paper.
         levels: names of the levels that it is run at.
+        pours: that it chooses itself, actively, in place of the repetition's; 0: it learns from those.
     """
 
     label: str
     plan: CalibrationPlan
     repetitions: int
     levels: tuple[str, ...]
+    pours: int = 0
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class StudyPlan:
         base: the campaign that all cells are made from, with the study's laboratory.
         pour_count: calibration pours of a repetition.
         holdout: how many of them are kept for testing.
-        compared: level at which C1 to C4 and the uncalibrated simulator are compared.
+        compared: level at which C1 to C4 and the uncalibrated simulator are compared; 'all': at all of them together.
         confirm: how often each deployment's recommended action is poured again.
         directory: in which the study has its folder.
     """
@@ -88,6 +93,10 @@ class StudyPlan:
     def level(self, name: str) -> Level:
         """A level by its name. Raises KeyError."""
         return {level.name: level for level in self.levels}[name]
+
+    def compares(self, level: str) -> bool:
+        """Whether calibrations are compared at a level."""
+        return self.compared in (ALL, level)
 
     def calibration(self, label: str) -> CalibrationArm:
         """The arm by its label. Raises KeyError."""

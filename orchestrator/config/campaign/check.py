@@ -272,7 +272,7 @@ def check_campaign(
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)
         if calibration.records is None:
-            for scene in calibration.scenes:
+            for scene in calibration.poured:
                 checker.reachable(calibration, scene, _Role("calibration", section))
         else:
             pours, at = calibration.records.pours, ("calibration", "pours")

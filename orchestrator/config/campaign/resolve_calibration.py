@@ -13,6 +13,7 @@ from orchestrator.config.yaml.source import Place
 from orchestrator.plan import CalibrationPlan, NormalPrior
 from orchestrator.strategies.doors import calibrations
 from sim_engine.space import Axis, Space
+from sim_engine.task import Scene
 
 DESIGN_SIMULATIONS = 64
 """Simulations of an active design unless a campaign says how many."""
@@ -67,11 +68,19 @@ def resolve_calibration(
     if further and from_file:
         text = "stands beside pours that are read 'from' a file, which were made into one; keep 'receiver'"
         report.add(place.at("receivers"), text, key=True)
+    tested: list[Scene | None] = []
+    for i, value in enumerate((None if pours is None else pours.holdout_receivers) or ()):
+        vessel = builder.references.vessel(value, at.at("holdout_receivers", i))
+        if vessel is not None and scene is not None:
+            name = f"calibration-{vessel.name}"
+            if name in {other.name for other in (*further, *tested) if other is not None}:
+                report.add(at.at("holdout_receivers", i), f"'{vessel.name}' is poured into already")
+            tested.append(builder.scene(name, pourer, vessel, motions, searched_actions, place))
     records = transfer = None
     count = holdout = 0
     if pours is not None and (from_file or from_run is not None):
         source = "a file" if from_file else "a run"
-        for key in ("count", "holdout", "design", "simulations"):
+        for key in ("count", "holdout", "holdout_receivers", "design", "simulations"):
             if at.at(key).loc in at.document.marks:
                 report.add(
                     at.at(key), f"belongs to pours that are still to be made; these are read 'from' {source}", key=True
@@ -86,7 +95,7 @@ def resolve_calibration(
         records, transfer = resolve_records(pours, at, builder, table, actions, scene, pourer, motions)
     elif from_run is not None:
         if scene is not None and actions is not None:
-            scenes = (scene, *(other for other in further if other is not None))
+            scenes = (scene, *(other for other in (*further, *tested) if other is not None))
             records = records_of_run(from_run, at.at("from_run"), scenes, actions, laboratory, report)
     elif pours is not None:
         if pours.simulations is not None and pours.design != "active":
@@ -130,6 +139,7 @@ def resolve_calibration(
         random_baseline=section.random_baseline,
         parameter_prior=known,
         further=others,
+        tested=tuple(scene for scene in tested if scene is not None),
         design="stratified" if pours is None else pours.design,
         design_simulations=(pours.simulations or DESIGN_SIMULATIONS) if pours is not None and active else 0,
     )

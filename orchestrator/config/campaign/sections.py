@@ -66,6 +66,9 @@ class PoursSection(Section):
     simulations: PositiveCount | None = None
     """active: simulations to learn from what pours would tell; 64 unless given."""
 
+    holdout_receivers: list[PathOr[VesselFile]] | None = None
+    """Receivers that those kept for testing go into, by turns: how well calibration carries over to other vessels."""
+
     source: FilePath | None = Field(default=None, alias="from")
     """CSV file of weighed pours; its column `split` says which are kept for testing."""
 

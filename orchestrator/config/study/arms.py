@@ -68,6 +68,20 @@ class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "ka
     """Simulations told between two pours; not 'free', for then the clock would decide what is asked for."""
 
 
+class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial", "kappa", simulations="108", pours="6")):  # type: ignore[misc]
+    """C4 on pours that it chooses itself, each by what it will tell about the deployments."""
+
+    pours: PositiveCount | None = None
+    """Training pours that it chooses; it is scored on the repetition's test pours."""
+
+    design_simulations: PositiveCount = 64
+    """Simulations to choose them with."""
+
+    def changes(self) -> dict[str, Any]:
+        """Settings of C4 that are given here."""
+        return {name: value for name, value in super().changes().items() if name in C4Settings.model_fields}
+
+
 class CalibrationsBase(Section):
     """The calibrations that are compared."""
 
@@ -85,6 +99,9 @@ class CalibrationsBase(Section):
 
     C4_paper: C4Arm | None = None
     """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""
+
+    C4_active: C4ActiveArmSection | None = None
+    """C4 on fewer pours that were chosen actively; compared, and used by nobody."""
 
 
 class DeploymentsBase(Section):

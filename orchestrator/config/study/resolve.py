@@ -13,7 +13,7 @@ from orchestrator.config.yaml.source import Place, Report
 from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from orchestrator.strategies.doors import calibrations, deployments
 from orchestrator.strategies.settings import Premises
-from orchestrator.study.plan import CalibrationArm, DeploymentArm, Level
+from orchestrator.study.plan import ALL, CalibrationArm, DeploymentArm, Level
 from sim_engine.task import PoseError
 
 if TYPE_CHECKING:
@@ -133,8 +133,11 @@ def calibration_arms(
             continue
         prior, known = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
         plan = replace(base, settings=settled, prior=prior, parameter_prior=known)
-        where = levels if written == "C4" else (compared,)
-        arms.append(CalibrationArm(_label(written), plan, arm.repetitions or 1, where))
+        own = getattr(arm, "pours", None) or 0  # only an arm that chooses its pours has the key
+        if own:
+            plan = replace(plan, design="active", design_simulations=arm.design_simulations)
+        where = levels if written == "C4" or compared == ALL else (compared,)
+        arms.append(CalibrationArm(_label(written), plan, arm.repetitions or 1, where, own))
     return tuple(arms)
 
 

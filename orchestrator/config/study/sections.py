@@ -21,7 +21,7 @@ from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
-from orchestrator.study.plan import StudyPlan
+from orchestrator.study.plan import ALL, StudyPlan
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Space
 
@@ -82,7 +82,10 @@ class StudyFile(Section):
     name."""
 
     compared: Text | None = None
-    """Level at which C1 to C4 are compared; the first unless given. C4 is run at all levels, for D1 and D3."""
+    """Level at which C1 to C4 are compared, or 'all'; the first unless given. C4 is run at all levels."""
+
+    random_baseline: Count = 0
+    """Random parameters that each calibration is scored beside."""
 
     calibration: CalibrationsSection | None = None
     """The calibrations."""
@@ -139,8 +142,8 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     levels = levels_of(written, base.laboratory.name, bench)
     names = tuple(level.name for level in levels)
     compared = file.compared or (names[0] if names else "")
-    if names and compared not in names:
-        report.add(root.at("compared"), f"no such level; there are {', '.join(names)}")
+    if names and compared not in (*names, ALL):
+        report.add(root.at("compared"), f"no such level; there are {', '.join(names)}, and all")
     if (
         file.calibration is None
         and file.deployment is None
@@ -155,7 +158,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         parameter_prior=tuple(prior for prior in calibration.parameter_prior if prior.name in searched.names),
         pour_count=0,
         holdout=0,
-        random_baseline=0,
+        random_baseline=file.random_baseline,
         fixed_parameters={
             name: value for name, value in base.parameters.model_dump().items() if name not in searched.names
         },

@@ -71,7 +71,15 @@ class ActivePours(DesignedPours):
 
     def __init__(self, plan: CalibrationPlan, deployment: DeploymentPlan | None, seed: int) -> None:
         """Plan; simulations of all scenes are queued."""
-        super().__init__(plan.scenes, plan.actions, plan.pour_count, plan.holdout, seed, constraints=plan.constraints)
+        super().__init__(
+            plan.scenes,
+            plan.actions,
+            plan.pour_count,
+            plan.holdout,
+            seed,
+            constraints=plan.constraints,
+            tested=plan.tested,
+        )
         self._plan = plan
         self._questions, self._trials = Questions(self._seeds), Trials()
         own = [(scene, plan.actions) for scene in plan.scenes]

@@ -29,7 +29,7 @@ def regression_discrepancy(
     from actors.optimizer.core.propose import propose
 
     usable = [pour for pour in train if pour.spillage is not None]
-    wanted = [pour for pour in test if pour.spillage is not None]
+    wanted = [pour for pour in test if pour.spillage is not None and contexts.knows(pour)]
     if len(usable) < 2 or not wanted:
         return None
     data = Data(tuple(contexts.point(pour) for pour in usable), tuple(_spillages(usable)))

@@ -36,6 +36,10 @@ class Contexts:
         """Those of a calibration."""
         return cls(plan.actions, plan.scenes)
 
+    def knows(self, pour: MeasuredPour) -> bool:
+        """Whether a pour was made in one of the scenes."""
+        return not pour.scene or pour.scene in self._names
+
     def point(self, pour: MeasuredPour) -> Point:
         """Where a weighed pour lies.
 

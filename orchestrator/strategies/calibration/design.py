@@ -217,6 +217,7 @@ class DesignedPours:
         *,
         points: Sequence[Point] | None = None,
         constraints: Sequence[Linear] = (),
+        tested: Sequence[Scene] = (),
     ) -> None:
         """Plan.
 
@@ -224,6 +225,7 @@ class DesignedPours:
             scenes: into which pours are made by turns, train and test each; at least one.
             points: the actions themselves, in the unit cube, in place of drawn ones: pours that are to be repeated.
             constraints: that the actions meet, if drawn.
+            tested: scenes of the pours that are kept for testing, by turns; none: the same.
         """
         self._actions = actions
         self._seeds = SeedStream(seed, "design")
@@ -232,11 +234,11 @@ class DesignedPours:
         else:
             strata = [Stratum(point, point) for point in points]
         kept = choose_holdout(strata, holdout, self._seeds.rng)
-        turns = {"train": 0, "test": 0}
+        turns, where = {"train": 0, "test": 0}, {"train": scenes, "test": tested or scenes}
         self._planned: list[_Planned] = []
         for i, stratum in enumerate(strata):
             split = "test" if i in kept else "train"
-            self._planned.append(_Planned(stratum, split, scenes[turns[split] % len(scenes)]))
+            self._planned.append(_Planned(stratum, split, where[split][turns[split] % len(where[split])]))
             turns[split] += 1
         self._region = region_of(actions, constraints if points is None else ())
         self._current = 0

@@ -47,9 +47,9 @@ class RiskLimitSettings(Section):
     probability: Annotated[float, Quantity("1", "5 %", 1e-3, 0.5)] = 0.05
     """With which a pour may lose more."""
 
-    otherwise: Otherwise = STOP
-    """Where no action keeps it. stop: the deployment ends; go on: the least risky one is poured; ask: the campaign
-    pauses with a question."""
+    otherwise: Otherwise = GO_ON
+    """Where no action keeps it, which is said before the pour. go on: the least risky one is poured; stop: the
+    deployment ends; ask: the campaign pauses with a question."""
 
 
 class StopSettings(Section):

@@ -130,7 +130,7 @@ class D3Settings(SearchSettings):
         return Rules(
             ignorance=self.ignorance or IgnoranceSettings(),
             limit=limit,
-            otherwise="stop" if self.risk_limit is None else self.risk_limit.otherwise,
+            otherwise="go on" if self.risk_limit is None else self.risk_limit.otherwise,
             gain_below=None if self.stop is None else worst * self.stop.gain_below,
             good_enough=None if self.good_enough is None else worst * self.good_enough,
         )

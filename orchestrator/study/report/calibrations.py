@@ -11,14 +11,14 @@ from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.report.drawing import Drawn, colour, legend, log_axis, look, strategy_of
-from orchestrator.study.report.gather import Found, Gathered, mean, running_least
+from orchestrator.study.report.gather import RANDOM, Found, Gathered, mean, running_least
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate
 
 
 def draw_calibrations(study: StudyPlan, found: Gathered) -> list[Drawn]:
     """The figures that what is there allows."""
     known = {name: one for name, one in found.calibrated.items() if any(one.test)}
-    strategies = {name: one for name, one in known.items() if name != UNCALIBRATED}
+    strategies = {name: one for name, one in known.items() if name not in (UNCALIBRATED, RANDOM)}
     drawn = [_boxes(known)] if known else []
     if strategies:
         drawn.append(_against_simulations(strategies))

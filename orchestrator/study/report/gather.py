@@ -12,10 +12,16 @@ from orchestrator.strategies.calibration.base import Calibrated
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.scorecard import CALIBRATED, UNCALIBRATED
 from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.study.cells import FINAL, Cell, cells_of
+from orchestrator.study.cells import FINAL, cells_of
 from orchestrator.study.folder import CellResult
 from orchestrator.study.plan import StudyPlan
 from orchestrator.study.strategies import FinalPoured
+
+RANDOM = "random θ"
+"""Label of the θ that a study draws at random, all together."""
+
+LEVEL = 100_000
+"""Apart lie the numbers of repetitions on different benches, where calibrations are compared on all of them."""
 
 
 @dataclass
@@ -98,7 +104,8 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
     """
     cells = cells_of(study)
     found = Gathered(cells=len(cells))
-    order = [UNCALIBRATED, *(arm.label for arm in study.calibrations)]
+    levels = [level.name for level in study.levels]
+    order = [UNCALIBRATED, RANDOM, *(arm.label for arm in study.calibrations)]
     receivers = {scene.name: scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes}
     for cell in cells:
         if cell.id not in results:
@@ -109,8 +116,11 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
         found.pours += data.pours
         found.cpu_s += data.cpu_s
         found.seconds += data.seconds
-        if cell.kind in ("calibration", "uncalibrated") and cell.level == study.compared:
-            _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Found()), cell, data)
+        if cell.kind in ("calibration", "uncalibrated") and study.compares(cell.level):
+            # a repetition's number counts once: on each of several benches it has a number of its own
+            number = cell.repetition + LEVEL * levels.index(cell.level)
+            _note_random(found.calibrated.setdefault(RANDOM, Found()), number, data)
+            _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Found()), number, data)
         elif cell.kind == "deployment":
             key = Key(cell.level, receivers[cell.receiver], cell.arm)
             found.losses.setdefault(key, []).append(_losses(data))
@@ -120,11 +130,30 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
             one = learnt_by(data.results, FINAL, FinalPoured)
             pour = Final(one.loss, one.spillage, one.made)
             found.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
-    found.calibrated = {name: found.calibrated[name] for name in order if name in found.calibrated}
+    found.calibrated = {
+        name: found.calibrated[name]
+        for name in order
+        if name in found.calibrated and (name != RANDOM or found.calibrated[name].test)
+    }
     return found
 
 
-def _note_calibration(noted: Found, cell: Cell, data: CellResult) -> None:
+def _note_random(noted: Found, number: int, data: CellResult) -> None:
+    """Random θ as if they were one arm: their differences together, where a cell scored them."""
+    pairs = [
+        (pair.split, abs(pair.measured - pair.simulated))
+        for pair in learnt_by(data.results, EVALUATION, Scores).pairs
+        if pair.theta.startswith("random ") and pair.measured is not None and pair.simulated is not None
+    ]
+    if not pairs:
+        return
+    noted.test.append([difference for split, difference in pairs if split == "test"])
+    noted.train.append([])
+    noted.numbers.append(number)
+    noted.simulations.append(0)
+
+
+def _note_calibration(noted: Found, number: int, data: CellResult) -> None:
     pairs = [
         (pair.split, abs(pair.measured - pair.simulated))
         for pair in learnt_by(data.results, EVALUATION, Scores).pairs
@@ -132,7 +161,7 @@ def _note_calibration(noted: Found, cell: Cell, data: CellResult) -> None:
     ]
     noted.test.append([difference for split, difference in pairs if split == "test"])
     noted.train.append([difference for split, difference in pairs if split == "train"])
-    noted.numbers.append(cell.repetition)
+    noted.numbers.append(number)
     result = learnt_by(data.results, CALIBRATION, Calibrated) if CALIBRATION in data.results else None
     noted.simulations.append(0 if result is None else result.simulations)
     if result is not None:

@@ -17,7 +17,7 @@ from orchestrator.study.report.deployments import checkpoints, loss_range, mean_
 from orchestrator.study.report.drawing import is_ours
 from orchestrator.study.report.effects import ALL, Effect, at_pour_of, effect, tests_of
 from orchestrator.study.report.finals import CAPTION, final_effects, final_rows
-from orchestrator.study.report.gather import Gathered, Key, at_pour, mean
+from orchestrator.study.report.gather import RANDOM, Gathered, Key, at_pour, mean
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate, statistic
 
 TABLE_POURS = (1, 3, 15)
@@ -101,7 +101,7 @@ def tables(study: StudyPlan, found: Gathered) -> list[Table]:
 def _calibrations(study: StudyPlan, found: Gathered) -> Table:
     rows: list[list[str | int | float | Estimate]] = []
     for name, one in found.calibrated.items():
-        spent = "0" if name == UNCALIBRATED else f"{mean([float(n) for n in one.simulations]):.0f}"
+        spent = "0" if name in (UNCALIBRATED, RANDOM) else f"{mean([float(n) for n in one.simulations]):.0f}"
         if name == "C1":
             spent += " (scored from one grid)"
         values = [mean(test) for test in one.test]
@@ -135,6 +135,8 @@ PAIRS = (
     ("C4", "C1"),
     ("C4", "C4-paper"),
     ("C4", UNCALIBRATED),
+    ("C4", RANDOM),
+    ("C4-active", "C4"),
     ("C4-paper", "C3"),
     ("C3", "C2"),
 )

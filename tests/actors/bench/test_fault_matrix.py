@@ -151,12 +151,13 @@ class Recorder:
                 self.joints.append(q)
 
 
-async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any]) -> float:
+async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any], pour: asyncio.Task[Any]) -> float:
     """Have a fault happen in the middle of a phase; the controller's time then [s]."""
     spans = {name: (begin, end) for name, begin, end in SPEC.arm.plan(SCENE, SLOWLY).phases}
     end = time.monotonic() + PATIENCE
     while True:
         assert time.monotonic() < end, f"never came to {phase}"
+        assert not pour.done(), f"a starved machine saw nothing of {phase}"
         state = await stage.bench.arm.state()
         if phase == "weigh" and seen and seen[-1].checkpoint in ("settle", "weigh"):
             break
@@ -182,7 +183,7 @@ async def tell_tale(open_stage: Any, phase: str, fault: Fault, *, mend: set[str]
         recording = asyncio.create_task(recorder.run())
         pour = asyncio.create_task(stage.pour(SLOWLY, progress=seen.append))
         try:
-            struck = await strike_in(stage, phase, fault, seen)
+            struck = await strike_in(stage, phase, fault, seen, pour)
         except BaseException:
             pour.cancel()
             await asyncio.gather(pour, return_exceptions=True)
@@ -347,7 +348,7 @@ def test_the_bench_pours_again_after_a_fault_was_mended(open_stage):
         seen: list[Any] = []
         async with open_stage(SPEC) as stage:
             pour = asyncio.create_task(stage.pour(SLOWLY, progress=seen.append))
-            await strike_in(stage, "tilt", ARM["protective stop"], seen)
+            await strike_in(stage, "tilt", ARM["protective stop"], seen, pour)
             with pytest.raises(UnknownPourError):
                 await pour
             assert isinstance(stage.operator, VirtualOperator)

@@ -129,7 +129,7 @@ def test_good_enough_is_the_end() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> None:
-    strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05))
+    strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05, otherwise="stop"))
     Play(narrow_cup_biased, narrow_cup)(strategy)
     found = losses(strategy)
     good = next(i for i, loss in enumerate(found) if loss <= 0.15)
