@@ -18,7 +18,9 @@ async function refresh() {
     Object.assign(now, { status, campaigns, questions, seen: Date.now() });
     const shown = campaigns.find((one) => RUNNING.includes(one.state) && one.run) || campaigns.find((one) => one.run);
     const detail = shown ? await call(`campaigns/${encodeURIComponent(shown.id)}`) : null;
-    now.pours = detail ? detail.pours_made.filter((pour) => pour.state !== "asked").slice(-8).reverse() : [];
+    const open = shown && !RUNNING.includes(shown.state) ? "UNKNOWN" : "under way";
+    now.pours = (detail ? detail.pours_made : []).filter((pour) => pour.state !== "asked").slice(-8).reverse()
+      .map((pour) => ({ ...pour, state: pour.state === "under way" ? open : pour.state }));
     show();
     link(true);
   } catch (error) {
@@ -30,13 +32,21 @@ async function refresh() {
   }
 }
 
-let timer = 0;
-function soon(delay) { clearTimeout(timer); timer = setTimeout(refresh, delay); }
+let timer = 0, due = Infinity;
+
+/** Look again after so long [ms], or earlier where that is planned: news that never pause postpone nothing. */
+function soon(delay) {
+  if (performance.now() + delay >= due) return;
+  clearTimeout(timer);
+  due = performance.now() + delay;
+  timer = setTimeout(() => { due = Infinity; refresh(); }, delay);
+}
 
 function told(type, data) {
   if (type === "QuestionAsked") announce("call", `A question: ${data.question.text}`);
   if (type === "Announced") announce("call", `In ${Math.round(data.seconds)} seconds: ${data.text}`);
   if (type === "CampaignRests") announce("say", `${data.campaign}: ${data.state}`);
+  if (type === "LogLine" && data.level === "error") alarm(data.text);
   if (type === "PourProgressed") { soon(700); return; }
   soon(150);
 }
@@ -44,6 +54,13 @@ function told(type, data) {
 function announce(where, text) {
   $(where).textContent = "";
   setTimeout(() => { $(where).textContent = text; }, 50); // a change is read out, what stood there is not
+}
+
+/** What must not be missed stands until somebody takes it away: an arm that did not confirm a stop, say. */
+function alarm(text) {
+  const line = el("p", {}, `${clock(Date.now() / 1000)} ${text} `, button(`read ${text}`, "Read", async () => line.remove(), "plain"));
+  $("alarms").append(line);
+  while ($("alarms").children.length > 5) $("alarms").firstChild.remove();
 }
 
 function link(stands, why = "") {
@@ -62,7 +79,7 @@ function show() {
   const { status, campaigns } = now;
   const real = status.rigs.filter((rig) => rig.mode === "hardware");
   draw($("mode"), real.map((rig) => rig.name), (names) => names.length ?
-    [modeBadge("hardware"), ` ${names.join(", ")}: the arm moves`] : [modeBadge("virtual"), " nothing real moves"]);
+    [modeBadge("hardware"), ` ${names.join(", ")}: a real arm`] : [modeBadge("virtual"), " nothing real moves"]);
   document.body.classList.toggle("real", real.length > 0);
   showEmergency(status.emergency);
   showQuestions();
@@ -90,7 +107,7 @@ function showEmergency(emergency) {
   $("emergency").hidden = !emergency;
   draw($("emergency"), emergency, (latched) => latched && [
     el("h2", { id: "emergency-head" }, "Emergency stop"),
-    el("p", {}, `By ${latched.by} at ${clock(latched.time)}${latched.reason ? `: ${latched.reason}` : ""}. All arms are stopped, `,
+    el("p", {}, `By ${latched.by} at ${clock(latched.time)}${latched.reason ? `: ${latched.reason}` : ""}. All arms were told to stop, `,
       "and nothing begins before it is cleared. A pour that was under way is UNKNOWN: somebody will be asked about it."),
     el("details", {}, el("summary", {}, "Clear it"),
       el("p", {}, "Is nobody in the cell, and does nothing stand or hang where it should not?"),

@@ -98,8 +98,15 @@ export function questionCard(question, campaign, mode, send) {
 
 function details(table) {
   const rows = Object.entries(table || {}).map(([key, value]) =>
-    el("div", {}, el("dt", {}, key), el("dd", {}, typeof value === "number" ? String(+value.toPrecision(5)) : String(value))));
+    el("div", {}, el("dt", {}, named(key)), el("dd", {}, typeof value === "number" ? String(+value.toPrecision(5)) : String(value))));
   return rows.length ? el("dl", {}, rows) : null;
+}
+
+/** 'tool_speed_mm_s' → 'tool speed [mm/s]'. */
+function named(key) {
+  const unit = key.match(/_(deg_s|mm_s|deg|mm|ml|g|s)$/);
+  const words = (unit ? key.slice(0, unit.index) : key).replaceAll("_", " ");
+  return unit ? `${words} [${unit[1].replace("_", "/")}]` : words;
 }
 
 function answers(question, answer) {

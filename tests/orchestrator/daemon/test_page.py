@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,21 @@ def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page
         assert lab.do(lab.served.get("/status"))["emergency"] is None
 
 
+def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path: Path) -> None:
+    text = "the arm of north did not confirm that it was stopped (no answer): use its own button"
+    with on_port(tmp_path) as lab:
+        page.goto(lab.address(Role.VIEWER))
+        page.get_by_text("Nothing runs here.").wait_for()
+        wait_until(page, lambda: lab.served.daemon.feed.readers > 0)
+        lab.loop.call_soon_threadsafe(
+            lab.served.daemon.feed.tell, "LogLine", {"level": "error", "text": text, "stage": ""}
+        )
+        page.get_by_role("alert").get_by_text(text).wait_for()
+        assert page.evaluate(LEGIBLE) == []
+        page.get_by_role("button", name="Read").click()
+        page.get_by_text(text).wait_for(state="detached")
+
+
 def test_a_viewer_may_stop_everything_but_answers_nothing(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(**REFILL)) as lab:
         asked(lab)
@@ -189,7 +205,7 @@ def test_real_and_virtual_cannot_be_mistaken(page: Any, tmp_path: Path) -> None:
     real = Rig("north", tmp_path / "north.yaml", LaboratorySpec("north", mode="hardware"))
     with on_port(tmp_path / "other", rigs=(real,)) as lab:
         page.goto(lab.address())
-        page.get_by_text("north: the arm moves").wait_for()
+        page.get_by_text("north: a real arm").wait_for()
         assert page.locator("header").get_by_text("REAL", exact=True).is_visible()
         assert page.locator("article").get_by_text("REAL", exact=True).is_visible()
         assert page.evaluate("getComputedStyle(document.querySelector('header')).background") != virtual
@@ -222,6 +238,27 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
         assert len(rows) == len(found["pours_made"]) == 3
         assert f"{100 * found['pours_made'][-1]['spillage']:.2f} %" in rows[0]
         assert found["pours_made"][-1]["predicted"] in rows[0]
+
+
+def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
+    """An arm tells where it is many times a second; what else happens is seen all the same."""
+    with on_port(tmp_path) as lab:
+        page.add_init_script("window.setInterval = () => 0")  # it also looks every few seconds, which would hide it
+        page.goto(lab.address())
+        page.get_by_text("Nothing runs here.").wait_for()
+
+        async def chatter() -> None:
+            key = await lab.served.submit()
+            while lab.sockets:
+                lab.served.daemon.feed.tell("PourProgressed", {"number": 1}, key, kept=False)
+                await asyncio.sleep(0.1)
+
+        asyncio.run_coroutine_threadsafe(chatter(), lab.loop)
+        page.locator(".step", has_text="tilting").wait_for()
+        page.wait_for_timeout(300)
+        lab.do(lab.served.post("/queue/pause"))
+        page.get_by_text("The queue is held").wait_for()
+        lab.sockets.clear()
 
 
 def test_a_lost_connection_is_told_with_what_to_do(page: Any, tmp_path: Path) -> None:
