@@ -62,6 +62,7 @@ def open_laboratory(
     make: Callable[[], Simulator] = pour_simulator,
     operator: Operator | None = None,
     kept: ClosablePool | None = None,
+    optimizer: Optimizer | None = None,
 ) -> Laboratory:
     """A laboratory, to be entered with `async with`; nothing starts before that.
 
@@ -72,6 +73,7 @@ def open_laboratory(
         operator: who answers questions, where a person does.
         kept: simulators that outlive the laboratory, in place of its own (`actors.warm`). Not on a cluster, whose
             members come and go.
+        optimizer: likewise, in place of one of its own: it keeps no state that matters.
 
     Raises:
         LaboratoryError: a bench is needed and there is none, or nobody to stand beside it, or the mode is not known.
@@ -85,8 +87,10 @@ def open_laboratory(
             f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
         )
     if spec.in_process:
-        return InProcessLaboratory(spec if need_bench else None, make, operator, kept)
-    return RayLaboratory(spec, make, need_bench=need_bench, operator=operator, kept=kept if spec.ray is None else None)
+        return InProcessLaboratory(spec if need_bench else None, make, operator, kept, optimizer)
+    if spec.ray is not None:
+        kept = optimizer = None
+    return RayLaboratory(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer)
 
 
 class ClosablePool(SimulatorPool, Protocol):
@@ -162,6 +166,10 @@ class _OpenLaboratory:
         """What is behind the bench; None where there is none."""
         return self._opened
 
+    def _own_optimizer(self, proposer: Device) -> Optimizer:
+        self._devices.append(proposer)
+        return DeviceOptimizer(proposer)
+
     async def _close_all(self) -> None:
         opened, self._opened = self._opened, None
         if opened is not None:
@@ -185,6 +193,7 @@ class InProcessLaboratory(_OpenLaboratory):
         make: makes the simulator.
         operator: a person, where one answers.
         kept: simulators to use in place of its own; they stay open.
+        optimizer: to use in place of its own; it stays open.
     """
 
     def __init__(
@@ -193,15 +202,15 @@ class InProcessLaboratory(_OpenLaboratory):
         make: Callable[[], Simulator] = pour_simulator,
         operator: Operator | None = None,
         kept: ClosablePool | None = None,
+        optimizer: Optimizer | None = None,
     ) -> None:
         super().__init__()
         self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
+        self._kept_optimizer = optimizer
 
     async def __aenter__(self) -> InProcessLaboratory:
         self._pool = self._kept or InProcessSimulatorPool(make=self._make)
-        proposer = LocalDevice("optimiser", Proposer)
-        self._devices.append(proposer)
-        self._optimizer = DeviceOptimizer(proposer)
+        self._optimizer = self._kept_optimizer or self._own_optimizer(LocalDevice("optimiser", Proposer))
         try:
             await self._open_bench(self._pool)
         except BaseException:
@@ -233,6 +242,7 @@ class RayLaboratory(_OpenLaboratory):
         need_bench: whether pours are needed.
         operator: a person, where one answers.
         kept: simulators to use in place of its own; they stay open.
+        optimizer: to use in place of its own; it stays open.
     """
 
     def __init__(
@@ -243,9 +253,11 @@ class RayLaboratory(_OpenLaboratory):
         need_bench: bool = False,
         operator: Operator | None = None,
         kept: ClosablePool | None = None,
+        optimizer: Optimizer | None = None,
     ) -> None:
         super().__init__()
         self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
+        self._kept_optimizer = optimizer
         self._needs_bench = need_bench and spec.pours
         self._cluster: JoinedCluster | None = None
         self._liquid: RaySimulatorPool | None = None
@@ -280,9 +292,7 @@ class RayLaboratory(_OpenLaboratory):
 
         here = None if self._cluster is None else self._cluster.here
         self._pool = self._kept or self._open_pool()
-        proposer = RayDevice("optimiser", Proposer, node=here)
-        self._devices.append(proposer)
-        self._optimizer = DeviceOptimizer(proposer)
+        self._optimizer = self._kept_optimizer or self._own_optimizer(RayDevice("optimiser", Proposer, node=here))
         if not self._needs_bench:
             return
         node = None if self._cluster is None else self._cluster.bench

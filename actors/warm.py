@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+from actors.device import Device, LocalDevice, RayDevice
 from actors.laboratory import ClosablePool
-from actors.protocols import LaboratoryError
+from actors.optimizer.actor import DeviceOptimizer, Proposer
+from actors.protocols import LaboratoryError, Optimizer
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
@@ -36,6 +38,7 @@ class WarmSimulators:
         self._make, self._tell = make, tell
         self._pool: ClosablePool | None = None
         self._fair: FairPool | None = None
+        self._proposer: Device | None = None
         self._opening = asyncio.Lock()
 
     @property
@@ -59,8 +62,10 @@ class WarmSimulators:
                 return
             if self._spec.in_process:
                 self._pool = InProcessSimulatorPool(make=self._make)
+                self._proposer = LocalDevice("optimiser", Proposer)
             else:
                 self._pool = await self._open_ray()
+                self._proposer = RayDevice("optimiser", Proposer)
             self._fair = FairPool(self._pool)
 
     async def _open_ray(self) -> ClosablePool:
@@ -88,12 +93,25 @@ class WarmSimulators:
             raise LaboratoryError("the simulators are not up yet")
         return self._fair.share()
 
+    def optimizer(self) -> Optimizer:
+        """Warm as well, and shared: one question after the other.
+
+        Raises:
+            LaboratoryError: it is not open.
+        """
+        if self._proposer is None:
+            raise LaboratoryError("the optimiser is not up yet")
+        return DeviceOptimizer(self._proposer)
+
     async def close(self) -> None:
         """End them. May be called twice."""
         async with self._opening:
             pool, self._pool, self._fair = self._pool, None, None
             if pool is None:
                 return
+            proposer, self._proposer = self._proposer, None
+            if proposer is not None:
+                await proposer.close()
             await pool.close()
             if not self._spec.in_process:
                 from actors.ray_runtime import stop_ray

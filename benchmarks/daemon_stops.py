@@ -163,9 +163,10 @@ def main() -> None:
         text, _ = pack(load_campaign(folder / "stops.yaml"))
         with daemon(folder) as client:
             found["first simulation of a plan"] = [round(warm(client, text), 3) for _ in range(3)]
+            print("first simulation", found["first simulation of a plan"], file=sys.stderr, flush=True)
             for load in ("idle", "saturated"):
                 with saturated(client, folder) if load == "saturated" else contextlib.nullcontext():
-                    for grade in ("pause", "stop", "abort", "emergency stop"):
+                    for grade in ("emergency stop", "abort", "stop", "pause"):
                         taken = [once(client, text, grade) for _ in range(times)]
                         found[f"{grade}, {load}"] = {
                             "median": round(1e3 * statistics.median(taken), 1),

@@ -27,7 +27,7 @@ FOLDER = ROOT / "docs" / "images" / "live"
 
 SIZE = {"width": 1920, "height": 1080}
 
-SETTLING = 40.0
+SETTLING = 35.0
 """A software rasteriser takes so long to draw what it was sent [s]."""
 
 
@@ -52,7 +52,7 @@ def during_a_run(chromium: str, to: Path) -> Path:
         shutil.copytree(ROOT / "configs", Path(name) / "configs")
         campaign = Path(name) / "configs" / "campaigns" / "quickstart.yaml"
         with running(campaign) as (process, url, run):
-            wait(process, run, lambda kinds: kinds.count(Kind.FINISHED) >= 12)
+            wait(process, run, lambda kinds: kinds.count(Kind.FINISHED) >= 10)
             look(chromium, url, to / "calibrating.png")
             wait(process, run, lambda kinds: "deploying" in kinds)
             look(chromium, url, to / "deploying.png")

@@ -119,7 +119,11 @@ class Running:
         asking, key, rig = self._common.asking, self.item.id, self._rig.name
         operator = RemoteOperator(asking, key, rig, self._announce) if work.pours and needs_person(spec) else None
         self._laboratory = open_laboratory(
-            spec, need_bench=work.pours, operator=operator, kept=self._common.warm.share()
+            spec,
+            need_bench=work.pours,
+            operator=operator,
+            kept=self._common.warm.share(),
+            optimizer=self._common.warm.optimizer(),
         )
         self._task = asyncio.create_task(
             run_campaign(

@@ -56,6 +56,7 @@ class Cell:
         self._shown: dict[str, str] = {}
         self._trail: list[list[float]] = []
         self._liquid: RecordedFrames | None = None
+        self._stands: tuple[float, ...] = ()
         outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
         outlet.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
         self._furnish()
@@ -79,9 +80,10 @@ class Cell:
             base = home[0, 0, :2]
             low, high = np.minimum(base, 0.0) - 0.3, np.maximum(base, 0.0) + 0.3
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
-            # Where it waits, until it moves: what is logged without a time gives way to nothing that has one.
+            # Where it waits, until it moves; what it looks like never changes.
             self._outlet.times(wall=time.time(), step=0, sim_time=0.0)
-            self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home))
+            self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
+            self._outlet.log(f"{PLACE}/arm", shapes.stance(home))
         self._outlet.log(
             f"{PLACE}/table",
             rr.Boxes3D(
@@ -116,6 +118,9 @@ class Cell:
             self._liquid = told.liquid
         if self.time_scale > SLOW and self._films.next_due is not None:
             return  # a film of the pour before is shown
+        if (stands := (*told.joints, *told.pourer)) == self._stands:
+            return
+        self._stands = stands
         if told.joints and self._figure is not None:
             self._move(np.array(told.joints))
         elif told.pourer:
@@ -129,7 +134,7 @@ class Cell:
     def _move(self, joints: FloatArray) -> None:
         figure = self._figure
         assert figure is not None
-        self._outlet.log(f"{PLACE}/arm", shapes.bars(figure, figure.ends(joints)))
+        self._outlet.log(f"{PLACE}/arm", shapes.stance(figure.ends(joints)))
         tool, pourer = figure.tool(joints[None])[0], figure.pourer(joints[None])[0]
         self._outlet.log(f"{PLACE}/tool", shapes.placed(tool))
         self._outlet.log(f"{PLACE}/pourer", shapes.placed(pourer))

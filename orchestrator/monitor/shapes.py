@@ -63,33 +63,40 @@ def placed(pose: FloatArray) -> Any:
 
 
 def bars(figure: ArmFigure, ends: FloatArray) -> Any:
-    """An arm's links as capsules.
+    """What an arm's links look like, however they stand: capsules as long as they always are.
 
     Args:
         figure: of the arm.
-        ends: of its bars, shape (bars, 2, 3) [m].
+        ends: of its bars for any joints, shape (bars, 2, 3) [m].
     """
     import rerun as rr
-    from scipy.spatial.transform import Rotation
 
-    along = ends[:, 1] - ends[:, 0]
-    lengths = np.linalg.norm(along, axis=-1)
-    axes = along / np.maximum(lengths, 1e-9)[:, None]
-    # A capsule lies along z; how it is turned about itself nobody sees.
-    turn = np.cross(np.array([0.0, 0.0, 1.0]), axes)
-    sine, cosine = np.linalg.norm(turn, axis=-1), axes[:, 2]
-    angles = np.arctan2(sine, cosine)
-    turn = np.where(sine[:, None] > 1e-9, turn / np.maximum(sine, 1e-12)[:, None], np.array([1.0, 0.0, 0.0]))
     return rr.Capsules3D(
-        lengths=lengths,
+        lengths=np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1),
         radii=[bar.radius for bar in figure.bars],
-        translations=ends[:, 0],
-        quaternions=Rotation.from_rotvec(turn * angles[:, None]).as_quat(),
         colors=[METAL if i % 2 else (*rgb("#56b4e9"), 255) for i in range(len(figure.bars))],
         labels=[bar.name for bar in figure.bars],
         show_labels=False,
         fill_mode="solid",
     )
+
+
+def stance(ends: FloatArray) -> Any:
+    """Where an arm's links are; what they look like is `bars`.
+
+    Args:
+        ends: of its bars, shape (bars, 2, 3) [m].
+    """
+    import rerun as rr
+
+    along = ends[:, 1] - ends[:, 0]
+    axes = along / np.maximum(np.linalg.norm(along, axis=-1), 1e-9)[:, None]
+    # A capsule lies along z; how it is turned about itself nobody sees. The turn from z to an axis a is the quaternion
+    # (z × a, 1 + z · a), but for an axis straight down, where any half turn will do.
+    turns = np.column_stack([-axes[:, 1], axes[:, 0], np.zeros(len(axes)), 1.0 + axes[:, 2]])
+    turns[turns[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
+    turns /= np.linalg.norm(turns, axis=-1, keepdims=True)
+    return rr.Capsules3D.from_fields(translations=ends[:, 0], quaternions=turns)
 
 
 def fates() -> Any:
