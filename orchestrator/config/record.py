@@ -72,6 +72,7 @@ def _calibration(base: Mapping[str, Any], plan: CalibrationPlan) -> dict[str, An
     pours: dict[str, Any] = {"count": plan.pour_count, "holdout": plan.holdout}
     if plan.records is not None:
         pours = {"from_run": str(plan.records.path.parent)}
+    pours["design"] = "stratified" if plan.records is not None else plan.design
     own = {"pours": pours, "random_baseline": plan.random_baseline, **written(plan.settings)}
     return {**_common(base, CalibrationSection), **own}
 
