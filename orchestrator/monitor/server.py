@@ -67,7 +67,7 @@ def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence
     """
     return [
         *(rerun_program(), "--serve-web", "--bind", address, "--port", str(port), "--web-viewer-port", str(web_port)),
-        # Not with --newest-first: the viewer in the browser (0.41) stays empty then.
+        # Not with --newest-first, which sends later arrangements of the views before earlier ones.
         *("--server-memory-limit", memory, *shown),
     ]
 

@@ -81,7 +81,7 @@ def resolve_calibration(
     if pours is not None and (from_file or from_run is not None):
         source = "a file" if from_file else "a run"
         for key in ("count", "holdout", "holdout_receivers", "design", "simulations"):
-            if at.at(key).loc in at.document.marks:
+            if pours.value(key) not in (None, "stratified"):  # what is meant anyway stands in a run's record
                 report.add(
                     at.at(key), f"belongs to pours that are still to be made; these are read 'from' {source}", key=True
                 )
