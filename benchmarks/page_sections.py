@@ -28,6 +28,7 @@ def introduction() -> str:
 What a simulated pour costs, where the time goes, and how that compares with the fastest solver that we know of. All of
 it is measured anew, and this page written, by
 
+<!-- needs: checkout and minutes -->
 ```
 python benchmarks/make_page.py --measure
 ```
