@@ -191,7 +191,7 @@ def test_quickstart_is_what_the_guide_says() -> None:
     assert deployment is not None
     said = (
         f"{calibration.pour_count} pours to calibrate on, {calibration.simulations} simulations to calibrate with, "
-        f"then {deployment.pours} pours into a {deployment.scenes[0].receiver.name} cup on a prior of "
+        f"then at most {deployment.pours} pours into a {deployment.scenes[0].receiver.name} cup on a prior of "
         f"{deployment.settings.simulations_before} simulations"
     )
     assert said in " ".join(text_of(ROOT / "docs" / "user-guide.md").split())

@@ -81,13 +81,13 @@ def test_what_is_forgotten_is_made_again(
 
 
 def test_regret_is_nothing_at_the_minimum_and_observations_scatter_around_it() -> None:
-    from optimiser_problems import BY_NAME, World
+    from optimiser_problems import BY_NAME, Instance
 
-    branin = World(BY_NAME["branin"], 0)
+    branin = Instance(BY_NAME["branin"], 0)
     assert branin.true(np.array([(np.pi + 5) / 15, 2.275 / 15])) == pytest.approx(0.0, abs=1e-4)
     hartmann = np.array([0.20169, 0.150011, 0.476874, 0.275332, 0.311652, 0.6573])
-    assert World(BY_NAME["hartmann6"], 0).true(hartmann) == pytest.approx(0.0, abs=1e-4)
-    spill = World(BY_NAME["spill2"], 3)
+    assert Instance(BY_NAME["hartmann6"], 0).true(hartmann) == pytest.approx(0.0, abs=1e-4)
+    spill = Instance(BY_NAME["spill2"], 3)
     grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 60)] * 2), axis=-1).reshape(-1, 2)
     costs = np.array([spill.true(point) for point in grid])
     assert costs.min() == 0.0

@@ -51,6 +51,7 @@ What the solver does in cases whose outcome is known: from theory, from experime
 is measured, not assumed, and judged by a criterion that was set beforehand; what fails is shown as failing. The page is
 written by
 
+<!-- needs: checkout and minutes -->
 ```
 decant physics --full --write docs
 ```

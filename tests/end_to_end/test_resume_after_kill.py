@@ -91,10 +91,10 @@ def test_a_campaign_learns_from_calibration_to_its_last_pour(undisturbed: Finish
 @pytest.mark.realtime
 def test_its_recording_can_be_read_and_shows_vessels_liquid_and_every_pour(undisturbed: Finished) -> None:
     rows = recording(Path(undisturbed.summary["recording"]))
-    assert rows["/scene/pourer/mesh"] >= 1
-    assert rows["/scene/receiver/mesh"] >= 1
-    assert rows["/scene/liquid"] > 5
-    assert rows["/pours/deployment-narrow/measured"] >= 2
+    assert rows["/cell/pourer/mesh"] >= 1
+    assert rows["/cell/receiver/mesh"] >= 1
+    assert rows["/cell/liquid"] > 5
+    assert rows["/learning/deployment-narrow/loss/measured"] >= 2
 
 
 def recording(path: Path) -> dict[str, int]:

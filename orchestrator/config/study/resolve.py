@@ -28,6 +28,7 @@ HARDWARE = (
 BUDGETS = (
     *("grid", "per_axis", "samples", "simulations"),
     *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "per_pour", "prices", "mean"),
+    *("risk_limit", "stop", "good_enough"),
 )
 """Settings that an arm does not take over from the base campaign: a study says itself what each may spend."""
 

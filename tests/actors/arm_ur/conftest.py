@@ -45,6 +45,7 @@ class Rig:
 
     def __init__(self, controller: VirtualController, arm: UrArm, path: PourPath) -> None:
         self.controller, self.arm, self.path = controller, arm, path
+        self.called: Call | None = None
 
     def fault(self, name: str, **arguments: Any) -> dict[str, Any]:
         return self.controller.fault(name, **arguments)
@@ -80,14 +81,21 @@ class Rig:
     def pouring(self) -> Call:
         """The pour, going on in a thread; at its start before."""
         self.to_start()
-        return Call(self.arm.execute, self.path)
+        self.called = Call(self.arm.execute, self.path)
+        return self.called
 
     def await_phase(self, phase: str) -> None:
         self.await_that(lambda: self.arm.state().phase == phase, f"phase {phase}")
 
     def await_tilt(self, tilt: float) -> None:
         """Until the last joint has really turned so far [rad]."""
-        self.await_that(lambda: self.joints[5] - START[5] > tilt, f"a tilt of {tilt}")
+        self.await_that(lambda: self._tilted(tilt), f"a tilt of {tilt}")
+
+    def _tilted(self, tilt: float) -> bool:
+        over = self.called is not None and not self.called.is_alive()
+        reached = bool(self.joints[5] - START[5] > tilt)
+        assert reached or not over, "the pour was over before a starved machine saw it tilt"
+        return reached
 
     def await_rest(self) -> None:
         self.await_that(lambda: max(map(abs, self.fault("state")["speeds"])) == 0.0, "rest")
