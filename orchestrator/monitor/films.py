@@ -36,7 +36,7 @@ class Films:
         self._numbers = itertools.count()
         self._free_at = 0.0
         self.end = 0.0
-        """Of the last film on the timeline of simulated time [s]."""
+        """The end of the last film on the timeline of simulated time [s]."""
 
     def add(self, now: float, step: int, times: Sequence[float], frames: Sequence[Frame]) -> None:
         """A film that became known.

@@ -32,10 +32,10 @@ from orchestrator.plan import CampaignPlan
 LOOPBACK = "127.0.0.1"
 
 WEB_PORT = 9090
-"""Of the viewer's page, where it is free: else the next free one."""
+"""The port of the viewer's page, where it is free; else the next free one."""
 
 STREAM_PORT = 9876
-"""Of the stream, likewise: Rerun's own default."""
+"""The port of the stream, likewise; Rerun's own default."""
 
 MEMORY = "512MiB"
 """Kept for those who come late; what is older is in the recording on disk."""
@@ -136,12 +136,12 @@ class LiveView:
 
     @property
     def url(self) -> str:
-        """Of the viewer's page, for a browser."""
+        """The address of the viewer's page, for a browser."""
         return f"http://{self.host}:{self._ports[1]}/?url={quote(self.stream, safe='')}"
 
     @property
     def server_pid(self) -> int:
-        """Of Rerun's server, whose output was not read before."""
+        """The process id of Rerun's server; asked for once, since it is the first line of its output."""
         assert self._process is not None
         assert self._process.stdout is not None
         return int(self._process.stdout.readline())

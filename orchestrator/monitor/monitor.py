@@ -65,7 +65,7 @@ class RerunMonitor:
 
     @property
     def pid(self) -> int:
-        """Of the process that writes."""
+        """The process id of the writer."""
         return self._process.pid
 
     @property

@@ -128,7 +128,7 @@ def read_text(path: Path, *, encoding: str = "utf-8", limit: int = SIZE_LIMIT) -
         limit: largest size [bytes].
 
     Raises:
-        UnreadableError: there is no such file, it is none, is too large, or not text.
+        UnreadableError: it does not exist, is not a file, is too large, or is not text.
     """
     if (why := why_unreadable(path)) is not None:
         hint = similar(path) if why == "no such file" else None

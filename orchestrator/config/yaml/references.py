@@ -55,7 +55,7 @@ class References:
             self.report.add(place, missing)
             return None
         if path.suffix.lower() not in YAML_SUFFIXES:
-            self.report.add(place, f"{path.name} is no YAML file; its name should end in .yaml")
+            self.report.add(place, f"{path.name} is not a YAML file; its name should end in .yaml")
             return None
         return self.file(path, model, place)
 

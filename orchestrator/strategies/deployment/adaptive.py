@@ -117,10 +117,10 @@ class BenchFound(Part):
     """Searched dimensions, in order."""
 
     scales: tuple[tuple[float, ...], ...]
-    """Of each draw and dimension, on the unit interval."""
+    """The factor of each draw in each dimension."""
 
     shifts: tuple[tuple[float, ...], ...]
-    """Of each draw and dimension, on the unit interval."""
+    """The shift of each draw in each dimension, on the unit interval."""
 
     def displacements(self) -> tuple[Displacement, ...]:
         """As questions carry them."""
@@ -300,7 +300,7 @@ class Trust:
 
 
 def _in_si(axis: Axis, shift: float, deviation: float) -> Displaced:
-    """Of a shift on the unit interval: in the axis' unit, in the middle of its range."""
+    """A shift on the unit interval in the axis' own unit, taken in the middle of its range."""
     if axis.scale == "log":
         middle, width = axis.decode(0.5), math.log(axis.upper / axis.lower)
         return Displaced(mean=middle * math.expm1(shift * width), deviation=middle * deviation * width)
