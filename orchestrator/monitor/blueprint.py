@@ -32,26 +32,33 @@ def campaign_blueprint(moment: Moment, receivers: Mapping[str, str], loss_label:
     """
     import rerun.blueprint as rrb
 
-    losses = [_loss(safe_name(scene), f"{name}: {loss_label}") for scene, name in receivers.items()]
-    maps = [
-        _picture(f"/learning/{safe_name(scene)}/surrogate", f"{name}: expected loss")
-        for scene, name in receivers.items()
-    ]
-    theta = [
-        _picture("/learning/calibration/surrogate", "Discrepancy over θ"),
-        _picture("/learning/calibration/theta", "θ* and which θ fit the pours"),
-    ]
-    calibrated = _loss("calibration", "Calibration pours: spilled / poured [%]")
+    # Made anew for each tab: a view has one place, and one that were put into two would stay empty in the second.
+    def losses() -> list[Any]:
+        return [_loss(safe_name(scene), f"{name}: {loss_label}") for scene, name in receivers.items()]
+
+    def maps() -> list[Any]:
+        names = receivers.items()
+        return [_picture(f"/learning/{safe_name(scene)}/surrogate", f"{name}: expected loss") for scene, name in names]
+
+    def theta() -> list[Any]:
+        return [
+            _picture("/learning/calibration/surrogate", "Discrepancy over θ"),
+            _picture("/learning/calibration/theta", "θ* and which θ fit the pours"),
+        ]
+
+    def calibrated() -> Any:
+        return _loss("calibration", "Calibration pours: spilled / poured [%]")
+
     calibrating = rrb.Horizontal(
         rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
-        rrb.Vertical(*theta, rrb.Horizontal(calibrated, _shares()), row_shares=[5, 4, 4]),
+        rrb.Vertical(*theta(), rrb.Horizontal(calibrated(), _shares()), row_shares=[5, 4, 4]),
         rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
         column_shares=[5, 7, 4],
         name="Calibrating",
     )
     deploying = rrb.Horizontal(
         rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
-        rrb.Vertical(rrb.Tabs(*maps), rrb.Tabs(*losses), _weight(), row_shares=[5, 4, 4]),
+        rrb.Vertical(rrb.Tabs(*maps()), rrb.Tabs(*losses()), _weight(), row_shares=[5, 4, 4]),
         rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
         column_shares=[5, 7, 4],
         name="Deploying",
@@ -60,8 +67,8 @@ def campaign_blueprint(moment: Moment, receivers: Mapping[str, str], loss_label:
         rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
         rrb.Vertical(
             rrb.Horizontal(_weighed_pour(), _shares()),
-            rrb.Tabs(*losses, calibrated),
-            rrb.Tabs(*maps, *theta),
+            rrb.Tabs(*losses(), calibrated()),
+            rrb.Tabs(*maps(), *theta()),
             row_shares=[4, 4, 5],
         ),
         rrb.Vertical(_status(), _log(), row_shares=[5, 4]),
