@@ -64,8 +64,8 @@ def scene(receiver: str) -> Scene:
     return Scene(f"to-{receiver}", beaker, glass, Liquid(mass=0.2), fixed={} if receiver != "narrow" else fixed)
 
 
-CALIBRATED, DEPLOYED = (scene("tumbler"), scene("mug")), scene("narrow")
-CALIBRATED = tuple(replace(one, fixed={"max_angle": 120 * DEG}) for one in CALIBRATED)
+CALIBRATED = tuple(replace(scene(name), fixed={"max_angle": 120 * DEG}) for name in ("tumbler", "mug"))
+DEPLOYED = scene("narrow")
 
 
 def spilled(scene: Scene, action: Action, theta: SimulationParameters, wave: tuple[float, float] = (0.0, 0.0)) -> float:

@@ -36,7 +36,6 @@ from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.monitor.server import environment, rerun_program
 from orchestrator.plan import CampaignPlan
 from orchestrator.requests import Pour, Simulate, Simulated
-from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome
 from sim_engine.simulated import RecordedFrames
 
@@ -196,7 +195,7 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
     arm = plan.laboratory.arm
     figure = None if arm is None else arm.figure()
     home = () if figure is None else figure.home
-    action = Action(**{"angular_velocity": 1.5, "x_offset": 0.1, **dict(scene.fixed)})
+    action = scene.action({"angular_velocity": 1.5, "x_offset": 0.1})
     rng = np.random.default_rng(1)
     place = rng.uniform(-0.05, 0.05, (PARTICLES, 3)).astype(np.float32)
     outcome = PourOutcome(0.9, 0.05, 0.05, 0.0, 0.0, PARTICLES, 0.003, 0.01, 3.0, 900, 0.9, 1)

@@ -129,6 +129,7 @@ def receivers(level: str, bench: int, carried: bool, pours: int, simulations: in
         plan = DeploymentPlan(ARMS["adaptive"](pours, simulations), (SCENE,), valley.space, Loss())
         plan = with_bench(plan, results if carried else {}, SimulationParameters())
         strategy, numbers = plan.settings.build(plan, SCENE, SimulationParameters(), bench), Numbers(valley)
+        assert isinstance(strategy, Deployment)
         numbers.play(strategy)
         results[f"{DEPLOYMENT}{number}"] = strategy.result()
         good = [i for i, lost in enumerate(numbers.poured, start=1) if lost < GOOD]

@@ -41,7 +41,7 @@ class Bench:
         return float(self.inner[-1, 1])
 
     def radius(self, z: Floats) -> Floats:
-        return np.interp(z, self.inner[1:, 1], self.inner[1:, 0])
+        return np.asarray(np.interp(z, self.inner[1:, 1], self.inner[1:, 0]))
 
     def diameters(self, count: int = 5) -> str:
         heights = np.linspace(0.1, 1.0, count) * self.height
