@@ -50,6 +50,7 @@ def test_the_dialect_is_found_out_and_then_used(unknown, voice):
     assert balance.weigh().mass == pytest.approx(0.2, abs=1e-9)
 
 
+@pytest.mark.realtime
 def test_finding_out_tares_and_zeroes_nothing(unknown, each_dialect):
     far, balance = unknown(each_dialect)
     far.put(0.05)
@@ -71,6 +72,7 @@ def test_the_speed_is_found_out(unknown, dialect, baud):
         far.close()
 
 
+@pytest.mark.realtime
 def test_a_balance_that_prints_by_itself_is_recognised_and_the_operator_told(unknown):
     far, balance = unknown("kern-swt")
     far.faults(unasked=0.05)
@@ -100,6 +102,7 @@ def test_gibberish_is_said_to_be_a_matter_of_speed_and_parity(unknown):
         far.close()
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     "voice", ["sbi", *(pytest.param(voice, marks=pytest.mark.slow) for voice in ("kcp", "kern-swt", "mt-sics"))]
 )
@@ -109,12 +112,14 @@ def test_a_balance_that_takes_its_time_is_recognised_all_the_same(unknown, voice
     assert balance.connect().startswith(dialects()[voice].title)
 
 
+@pytest.mark.realtime
 def test_a_longer_answer_time_counts_where_only_the_dialect_is_named(unknown):
     far, balance = unknown("kcp", dialect="kcp", answer_time=2.5)
     far.faults(delay=2.0)
     assert balance.connect().startswith("Kern KCP")
 
 
+@pytest.mark.realtime
 def test_another_dialect_than_the_one_named_is_shown_as_it_came(unknown):
     _, balance = unknown("mt-sics", dialect="sbi", baud=9600)
     with pytest.raises(
@@ -133,6 +138,7 @@ def test_a_search_can_be_interrupted(unknown):
     assert time.monotonic() - started < 1.0
 
 
+@pytest.mark.realtime
 def test_a_setting_that_the_port_refuses_is_left_out_and_named(unknown, monkeypatch):
     real = serial.Serial
 
