@@ -1,4 +1,5 @@
-"""The file that a journal is: its tables, its header, its lock. SQLite is known here and in `journal.py` alone."""
+"""The file that a journal is: its tables, its header, its lock. Beside `journal.py` nobody else
+knows how a journal is kept."""
 
 from __future__ import annotations
 
@@ -126,3 +127,12 @@ def take_lock(path: Path) -> IO[str]:
     file.write(str(os.getpid()))
     file.flush()
     return file
+
+
+def whole_copy(path: Path) -> bytes:
+    """A journal in one file, as bytes; also while it is being written."""
+    uri = f"{path.absolute().as_uri()}?mode=ro"
+    with closing(sqlite3.connect(uri, uri=True)) as source, closing(sqlite3.connect(":memory:")) as copy:
+        source.backup(copy)
+        copy.execute("pragma journal_mode = delete")
+        return copy.serialize()

@@ -9,9 +9,7 @@ import base64
 import binascii
 import json
 import re
-import sqlite3
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from orchestrator.config.load import load_campaign
 from orchestrator.config.yaml.errors import ConfigError, Problem
 from orchestrator.config.yaml.files import confined, out_of_bounds
 from orchestrator.journal import JOURNAL_NAME
+from orchestrator.journal_file import whole_copy
 from orchestrator.plan import CampaignPlan
 
 CAMPAIGN = "campaign.yaml"
@@ -70,21 +69,12 @@ def _taken(path: Path, files: Files) -> str:
     stem = re.sub(r"[^A-Za-z0-9._-]", "_", path.name).lstrip("._-")[-60:] or "file"
     name = f"files/{len(files) + 1}-{stem}"
     if (path / JOURNAL_NAME).is_file():  # a former run: its journal is all that is read of it
-        files[f"{name}/{JOURNAL_NAME}"] = _coded(_journal(path / JOURNAL_NAME))
+        files[f"{name}/{JOURNAL_NAME}"] = _coded(whole_copy(path / JOURNAL_NAME))
     elif path.is_file():
         files[name] = _coded(path.read_bytes())
     else:
         return str(path)
     return name
-
-
-def _journal(path: Path) -> bytes:
-    """A journal in one file, also while it is being written."""
-    uri = f"{path.absolute().as_uri()}?mode=ro"
-    with closing(sqlite3.connect(uri, uri=True)) as source, closing(sqlite3.connect(":memory:")) as copy:
-        source.backup(copy)
-        copy.execute("pragma journal_mode = delete")
-        return copy.serialize()
 
 
 def _coded(content: bytes) -> str:
