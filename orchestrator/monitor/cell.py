@@ -30,6 +30,9 @@ PLACE = "/cell"
 SLOW = 3.0
 """A bench whose time runs faster than this is shown by films of its pours: nobody could follow it."""
 
+TRAILING = 5
+"""The path that was executed is drawn again with every so many places of it."""
+
 _TRAY = 0.012
 """Thickness of the tray [m]."""
 
@@ -128,7 +131,7 @@ class Cell:
             self._trail.append(list(told.pourer[:3]))
         else:
             return
-        if len(self._trail) > 1 and self.time_scale <= SLOW:
+        if len(self._trail) % TRAILING == 2 and self.time_scale <= SLOW:
             self._outlet.log(f"{PLACE}/path/executed", self._line(np.array(self._trail), style.MEASURED, 3e-3))
 
     def _move(self, joints: FloatArray) -> None:

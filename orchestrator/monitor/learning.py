@@ -34,11 +34,12 @@ CALIBRATION = "calibration"
 MAPPED = 2
 """Axes that one picture shows; of more, there is a picture of all pairs."""
 
-SLICING_INTERVAL = 60.0
+SLICING_INTERVAL = 180.0
 """As `DRAWING_INTERVAL`, for pictures whose surrogate has to be fitted once more [s]."""
 
-DRAWING_INTERVAL = 20.0
-"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.3 s."""
+DRAWING_INTERVAL = 45.0
+"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.4 s of a
+core, which has to stay about a hundredth of it."""
 
 
 class LearningStage:

@@ -18,8 +18,11 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-FLUSHING = 0.3
-"""Rows are kept together for so long [s]."""
+FILING = 2.0
+"""Rows of the file are kept together for so long [s]: packing each few of them costs more than making them."""
+
+SENDING = 0.5
+"""Rows for those who watch, likewise [s]."""
 
 LAST_WORDS = 5.0
 """How long a server may take for the last of it [s]."""
@@ -47,13 +50,14 @@ class Outlet:
         self._on_wall = False
         recording_id = uuid.uuid4().hex
         # Some rows at a time: a viewer chokes on many small pieces long before their bytes are many.
-        batches = rr.ChunkBatcherConfig()
-        batches.flush_tick = FLUSHING
-        self._file = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
+        # Not by size either: a film's frames would be packed one by one.
+        filed, sent = rr.ChunkBatcherConfig(), rr.ChunkBatcherConfig()
+        filed.flush_tick, sent.flush_tick = FILING, SENDING
+        self._file = rr.RecordingStream(application, recording_id=recording_id, batcher_config=filed)
         self._file.set_sinks(rr.FileSink(str(path)))
         self._streams = [self._file]
         if url:
-            live = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
+            live = rr.RecordingStream(application, recording_id=recording_id, batcher_config=sent)
             live.set_sinks(rr.GrpcSink(url))
             self._streams.append(live)
         for stream in self._streams:
