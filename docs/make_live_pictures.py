@@ -64,9 +64,11 @@ def during_a_run(chromium: str, to: Path) -> Path:
             wait(process, run, stage="deployment", kind=Kind.POUR_FINISHED, count=2)
             picture(page, to / "deploying.png")
             process.wait(1800.0)
-        kept = Path(tempfile.gettempdir()) / "quickstart.rrd"
-        shutil.copy(run / "campaign.rrd", kept)
-        return kept
+        kept = Path(tempfile.gettempdir()) / "live-quickstart-run"
+        shutil.rmtree(kept, ignore_errors=True)
+        shutil.copytree(run, kept)
+        print(f"the run is kept in {kept}: decant report makes its page anew", flush=True)
+        return kept / "campaign.rrd"
 
 
 @contextlib.contextmanager
