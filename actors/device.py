@@ -101,7 +101,8 @@ class RayDevice:
 
     def __init__(self, name: str, cls: type[Any], *args: Any, node: PinnedNode | None = None) -> None:
         self.name = name
-        self._class, self._args, self._node = cls, args, node
+        self._class: Any = cls
+        self._args, self._node = args, node
         self._actor: Any = None
         self._lost = False
         self._start()
