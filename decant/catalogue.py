@@ -51,19 +51,7 @@ def find_runs(
         ValueError: a date or the mode is none.
         RunError: the catalogue can't be read.
     """
-    conditions = search.searching(
-        words=words,
-        since=since,
-        until=until,
-        mode=mode,
-        campaign=campaign,
-        pourer=pourer,
-        receiver=receiver,
-        liquid=liquid,
-        strategy=strategy,
-        state=state,
-        tag=tag,
-    )
+    conditions = search.searching(**locals())
     return _table("run", lambda catalogue: search.find_runs(catalogue, conditions))
 
 
@@ -101,19 +89,7 @@ def find_pours(
     Raises:
         ValueError, RunError: see `find_runs`.
     """
-    conditions = search.searching(
-        words=words,
-        since=since,
-        until=until,
-        mode=mode,
-        run=None if run is None else str(run),
-        campaign=campaign,
-        pourer=pourer,
-        receiver=receiver,
-        liquid=liquid,
-        strategy=strategy,
-        tag=tag,
-    )
+    conditions = search.searching(**locals())
     return _table("pour", lambda catalogue: search.find_pours(catalogue, conditions))
 
 

@@ -168,7 +168,8 @@ def searching(
     since: str | None = None,
     until: str | None = None,
     mode: str | None = None,
-    words: Sequence[str] = (),
+    words: Sequence[str] | None = (),
+    run: Path | str | None = None,
     **others: Any,
 ) -> Search:
     """A search from what people type; see `Search`, `moment`, and `MODES` for `mode`.
@@ -179,7 +180,8 @@ def searching(
     if mode is not None and mode.lower() not in MODES:
         raise ValueError(f"mode '{mode}' is not one of {', '.join(MODES)}")
     return Search(
-        words=tuple(words),
+        words=tuple(words or ()),
+        run=None if run is None else str(run),
         since=None if since is None else moment(since),
         until=None if until is None else moment(until, end=True),
         mode=None if mode is None else MODES[mode.lower()],

@@ -19,7 +19,7 @@ from orchestrator.commands.runs_shown import (
     percent,
     print_pours,
 )
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json, say
 from orchestrator.report.table import print_table
 
 if TYPE_CHECKING:
@@ -260,10 +260,8 @@ def _refusing() -> Iterator[None]:
 def _search(conditions: Mapping[str, Any]) -> Search:
     from orchestrator.catalogue.search import searching
 
-    try:
+    with Refused(ValueError):
         return searching(**conditions)
-    except ValueError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 def _one(catalogue: Catalogue, name: str) -> Row:

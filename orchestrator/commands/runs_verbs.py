@@ -62,6 +62,13 @@ Which = Annotated[str, typer.Argument(help="A run: its folder's name, the beginn
 Limit = Annotated[int | None, typer.Option(min=1, help="The newest so many.")]
 
 
+def _conditions(given: dict[str, Any]) -> dict[str, Any]:
+    """The conditions among a verb's options. `--state` is the state directory, `--in-state` a condition."""
+    left_out = ("folder", "state", "formats", "as_json", "in_state")
+    state = {"state": given["in_state"]} if "in_state" in given else {}
+    return {name: value for name, value in given.items() if name not in left_out} | state
+
+
 @runs.callback()
 def newest(context: typer.Context, state: State = None) -> None:
     """What `decant runs` does without a verb."""
@@ -95,26 +102,10 @@ def list_(
     as_json: Json = False,
 ) -> None:
     """List runs, the newest first; every condition that is given must hold."""
+    conditions = _conditions(locals())
     from orchestrator.commands import runs as verb
 
-    call(
-        verb.list_runs,
-        {
-            "words": words or (),
-            "since": since,
-            "until": until,
-            "campaign": campaign,
-            "pourer": pourer,
-            "receiver": receiver,
-            "liquid": liquid,
-            "strategy": strategy,
-            "mode": mode,
-            "state": in_state,
-            "tag": tag,
-            "limit": limit,
-        },
-        as_json=as_json,
-    )
+    call(verb.list_runs, conditions, as_json=as_json)
 
 
 runs.command("search", hidden=True)(list_)
@@ -143,26 +134,10 @@ def pours(
     as_json: Json = False,
 ) -> None:
     """List pours: which action was used, what it spilled, and what had been expected."""
+    conditions = _conditions(locals())
     from orchestrator.commands import runs as verb
 
-    call(
-        verb.list_pours,
-        {
-            "words": words or (),
-            "since": since,
-            "until": until,
-            "run": run,
-            "campaign": campaign,
-            "pourer": pourer,
-            "receiver": receiver,
-            "liquid": liquid,
-            "strategy": strategy,
-            "mode": mode,
-            "tag": tag,
-            "limit": limit,
-        },
-        as_json=as_json,
-    )
+    call(verb.list_pours, conditions, as_json=as_json)
 
 
 @runs.command(epilog=examples("decant runs show quickstart-20300301-1"))
@@ -226,16 +201,9 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write runs and pours as CSV and Parquet, with a data dictionary: runs.*, pours.*, dictionary.csv."""
+    conditions = _conditions(locals())
     from orchestrator.commands import runs as verb
 
-    conditions: dict[str, Any] = {
-        "since": since,
-        "until": until,
-        "campaign": campaign,
-        "receiver": receiver,
-        "mode": mode,
-        "tag": tag,
-    }
     call(verb.export, folder, conditions, formats, as_json=as_json)
 
 
