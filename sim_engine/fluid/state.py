@@ -77,6 +77,7 @@ class FluidState:
         self.spacing = ti.field(ti.f32, shape=scenes)
         self.cohesion = ti.field(ti.f32, shape=scenes)  # scale of its accelerations [m/s²]
         self.viscosity = ti.field(ti.f32, shape=scenes)
+        self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over that at which a pair parts
         self.friction = ti.field(ti.f32, shape=scenes)
         self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
@@ -118,12 +119,13 @@ class FluidState:
     def set_parameters(self, s: int, setup: SceneSetup) -> None:
         """What θ_s of a scene is to the methods."""
         from sim_engine.fluid.tension import cohesion_acceleration, pull_interval
-        from sim_engine.fluid.viscosity import relax_interval
+        from sim_engine.fluid.viscosity import eddy_rate, relax_interval
 
         theta, density, d = setup.parameters, setup.density, setup.spacing
         self.cohesion[s] = cohesion_acceleration(theta.cohesion, density, d)
         self.pull_waited[s], self.pull_wait[s] = 0.0, pull_interval(theta.cohesion, density, d)
         self.viscosity[s] = theta.viscosity
+        self.eddies[s] = eddy_rate(theta.eddies)
         self.waited[s], self.wait[s] = 0.0, relax_interval(theta.viscosity)
         self.friction[s] = theta.friction
         self.lip_drop[s] = theta.lip_drop
