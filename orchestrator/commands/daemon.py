@@ -77,7 +77,7 @@ def talking(at: At) -> Iterator[Client]:
 def submit(
     path: Path,
     *,
-    verb: str,
+    wanted: str,
     rig: str,
     priority: int,
     laboratory: Path | None,
@@ -99,7 +99,7 @@ def submit(
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
     with talking(at) as client:
-        body = {"text": text, "files": files, "verb": verb, "rig": rig, "priority": priority}
+        body = {"text": text, "files": files, "verb": wanted, "rig": rig, "priority": priority}
         found = client.post("/campaigns", body)
     if as_json:
         print_json(found)

@@ -55,10 +55,10 @@ def submit(
     as_json: Json = False,
 ) -> None:
     """Put a campaign into the daemon's queue, with copies of everything that it refers to."""
-    options = given(locals(), "campaign", "url", "state")
+    options = given(locals(), "campaign", "verb", "url", "state")
     from orchestrator.commands import daemon as module
 
-    call(module.submit, campaign, at=(url, state), **options)
+    call(module.submit, campaign, wanted=verb, at=(url, state), **options)
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
