@@ -462,3 +462,4 @@ class Lane:
         with contextlib.suppress(OSError):
             busy = {one.running.item.run for one in self._daemon.lanes.values() if one.running is not None}
             await asyncio.to_thread(prune_recordings, self._common.settings, {name for name in busy if name})
+            await self._common.warm.tidy()

@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from actors.arm.errors import (
     ArmError,
@@ -112,6 +111,8 @@ class UrArm:
 
     def where(self) -> Whereabouts:
         """See `Arm.where`."""
+        from scipy.spatial.transform import Rotation
+
         joints = self.joints()
         rotation, position = forward(np.array([joints]), MODELS[self._spec.model])
         tool = cell_transforms(self._spec).tool
