@@ -12,8 +12,8 @@ from sim_engine.outcome import ParticleState
 SPILLED = int(ParticleState.SPILLED)
 
 LAYERS = 3.0
-"""Cells are as wide and as deep as lists reach, and that many times lower: what lies side by side in memory is a column,
-of which a search then takes little more than it needs."""
+"""Cells are as wide and deep as lists reach, and so many times lower: what lies side by side in memory is a column, of
+which a search then takes little more than it needs."""
 
 
 @ti.func
