@@ -17,7 +17,8 @@ from orchestrator.report.campaign import draw_figures
 from orchestrator.report.record import read_record
 from orchestrator.report.results import evaluation_of, theta_of
 from orchestrator.report.run_page import REPORT_NAME, run_page
-from orchestrator.report.summary import PoolUse, RunSummary, Totals, summarise, write_summary
+from orchestrator.report.summarise import summarise
+from orchestrator.report.summary import PoolUse, RunSummary, Totals, write_summary
 from orchestrator.run_result import CampaignResult
 from orchestrator.runs import VERSIONS
 from orchestrator.strategies.calibration.base import CalibratedTheta
