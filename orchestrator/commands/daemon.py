@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json, say
 from sim_engine.extras import MissingExtraError, require
 
 if TYPE_CHECKING:
@@ -56,10 +56,8 @@ def serve(path: Path | None, *, state: Path | None, port: int | None, simulators
 
 def _require_extra() -> None:
     for module in ("fastapi", "uvicorn", "httpx", "prometheus_client", "pythonjsonlogger"):
-        try:
+        with Refused(MissingExtraError):
             require(module, "the daemon")
-        except MissingExtraError as error:
-            raise RefusalError(str(error), BAD_INPUT) from None
 
 
 @contextmanager
