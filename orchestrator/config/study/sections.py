@@ -17,7 +17,7 @@ from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Text
+from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Seed, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
@@ -55,7 +55,7 @@ class StudyFile(Section):
     name: Name | None = None
     """Its name; runs go to study-NAME."""
 
-    seed: Count = 0
+    seed: Seed = 0
     """Seed of every random choice."""
 
     campaign: Text | None = None
@@ -238,6 +238,8 @@ def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) 
             report.add(
                 root.at("search", i), f"'{name}' is not searched by the campaign; searched are {', '.join(axes)}"
             )
+        elif name in file.search[:i]:
+            report.add(root.at("search", i), f"'{name}' stands twice; keep one")
     known = list(dict.fromkeys(name for name in file.search if name in axes))
     if not known:
         if not file.search:
