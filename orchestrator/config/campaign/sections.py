@@ -21,7 +21,6 @@ from orchestrator.config.yaml.sections import (
     PathOr,
     PositiveCount,
     Section,
-    Seed,
     Switch,
     Text,
     tagged,
@@ -266,7 +265,7 @@ class CampaignFile(Section):
     name: Name | None = None
     """Its name in run directories and figures."""
 
-    seed: Seed = 0
+    seed: Count = 0
     """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
     laboratory: PathOr[LaboratoryFile] | None = None

@@ -23,14 +23,8 @@ from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from sim_engine.marks import Mark
 
-MOST = 1_000_000
-"""The most of anything that is counted: years of simulations, decades of pours. More is a slip of the finger."""
-
-Count = Annotated[int, Strict(), Field(ge=0, le=MOST)]
+Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
-
-Seed = Annotated[int, Strict(), Field(ge=0)]
-"""A seed: any whole number from 0 on."""
 
 
 def _count_form(value: Any) -> str | None:
@@ -47,7 +41,7 @@ CountOrFree = Annotated[
 ]
 """A whole number, 0 or more, or 'free'."""
 
-PositiveCount = Annotated[int, Strict(), Field(ge=1, le=MOST)]
+PositiveCount = Annotated[int, Strict(), Field(ge=1)]
 """A whole number, 1 or more."""
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
