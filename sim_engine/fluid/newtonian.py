@@ -28,8 +28,6 @@ Source: Weiler, Koschier, Brand & Bender 2018, A physically consistent implicit 
 and thin films: ours, as above.
 """
 
-import math
-
 import taichi as ti
 
 from sim_engine.fluid.kernels import SIGMA, weight
@@ -42,8 +40,6 @@ LAYERED = 1.14
 that slide over each other, as they do beside walls: between the two."""
 PAIRS = LAYERED * 200.0 * SIGMA / SUPPORT**5
 """Of a pair's coefficient: 10 V (σ/h⁵) 20 in units of 1/d²."""
-EDDIES = 0.17**2 * math.sqrt(15.0)
-"""Smagorinsky's ν over d² and the root mean square of the rates at which pairs part."""
 NEAREST = 0.25
 """No particle is taken to be nearer to a wall than that many spacings."""
 FADES, ENDS = 0.75, 1.25
@@ -126,8 +122,9 @@ def survey(f: ti.template(), s, dt):
         f.dx[i] = f.dx[i] - lean
     nu = f.kinematic[s]
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        # A relaxation at the rate k is a viscosity of k d²/5.
         strain = ti.sqrt(f.dp[i] / (f.squares[i] + 1e-9))
-        f.dp[i] = ti.max(nu, EDDIES * d * d * strain)
+        f.dp[i] = ti.max(nu, 0.2 * f.eddies[s] * d * d * strain)
         for b in ti.static(range(VESSELS)):
             n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
             e = film(ALONE * f.squares[i], ALONE * dot(f.dx[i], n) / d)
