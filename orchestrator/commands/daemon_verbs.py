@@ -15,7 +15,8 @@ Key = Annotated[
     typer.Argument(metavar="CAMPAIGN_ID", help="As 'decant list' shows it; its beginning will do.", show_default=False),
 ]
 Url = Annotated[
-    str | None, typer.Option(help="Of the daemon; else $DECANT_URL, or the one on this machine.", show_default=False)
+    str | None,
+    typer.Option(help="The daemon's address; else $DECANT_URL, or this machine's.", show_default=False),
 ]
 State = Annotated[
     Path | None, typer.Option(help="The daemon's state directory; else $DECANT_STATE.", show_default=False)
@@ -76,7 +77,9 @@ def show(key: Key, url: Url = None, state: State = None, as_json: Json = False) 
 
 
 def logs(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Of all unless given.")] = None,
+    key: Annotated[
+        str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Whose events; all of them unless given.")
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes; Ctrl-C ends it.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Every event as one line of JSON.")] = False,
     url: Url = None,
