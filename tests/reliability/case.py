@@ -100,13 +100,20 @@ def points_of(writes: Iterable[str]) -> list[Point]:
 
 def first_and_last(points: Sequence[Point]) -> list[Point]:
     """Of each kind of write in each stage the first and the last, in order."""
-    last = {at: number for at, number in points}
+    last = dict(points)
     return [point for point in points if point[1] in (1, last[point[0]])]
 
 
-def first(points: Sequence[Point]) -> list[Point]:
-    """Of each kind of write in each stage the first, in order."""
-    return [point for point in points if point[1] == 1]
+def first_of_kind(points: Sequence[Point]) -> list[Point]:
+    """Of each kind of write in the whole campaign the first, in order."""
+    kinds: set[str] = set()
+    found = []
+    for point in points:
+        kind = point[0].partition(": ")[2]
+        if kind not in kinds:
+            kinds.add(kind)
+            found.append(point)
+    return found
 
 
 def every(target: str, fault: str, points: Iterable[Point]) -> list[Case]:

@@ -89,13 +89,14 @@ def commit() -> str:
 
 def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
     """All cases of some targets, so many processes at a time; whether all of them came to their end."""
-    tasks = [(target, n, jobs) for target in targets for n in range(jobs)]
+    shares = {"program": jobs}  # of those with many cases; a process of each of the others
+    tasks = [(target, n, shares.get(target, 1)) for target in targets for n in range(shares.get(target, 1))]
     running: list[subprocess.Popen[bytes]] = []
     good = True
     while tasks or running:
         while tasks and len(running) < jobs:
-            target, number, shares = tasks.pop(0)
-            arguments = ["--results", str(results), "--share", target, str(number), str(shares)]
+            target, number, of = tasks.pop(0)
+            arguments = ["--results", str(results), "--share", target, str(number), str(of)]
             running.append(subprocess.Popen([sys.executable, "-m", "tests.reliability.page", *arguments], cwd=ROOT))
         time.sleep(0.2)
         good &= all(process.returncode in (None, 0) for process in running)
@@ -166,13 +167,13 @@ def write(results: Path) -> int:
     rows.sort(key=lambda row: (order[row["case"]["target"]], order[row["case"]["fault"]]))
     with LIST.open("w", encoding="utf-8", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow(["struck", "fault", "at", "number", "first life", "told", "lives", "asked", "bench asked", "wrong"])
+        out.writerow(
+            ["struck", "fault", "at", "number", "first life", "told", "lives", "asked", "bench asked", "wrong"]
+        )
         for row in rows:
             case, told = row["case"], " ".join(row["told"].split())[:100]
-            out.writerow(
-                [case["target"], case["fault"], case["at"], case["number"], row["ended"], anonymous(told)]
-                + [row["lives"], row["asked"], " ".join(row["heard"]), "; ".join(row["wrong"])]
-            )
+            out.writerow([*case.values(), row["ended"], anonymous(told), row["lives"], row["asked"],
+                          " ".join(row["heard"]), "; ".join(row["wrong"])])  # fmt: skip
     for row in rows:
         if row["wrong"]:
             print(Case(**row["case"]).name, row["wrong"])

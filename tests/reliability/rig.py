@@ -26,7 +26,7 @@ import psutil
 
 from orchestrator.campaign import run_campaign
 from orchestrator.config.load import load_campaign
-from orchestrator.events import Watcher
+from orchestrator.events import Event, PourProgressed, Watcher
 from orchestrator.journal import JOURNAL_NAME, Entry, Journal, JournalReader, Kind
 from orchestrator.plan import CampaignPlan
 from orchestrator.states import State
@@ -95,6 +95,8 @@ class Rig:
     """
 
     target = "program"
+    tilts = False
+    """Whether the middle of its pours is a moment too."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -107,6 +109,7 @@ class Rig:
             said = self._live(life)
             assert said == "went on", (said, life.noted("told"))
             self.points: list[Point] = points_of(life.noted("writes"))
+            self.up = [point for point, up in zip(self.points, life.noted("up"), strict=True) if up == "yes"]
             self.expected = record(life.directory)
             self.weights = weights(life.directory)
 
@@ -172,10 +175,10 @@ class Rig:
 
     @contextlib.contextmanager
     def _room(self, place: Path, disk: Path | None = None) -> Iterator[None]:
-        (place / "tmp").mkdir()
         try:
             with contextlib.nullcontext() if disk is None else strikes.disk(disk):
-                if disk is not None and disk == place / "disk":
+                (place / "tmp").mkdir(exist_ok=True)
+                if disk is not None and disk == place / "disk" and self.target == "program":
                     (disk / "run").mkdir()
                     (place / "run").symlink_to(disk / "run")
                 yield
@@ -210,6 +213,10 @@ class Rig:
 
     def run(self, life: Life, *, resume: bool) -> None:
         """In the program's process: run the campaign, or go on with it."""
+        asyncio.run(self.campaign(life, resume=resume))
+
+    async def campaign(self, life: Life, *, resume: bool) -> None:
+        """The same, awaited."""
         plan = replace(self.plan, outputs=replace(self.plan.outputs, directory=life.place))
         life.directory.mkdir(parents=True, exist_ok=True)
 
@@ -217,15 +224,22 @@ class Rig:
             life.note("asked", question)
             return self.answer(question)
 
-        async def campaign() -> None:
-            async with self.laboratory(life) as laboratory:
-                with self.watchers(life, plan) as watchers:
-                    await run_campaign(
-                        plan, laboratory, life.directory, resume=resume, ask_operator=answer, watchers=watchers
-                    )
+        moments = Moments(life, self._strike(life), self.pids)
+        async with self.laboratory(life) as laboratory:
+            with self.watchers(life, plan) as watchers, moments.noted():
+                everybody = [*watchers, self._tilting(moments)]
+                await run_campaign(
+                    plan, laboratory, life.directory, resume=resume, ask_operator=answer, watchers=everybody
+                )
 
-        with noting(life, self._strike(life)):
-            asyncio.run(campaign())
+    def _tilting(self, moments: Moments) -> Watcher:
+        """The middle of a pour is a moment like a write."""
+
+        def watch(event: Event) -> None:
+            if self.tilts and isinstance(event, PourProgressed) and event.progress.checkpoint == "tilt":
+                moments.tilting(f"{event.stage}: tilting", event.number)
+
+        return watch
 
     def answer(self, question: str) -> str:
         """The operator has weighed what the undisturbed pour weighed."""
@@ -278,13 +292,15 @@ class Rig:
             return
         if (difference := first_difference(record(life.directory), self.expected)) is not None:
             yield f"other requests, decisions or results than undisturbed: {difference}"
-        finished = Counter(e.body["id"] for e in entries(life.directory) if e.kind in (Kind.FINISHED, Kind.POUR_FINISHED))
+        finished = Counter(
+            e.body["id"] for e in entries(life.directory) if e.kind in (Kind.FINISHED, Kind.POUR_FINISHED)
+        )
         if set(finished.values()) != {1}:
             yield "something was done again although it was finished"
         poured = Counter((life.place / "poured").read_text("utf-8").split())
         if again := [seed for seed, count in poured.items() if count > 1]:
             yield f"{len(again)} pour(s) were made twice"
-        weighed = {w for w in weights(life.directory)}
+        weighed = set(weights(life.directory))
         if weighed != set(self.weights) or len(poured) > len(weighed):
             yield f"{len(poured)} pours were made, {len(weighed)} weights are in the journal"
         if (asked := len(life.noted("asked"))) != len(unknown):
@@ -324,29 +340,52 @@ def warm_up(plan: CampaignPlan) -> None:
 # ---- in the program's process
 
 
-@contextlib.contextmanager
-def noting(life: Life, strike: Callable[[bool], None]) -> Iterator[None]:
-    """Every write of a journal is noted, and struck at where it is to be."""
-    write, seen = Journal.append_all, Counter[str]()
+class Moments:
+    """What happens, moment by moment; it is written down, and struck at where it is to be.
 
-    def noted(self: Journal, drafts: Any) -> None:
-        label = label_of(drafts)
-        seen[label] += 1
-        case = life.case
-        hit = case is not None and (label, seen[label]) == (case.at, case.number)
-        if case is None:
+    Args:
+        strike: makes the fault happen; told whether what happens has happened.
+        pids: processes of what is struck.
+    """
+
+    def __init__(self, life: Life, strike: Callable[[bool], None], pids: Callable[[], list[int]]) -> None:
+        self._life, self._strike, self._pids = life, strike, pids
+        self._seen: Counter[str] = Counter()
+
+    def comes(self, label: str) -> bool:
+        """It is about to happen; whether it is struck at."""
+        life = self._life
+        self._seen[label] += 1
+        if life.case is None:
             life.note("writes", label)
+            life.note("up", "yes" if self._pids() else "no")
+            return False
+        hit = (label, self._seen[label]) == (life.case.at, life.case.number)
         if hit:
-            strike(False)
-        write(self, drafts)
-        if hit:
-            strike(True)
+            self._strike(False)
+        return hit
 
-    Journal.append_all = noted  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        Journal.append_all = write  # type: ignore[method-assign]
+    def tilting(self, label: str, number: int) -> None:
+        """A pour tilts: the first word of it counts."""
+        if self._seen[label] < number:
+            self.comes(label)
+
+    @contextlib.contextmanager
+    def noted(self) -> Iterator[None]:
+        """Every write of a journal is such a moment."""
+        write = Journal.append_all
+
+        def noted(journal: Journal, drafts: Any) -> None:
+            hit = self.comes(label_of(drafts))
+            write(journal, drafts)
+            if hit:
+                self._strike(True)
+
+        Journal.append_all = noted  # type: ignore[method-assign]
+        try:
+            yield
+        finally:
+            Journal.append_all = write  # type: ignore[method-assign]
 
 
 def label_of(drafts: Any) -> str:
@@ -387,8 +426,12 @@ def leftovers(place: Path) -> list[psutil.Process]:
 
 
 def cpu() -> float:
-    """Seconds of a core that this process and its ended children have taken."""
-    return sum(os.times()[:4])
+    """Seconds of a core that this process and everything that it has started have taken."""
+    total = sum(os.times()[:4])
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            total += sum(process.cpu_times()[:4])
+    return total
 
 
 def entries(directory: Path) -> list[Entry]:

@@ -7,7 +7,6 @@ import ctypes
 import os
 import signal
 import socket
-import stat
 import subprocess
 import threading
 import time
@@ -62,11 +61,11 @@ def _cut(pid: int) -> int:
     libc = ctypes.CDLL(None, use_errno=True)
     handle, count = os.pidfd_open(pid), 0
     try:
-        for name in os.listdir(f"/proc/{pid}/fd"):
+        for path in Path(f"/proc/{pid}/fd").iterdir():
             with contextlib.suppress(OSError):
-                if not stat.S_ISSOCK(os.stat(f"/proc/{pid}/fd/{name}").st_mode):
+                if not path.is_socket():
                     continue
-                number = libc.syscall(_PIDFD_GETFD, handle, int(name), 0)
+                number = libc.syscall(_PIDFD_GETFD, handle, int(path.name), 0)
                 if number < 0:
                     continue
                 with socket.socket(fileno=number) as line:
@@ -101,7 +100,7 @@ def shift_clock(seconds: float) -> None:
 @contextlib.contextmanager
 def disk(place: Path) -> Iterator[None]:
     """A small disk of its own."""
-    place.mkdir(parents=True)
+    place.mkdir(parents=True, exist_ok=True)
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(place)], check=True)
     try:
         yield

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from actors.bench import virtual_operator
 from actors.bench.virtual_operator import VirtualOperator
 from actors.laboratory import InProcessLaboratory
 from actors.operator import OperatorSpec, Question
@@ -18,7 +19,7 @@ from orchestrator.journal import Kind
 from tests.actors.bench.conftest import wired_spec
 from tests.end_to_end.test_wired_campaign import write_wired
 from tests.reliability import strikes
-from tests.reliability.case import CUT, KILLED, STOPPED, Case, Point, every, first
+from tests.reliability.case import CUT, KILLED, STOPPED, Case, Point, every, first_of_kind
 from tests.reliability.formula import Formula
 from tests.reliability.rig import Life, Rig
 
@@ -31,6 +32,7 @@ ROUTINE = ("tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pour
 class WiredRig(Rig):
     """A campaign on the shipped virtual laboratory, in scaled time."""
 
+    tilts = True
     process = ""
     """What stands on the command line of what is struck."""
 
@@ -41,11 +43,9 @@ class WiredRig(Rig):
         return path
 
     def cases(self) -> list[Case]:
-        """Killed at the first write of each kind in each stage, and at each one of a pour, calibration's and D3's;
-        stopped and cut at those of D3's pour."""
-        pour = during(self.points, "deployment:narrow", 1)
-        killed = sorted({*first(self.points), *during(self.points, "pours", 2), *pour}, key=self.points.index)
-        killed = [point for point in killed if point[0] not in NOTHING_UP]
+        """Killed at the first moment of each kind, and in D3's first pour at each; stopped and cut in that."""
+        pour = [point for point in during(self.points, "deployment:narrow", 1) if point in self.up and its(point)]
+        killed = sorted({*first_of_kind(self.up), *pour}, key=self.points.index)
         return [
             *every(self.target, KILLED, killed),
             *every(self.target, STOPPED, pour),
@@ -59,16 +59,13 @@ class WiredRig(Rig):
             hurried=True,
             operator=OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
         )
+        virtual_operator.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
         async with InProcessLaboratory(spec, Formula) as opened:
             attend(opened, life)
             yield _Open(opened)
 
     def pids(self) -> list[int]:
         return strikes.descendants(self.process)
-
-
-NOTHING_UP = ("campaign: campaign.state",)
-"""Written before the laboratory is open, and after it."""
 
 
 class _Open:
@@ -92,6 +89,11 @@ def during(points: Sequence[Point], stage: str, pour: int) -> list[Point]:
     begin = points.index((f"{stage}: {Kind.POUR_STARTED}", pour))
     end = points.index((f"{stage}: {Kind.POUR_FINISHED}", pour))
     return list(points[begin : end + 1])
+
+
+def its(point: Point) -> bool:
+    """Whether a write belongs to a pour, and not to what is simulated beside it."""
+    return point[0].startswith("campaign: note") or ": pour." in point[0] or point[0].endswith("tilting")
 
 
 def attend(laboratory: InProcessLaboratory, life: Life) -> None:
