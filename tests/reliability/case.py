@@ -104,6 +104,11 @@ def first_and_last(points: Sequence[Point]) -> list[Point]:
     return [point for point in points if point[1] in (1, last[point[0]])]
 
 
+def first_in_stages(points: Sequence[Point]) -> list[Point]:
+    """Of each kind of write in each stage the first, in order."""
+    return [point for point in points if point[1] == 1]
+
+
 def first_of_kind(points: Sequence[Point]) -> list[Point]:
     """Of each kind of write in the whole campaign the first, in order."""
     kinds: set[str] = set()

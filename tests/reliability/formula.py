@@ -55,6 +55,9 @@ class Formula:
             steps=400,
             cpu_s=0.01,
             seed=task.seed,
+            curve_times=(0.0, 1.0),
+            curve_poured=(0.0, 1.0 - retained),
+            curve_spilled=(0.0, spilled),
         )
         return SimulatedPour(outcome)
 

@@ -63,7 +63,7 @@ def found(results: Path) -> dict[str, dict[str, Any]]:
     return {Case(**row["case"]).name: row for row in rows if "case" in row}
 
 
-def work(target: str, number: int, shares: int, results: Path) -> None:
+def work(target: str, number: int, shares: int, results: Path, limit: int | None = None) -> None:
     """One process' share of a target's cases, each written down as soon as it has ended."""
     with tempfile.TemporaryDirectory() as folder, results.open("a", encoding="utf-8") as out:
         rig = rig_of(target, Path(folder))
@@ -72,12 +72,11 @@ def work(target: str, number: int, shares: int, results: Path) -> None:
         random.Random(SEED).shuffle(cases)
         out.write(json.dumps({"target": target, "cases": len(cases), "points": len(rig.points)}) + "\n")
         done = {name for name, row in found(results).items() if not row["wrong"]}
-        for case in cases[number::shares]:
-            if case.name not in done:
-                outcome = rig.play(case)
-                out.write(json.dumps({**asdict(outcome), "t": time.time(), "code": commit()}) + "\n")
-                out.flush()
-                print(case.name, *outcome.wrong, sep=" | ", flush=True)
+        for case in [case for case in cases[number::shares] if case.name not in done][:limit]:
+            outcome = rig.play(case)
+            out.write(json.dumps({**asdict(outcome), "t": time.time(), "code": commit()}) + "\n")
+            out.flush()
+            print(case.name, *outcome.wrong, sep=" | ", flush=True)
         rig.close()
 
 
@@ -192,6 +191,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", nargs="+", choices=list(RIGS), default=list(RIGS))
+    parser.add_argument("--limit", type=int, default=None, help="as many cases of each share, and no more")
     parser.add_argument("--fresh", action="store_true")
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -199,7 +199,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.share is not None:
         target, number, shares = options.share
-        work(target, int(number), int(shares), options.results)
+        work(target, int(number), int(shares), options.results, options.limit)
         return
     options.results.parent.mkdir(exist_ok=True)
     if options.fresh:

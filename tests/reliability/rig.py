@@ -20,7 +20,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import psutil
 
@@ -104,7 +104,7 @@ class Rig:
         self.weights: dict[str, str] = {}
         warm_up(self.plan)
         place = self._place()
-        life = Life(place)
+        life = self.life(place)
         with self._room(place):
             said = self._live(life)
             assert said == "went on", (said, life.noted("told"))
@@ -134,6 +134,10 @@ class Rig:
         """Who watches."""
         yield []
 
+    def life(self, place: Path, case: Case | None = None) -> Life:
+        """Of a case, or undisturbed."""
+        return Life(place, case)
+
     def pids(self) -> list[int]:
         """In the program's process: of what is struck."""
         return [os.getpid()]
@@ -154,7 +158,7 @@ class Rig:
     def play(self, case: Case) -> Outcome:
         """Strike, go on, compare."""
         place, begun = self._place(), cpu()
-        life = Life(place, case)
+        life = self.life(place, case)
         disk = self.full(life) if case.fault == FULL else None
         with self._room(place, disk):
             ended = self._live(life)
@@ -193,23 +197,27 @@ class Rig:
                 path.unlink()
         child = os.fork()
         if child == 0:
-            code = 1
-            try:
-                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-                os.dup2(os.open(life.place / "errors", os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
-                os.environ |= {"TMPDIR": str(life.place / "tmp"), LOG: str(life.place / "poured")}
-                tempfile.tempdir = None
-                self.run(life, resume=there)
-                code = 0
-            except Exception as error:
-                with contextlib.suppress(OSError):
-                    life.note("told", f"{type(error).__name__}: {error}")
-            finally:
-                os._exit(code)
+            self._in_child(life, resume=there)
         status = wait(child)
         if os.WIFSIGNALED(status):
             return f"ended by {signal.Signals(os.WTERMSIG(status)).name}"
         return "went on" if os.WEXITSTATUS(status) == 0 else f"came to rest: {state(life.directory)}"
+
+    def _in_child(self, life: Life, *, resume: bool) -> NoReturn:
+        """The program's process, from its beginning to its end."""
+        code = 1
+        try:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            os.dup2(os.open(life.place / "errors", os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
+            os.environ |= {"TMPDIR": str(life.place / "tmp"), LOG: str(life.place / "poured")}
+            tempfile.tempdir = None
+            self.run(life, resume=resume)
+            code = 0
+        except Exception as error:
+            with contextlib.suppress(OSError):
+                life.note("told", f"{type(error).__name__}: {error}")
+        finally:
+            os._exit(code)
 
     def run(self, life: Life, *, resume: bool) -> None:
         """In the program's process: run the campaign, or go on with it."""
@@ -475,7 +483,7 @@ def weights(directory: Path) -> dict[str, str]:
             numbers[entry.body["id"]] = entry.body["request"]["number"]
         elif entry.kind == Kind.POUR_FINISHED and "measurement" in entry.body["outcome"]:
             m = entry.body["outcome"]["measurement"]
-            grams = " ".join(repr(round(1e3 * m[name], 6)) for name in ("spilled", "retained", "loaded"))
+            grams = " ".join(repr(round(1e3 * m[name], 12)) for name in ("spilled", "retained", "loaded"))
             found[f"{entry.stage} {numbers[entry.body['id']]}"] = f"weighed {grams}"
     return found
 
@@ -489,7 +497,7 @@ def record(directory: Path) -> list[Any]:
         match entry.kind:
             case Kind.POUR_FINISHED if "measurement" in body["outcome"]:
                 measured = body["outcome"]["measurement"]
-                outcomes[body["id"]] = [round(1e3 * measured[k], 4) for k in ("loaded", "spilled", "retained")]
+                outcomes[body["id"]] = [round(1e3 * measured[k], 9) for k in ("loaded", "spilled", "retained")]
             case Kind.FINISHED | Kind.POUR_FINISHED:
                 outcomes[body["id"]] = timeless(body["outcome"])
             case Kind.TOLD:

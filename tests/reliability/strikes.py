@@ -7,6 +7,7 @@ import ctypes
 import os
 import signal
 import socket
+import struct
 import subprocess
 import threading
 import time
@@ -48,8 +49,14 @@ def stop(pids: Iterable[int], pause: float = PAUSE) -> None:
     threading.Thread(target=go_on).start()
 
 
+def stop_this() -> None:
+    """The same for this process: another one lets it go on."""
+    subprocess.Popen(["sh", "-c", f"sleep {PAUSE}; kill -CONT {os.getpid()}"], start_new_session=True)
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
 def cut(pids: Iterable[int]) -> int:
-    """Shut all connections of other processes, as a line that is cut; their two ends find out by themselves.
+    """Shut all connections of processes with others, as a line that is cut; their two ends find out by themselves.
 
     Returns:
         How many there were.
@@ -69,14 +76,28 @@ def _cut(pid: int) -> int:
                 if number < 0:
                     continue
                 with socket.socket(fileno=number) as line:
-                    if line.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
-                        continue  # it only listens
+                    if line.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) or _with_itself(line, pid):
+                        continue  # it only listens, or is how its threads wake each other
                     line.getpeername()
                     line.shutdown(socket.SHUT_RDWR)
                     count += 1
     finally:
         os.close(handle)
     return count
+
+
+def _with_itself(line: socket.socket, pid: int) -> bool:
+    if line.family != socket.AF_UNIX:
+        return False
+    peer, _, _ = struct.unpack("3i", line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    return bool(peer == pid)
+
+
+def connections(pid: int) -> int:
+    """How many connections over the network a process has."""
+    with contextlib.suppress(psutil.Error):
+        return sum(one.status == psutil.CONN_ESTABLISHED for one in psutil.Process(pid).net_connections("inet"))
+    return 0
 
 
 def descendants(*words: str) -> list[int]:
