@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from actors.cluster.nodes import PinnedNode
 from actors.protocols import BenchLostError, LaboratoryError
+from actors.ray_class import actor_class
 
 
 class DeviceLostError(LaboratoryError):
@@ -100,19 +101,16 @@ class RayDevice:
 
     def __init__(self, name: str, cls: type[Any], *args: Any, node: PinnedNode | None = None) -> None:
         self.name = name
-        self._class, self._args, self._node = cls, args, node
+        self._class: Any = cls
+        self._args, self._node = args, node
         self._actor: Any = None
         self._lost = False
         self._start()
 
     def _start(self) -> None:
-        import ray
-
         placement = {} if self._node is None else self._node.options
-        actor_class = ray.remote(
-            num_cpus=0, max_restarts=0, max_task_retries=0, concurrency_groups={"work": 1, "control": 2}, **placement
-        )(self._class)
-        self._actor = actor_class.remote(*self._args)
+        made = actor_class(self._class, (("work", 1), ("control", 2)))
+        self._actor = made.options(num_cpus=0, **placement).remote(*self._args)
         self._lost = False
 
     async def call(self, method: str, *args: Any, deadline: float, urgent: bool = False) -> Any:

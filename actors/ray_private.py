@@ -11,6 +11,7 @@ import contextlib
 import fcntl
 import logging
 import os
+import re
 import secrets
 import subprocess
 import sys
@@ -21,12 +22,17 @@ from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
 
+import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
+
 from actors.protocols import LaboratoryError
 from actors.ray_warden import MARK, end_cluster
 from actors.spec import LaboratorySpec
 
 _LONGEST_FOLDER = 40
 """Ray puts sockets some 65 characters below its folder, and a socket's path may have 107."""
+
+_WORKER_LOG = re.compile(r"(?:worker-|python-core-worker-).*[-_](\d+)\.(?:out|err|log)")
+"""Name of a worker's log; the number is its process id."""
 
 _TOKEN = secrets.token_hex(32)
 """Without it nobody else on this machine may talk to our Ray. One per process, since Ray reads it only once."""
@@ -57,6 +63,15 @@ class PrivateRay:
             # Makes Ray take 127.0.0.1 for the node's address and listen there only. On Windows and macOS that is its
             # habit; on Linux it would offer itself to the network.
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+            # Ray remembers 100,000 each of dead actors, dead workers and calls, for a dashboard that nobody opens: over
+            # weeks that is memory.
+            "RAY_maximum_gcs_destroyed_actor_cached_count": "50",
+            "RAY_maximum_gcs_dead_worker_cached_count": "50",
+            "RAY_task_events_report_interval_ms": "0",
+            # Its own processes would log some 2 MB an hour, up to gigabytes.
+            "RAY_BACKEND_LOG_LEVEL": "warning",
+            "RAY_ROTATION_MAX_BYTES": "2000000",
+            "RAY_ROTATION_BACKUP_COUNT": "1",
         }
 
 
@@ -168,6 +183,29 @@ def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
     finally:
         # Programs that this one starts later are not Ray's and must not be ended with it.
         del os.environ[MARK]
+    _end_log_monitor()
     address = ray.util.get_node_ip_address()
     if address != "127.0.0.1":
         raise LaboratoryError(f"Ray listens on {address} instead of this machine only; was it imported too early?")
+
+
+def _end_log_monitor() -> None:
+    """End the process that reads all workers' logs: nobody is told of them, and it holds up to 200 of them open."""
+    from ray._private import worker
+
+    worker._global_node.kill_log_monitor(check_alive=False)
+
+
+def forget_logs(private: PrivateRay) -> int:
+    """Remove the logs of Ray's workers that are gone: each bench that is opened and closed leaves some.
+
+    Returns:
+        How many files were removed.
+    """
+    removed = 0
+    for path in private.folder.glob("session_*/logs/*-*"):
+        found = _WORKER_LOG.fullmatch(path.name)
+        if found is not None and not psutil.pid_exists(int(found[1])):
+            path.unlink(missing_ok=True)
+            removed += 1
+    return removed

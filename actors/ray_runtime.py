@@ -19,7 +19,7 @@ from types import FrameType
 
 from actors.cluster.last_word import dismiss, speaker
 from actors.protocols import LaboratoryError
-from actors.ray_private import PrivateRay, close_private, open_private, start_private
+from actors.ray_private import PrivateRay, close_private, forget_logs, open_private, start_private
 from actors.ray_settings import ray_settings
 from actors.spec import LaboratorySpec
 
@@ -94,6 +94,13 @@ def stop_ray() -> None:
 def ray_folder() -> Path | None:
     """Folder of the private Ray; None while there is none."""
     return None if _cluster is None or _cluster.private is None else _cluster.private.folder
+
+
+def forget_ray_logs() -> None:
+    """Remove what dead workers of a private Ray have logged. Takes moments; may be called at any time."""
+    cluster = _cluster
+    if cluster is not None and cluster.private is not None:
+        forget_logs(cluster.private)
 
 
 def keep_signals() -> None:

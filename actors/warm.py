@@ -103,6 +103,13 @@ class WarmSimulators:
             raise LaboratoryError("the optimiser is not up yet")
         return DeviceOptimizer(self._proposer)
 
+    async def tidy(self) -> None:
+        """Forget what laboratories that are closed have left behind."""
+        if self._pool is not None and not self._spec.in_process:
+            from actors.ray_runtime import forget_ray_logs
+
+            await asyncio.to_thread(forget_ray_logs)
+
     async def close(self) -> None:
         """End them. May be called twice."""
         async with self._opening:

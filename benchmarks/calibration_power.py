@@ -53,10 +53,18 @@ from sim_engine.space import Axis, Space
 from sim_engine.task import PourTask
 
 CAMPAIGN = ROOT / "configs" / "campaigns" / "recorded.yaml"
-STEPS = (("viscosity",), ("cohesion",), ("friction",), ("wall_distance", "lip_drop"))
+STEPS = (("viscosity",), ("cohesion",), ("friction",), ("wall_distance", "lip_drop"), ("eddies",))
 """Which parameters join the search, one step after the other."""
 
-RANGES = {"friction": Axis("friction", 0.0, 0.3)}
+RANGES = {
+    axis.name: axis
+    for axis in (
+        Axis("cohesion", 0.0, 0.1),
+        Axis("viscosity", 0.0, 10.0),
+        Axis("friction", 0.0, 0.3),
+        Axis("eddies", 0.0, 0.2),
+    )
+}
 """Ranges of parameters that the campaign does not search."""
 
 SPLITS = ("train", "test", "transfer")

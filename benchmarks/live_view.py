@@ -1,12 +1,14 @@
-"""What watching costs control: `python benchmarks/live_view.py`; writes docs/live-view-timing.json.
+"""What watching costs control: `python benchmarks/live_view.py`; writes docs/live-view-timing.json and the table.
 
 A control loop of 100 Hz runs in this process and emits what a campaign emits: a pour's progress ten times a second, a
-simulation every half second, every tenth with its particles. Measured is how late the loop wakes, how long emitting
-takes, and CPU time, with no monitor, with a recording, with the live view and 0, 1, 20 viewers, with a viewer and with
-the server stopped by SIGSTOP, with the server killed, and with a full disk.
+simulation every half second, every tenth with its particles, and a surrogate every two seconds. Measured is how late
+the loop wakes, how long emitting takes, and CPU time of control, of the process that writes and of Rerun's server: with
+no monitor, with a recording, with the live view and 0, 1, 20 viewers, with a viewer and with the server stopped by
+SIGSTOP, with the server killed, and with a full disk. All of it from when programs are loaded and the first pictures
+drawn (`--warm-up`).
 
 Viewers are Rerun's own program without a screen: they take the stream as a browser does. Times on a machine that does
-something else as well are worth their ratios, no more.
+something else as well are worth their ratios, no more. However the script ends, nothing that it started stays.
 """
 
 from __future__ import annotations
@@ -18,16 +20,19 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
 
+from actors.optimizer.core.problem import Data, SuggestProblem
+from actors.optimizer.core.propose import propose
 from actors.protocols import PourProgress
 from orchestrator.config.load import load_campaign
 from orchestrator.events import Event, PourProgressed, RequestFinished, RequestStarted
@@ -35,7 +40,7 @@ from orchestrator.monitor.live import LiveView
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.monitor.server import environment, rerun_program
 from orchestrator.plan import CampaignPlan
-from orchestrator.requests import Pour, Simulate, Simulated
+from orchestrator.requests import Pour, Simulate, Simulated, Suggest, Suggested
 from sim_engine.outcome import PourOutcome
 from sim_engine.simulated import RecordedFrames
 
@@ -50,18 +55,25 @@ PARTICLES = 2000
 def main() -> None:
     """Measure all cases."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0, help="per case")
+    parser.add_argument("--seconds", type=float, default=60.0, help="measured, per case")
+    parser.add_argument("--warm-up", type=float, default=15.0, help="before that [s]")
+    parser.add_argument("--only", default="", help="cases whose names begin so")
     parser.add_argument("--to", type=Path, default=ROOT / "docs" / "live-view-timing.json")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what is open is closed
     plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml")
     rows = []
     for name, case in cases(plan):
-        with tempfile.TemporaryDirectory() as folder, case(Path(folder)) as (watcher, processes):
-            row = {"case": name, **asyncio.run(controlled(plan, watcher, processes, arguments.seconds))}
+        if not name.startswith(arguments.only):
+            continue
+        with tempfile.TemporaryDirectory() as folder, case(Path(folder)) as watching:
+            measured = asyncio.run(controlled(plan, watching, arguments.seconds, arguments.warm_up))
+            row = {"case": name, **measured}
         rows.append(row)
         print(json.dumps(row), flush=True)
     told = {
         "seconds": arguments.seconds,
+        "warm_up": arguments.warm_up,
         "rate_hz": RATE,
         "cores": os.cpu_count(),
         "load": os.getloadavg(),
@@ -70,7 +82,21 @@ def main() -> None:
     arguments.to.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
 
 
-Watching = tuple[RerunMonitor | None, list[psutil.Process]]
+@dataclass(frozen=True)
+class Watching:
+    """Who watches.
+
+    Attributes:
+        monitor: that events go to.
+        processes: that do it, by what they are.
+        recording: that is written.
+    """
+
+    monitor: RerunMonitor | None = None
+    processes: Mapping[str, psutil.Process] = field(default_factory=dict)
+    recording: Path | None = None
+
+
 Case = Callable[[Path], contextlib.AbstractContextManager[Watching]]
 
 
@@ -79,34 +105,30 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
 
     @contextlib.contextmanager
     def nobody(folder: Path) -> Iterator[Watching]:
-        yield None, []
+        yield Watching()
 
     @contextlib.contextmanager
     def recorded(folder: Path) -> Iterator[Watching]:
         monitor = RerunMonitor(folder / "campaign.rrd", plan)
-        yield monitor, [psutil.Process(monitor.pid)]
-        monitor.close()
+        with guarded(monitor.pid):
+            yield Watching(monitor, {"writer": psutil.Process(monitor.pid)}, monitor.path)
+            monitor.close()
 
-    def live(viewers: int, harm: Callable[[LiveView, list[int]], None] = lambda view, pids: None) -> Case:
+    def live(viewers: int, harm: Callable[[psutil.Process, list[int]], None] = lambda server, pids: None) -> Case:
         @contextlib.contextmanager
         def case(folder: Path) -> Iterator[Watching]:
             with contextlib.ExitStack() as stack:
                 view = stack.enter_context(LiveView())
+                server = psutil.Process(view.server_pid)
                 monitor = view.watcher_for(plan, folder)
+                stack.enter_context(guarded(monitor.pid))
                 pids = [stack.enter_context(viewer(view, folder / f"{n}.rrd")) for n in range(viewers)]
-                harm(view, pids)
-                yield monitor, [psutil.Process(monitor.pid)]
+                harm(server, pids)
+                processes = {"writer": psutil.Process(monitor.pid), "server": server}
+                yield Watching(monitor, processes, monitor.path)
                 monitor.close(20.0)
-                for pid in pids:
-                    os.kill(pid, signal.SIGCONT)
 
         return case
-
-    def stop_server(view: LiveView, pids: list[int]) -> None:
-        os.kill(view.server_pid, signal.SIGSTOP)
-
-    def kill_server(view: LiveView, pids: list[int]) -> None:
-        os.kill(view.server_pid, signal.SIGKILL)
 
     @contextlib.contextmanager
     def full(folder: Path) -> Iterator[Watching]:
@@ -117,8 +139,9 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
             raise SystemExit("the case of a full disk needs the right to mount a tmpfs of 1 MiB")
         try:
             monitor = RerunMonitor(mount / "campaign.rrd", plan)
-            yield monitor, [psutil.Process(monitor.pid)]
-            monitor.close(20.0)
+            with guarded(monitor.pid):
+                yield Watching(monitor, {"writer": psutil.Process(monitor.pid)}, monitor.path)
+                monitor.close(20.0)
         finally:
             subprocess.run(["umount", "-l", str(mount)], check=False)
 
@@ -126,8 +149,9 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
     def stopped_writer(folder: Path) -> Iterator[Watching]:
         monitor = RerunMonitor(folder / "campaign.rrd", plan, capacity=200)
         os.kill(monitor.pid, signal.SIGSTOP)
-        yield monitor, [psutil.Process(monitor.pid)]
-        monitor.close(1.0)
+        with guarded(monitor.pid):
+            yield Watching(monitor, {"writer": psutil.Process(monitor.pid)}, monitor.path)
+            monitor.close(1.0)
 
     return [
         ("nobody watches", nobody),
@@ -135,9 +159,9 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
         ("live, no viewer", live(0)),
         ("live, 1 viewer", live(1)),
         ("live, 20 viewers", live(20)),
-        ("live, viewer stopped", live(1, lambda view, pids: os.kill(pids[0], signal.SIGSTOP))),
-        ("live, server stopped", live(0, stop_server)),
-        ("live, server killed", live(0, kill_server)),
+        ("live, viewer stopped", live(1, lambda server, pids: os.kill(pids[0], signal.SIGSTOP))),
+        ("live, server stopped", live(0, lambda server, pids: server.suspend())),
+        ("live, server killed", live(0, lambda server, pids: server.kill())),
         ("writer stopped", stopped_writer),
         ("disk full", full),
     ]
@@ -149,33 +173,50 @@ def viewer(view: LiveView, kept: Path) -> Iterator[int]:
     command = [rerun_program(), "--save", str(kept), "--connect", view.stream, "--port", "auto"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment())
     try:
-        yield process.pid
+        with guarded(process.pid):
+            yield process.pid
     finally:
         process.kill()
         process.wait()
 
 
-async def controlled(
-    plan: CampaignPlan, watcher: RerunMonitor | None, processes: list[psutil.Process], seconds: float
-) -> dict[str, Any]:
-    """Run the loop, and say how it went."""
-    await asyncio.sleep(4.0)  # programs are loaded
-    cpu = _cpu(processes)
+_GUARD = "import os, sys; sys.stdin.read(); os.kill(int(sys.argv[1]), 9)"
+
+
+@contextlib.contextmanager
+def guarded(pid: int) -> Iterator[None]:
+    """A process that would stay, stopped perhaps, if this script were killed, is ended then."""
+    guard = subprocess.Popen([sys.executable, "-c", _GUARD, str(pid)], stdin=subprocess.PIPE, start_new_session=True)
+    try:
+        yield
+    finally:
+        guard.kill()
+        guard.wait()
+
+
+async def controlled(plan: CampaignPlan, watching: Watching, seconds: float, warm_up: float) -> dict[str, Any]:
+    """Run the loop, and say how it went once programs are loaded."""
+    watcher = watching.monitor
     late, emitting, count = [], [], 0
     events = _events(plan)
-    own, begin = time.process_time(), time.monotonic()
-    while (now := time.monotonic() - begin) < seconds:
+    begin = time.monotonic()
+    cpu, size, own, measuring = _cpu(watching), _size(watching), 0.0, False
+    while (now := time.monotonic() - begin) < warm_up + seconds:
+        if not measuring and now >= warm_up:
+            measuring, cpu, size, own = True, _cpu(watching), _size(watching), time.process_time()
         tick = round(now * RATE) + 1
         for event in events(tick):
             if watcher is not None:
                 start = time.perf_counter()
                 watcher(event)
-                emitting.append(time.perf_counter() - start)
-            count += 1
+                if measuring:
+                    emitting.append(time.perf_counter() - start)
+            count += measuring
         await asyncio.sleep(max(tick / RATE - (time.monotonic() - begin), 0.0))
-        late.append(time.monotonic() - begin - tick / RATE)
+        if measuring:
+            late.append(time.monotonic() - begin - tick / RATE)
     own = time.process_time() - own
-    spent = _cpu(processes) - cpu
+    spent = {name: after - cpu[name] for name, after in _cpu(watching).items()}
     lateness = 1e3 * np.array(late)
     return {
         "late_median_ms": round(float(np.median(lateness)), 3),
@@ -183,7 +224,9 @@ async def controlled(
         "emit_99_us": round(1e6 * float(np.percentile(emitting, 99)), 1) if emitting else 0.0,
         "emit_most_us": round(1e6 * max(emitting, default=0.0), 1),
         "control_cpu_percent": round(100.0 * own / seconds, 2),
-        "writer_cpu_percent": round(100.0 * spent / seconds, 2),
+        "writer_cpu_percent": round(100.0 * spent.get("writer", 0.0) / seconds, 2),
+        "server_cpu_percent": round(100.0 * spent.get("server", 0.0) / seconds, 2),
+        "written_kB_s": round(1e-3 * (_size(watching) - size) / seconds, 1),
         "events": count,
         "dropped": 0 if watcher is None else watcher.dropped,
     }
@@ -204,6 +247,11 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
     pour = Pour(scene.name, action, 1, 1)
     stage = f"deployment:{scene.name}"
 
+    space = plan.deployment.actions
+    weighed = Data(tuple(map(tuple, rng.random((12, space.dimension)))), tuple(rng.random(12)))
+    question = Suggest(SuggestProblem(space, weighed, map_resolution=25))
+    answer = propose(question.problem)
+
     def at(tick: int) -> list[Event]:
         told: list[Event] = []
         if tick == 1:
@@ -212,6 +260,8 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
             joints = tuple(value + 0.1 * np.sin(tick / 100.0) for value in home)
             progress = PourProgress("tilt", 0.5, 0.3, 1e-5 * tick, stable=False, joints=joints)
             told.append(PourProgressed(stage=stage, id=1, number=1, progress=progress))
+        if tick % 200 == 0:
+            told.append(RequestFinished(stage=stage, id=10**6 + tick, request=question, outcome=Suggested(answer)))
         if tick % 50 == 0:
             frames = None
             if tick % 500 == 0:
@@ -234,13 +284,20 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
     return at
 
 
-def _cpu(processes: list[psutil.Process]) -> float:
-    total = 0.0
-    for process in processes:
+def _cpu(watching: Watching) -> dict[str, float]:
+    """CPU seconds of each process; 0 for one that is gone."""
+    spent = dict.fromkeys(watching.processes, 0.0)
+    for name, process in watching.processes.items():
         with contextlib.suppress(psutil.Error):
             times = process.cpu_times()
-            total += times.user + times.system
-    return total
+            spent[name] = times.user + times.system
+    return spent
+
+
+def _size(watching: Watching) -> int:
+    with contextlib.suppress(OSError):
+        return 0 if watching.recording is None else watching.recording.stat().st_size
+    return 0
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ PLAN: dict[str, tuple[str, ...]] = {
     "scaling": ("scaling.py", "--repeats=1"),
     "scenes": ("batches.py",),
     "start-up": ("start_up.py",),
+    "validate": ("validate_cost.py",),
     "profile": ("profile_passes.py",),
     "core-limit": ("core_limit.py",),
     "pool": ("pool_speed.py",),
@@ -73,6 +74,7 @@ def page_text(records: dict[str, Any], tried: str) -> str:
         page_many.scenes(records.get("scenes")),
         sections.memory(scaling),
         sections.start_up(records.get("start-up")),
+        page_many.validate(records.get("validate")),
         page_many.pool(records.get("pool")),
         page_many.gpu(records.get("gpu")),
     ]

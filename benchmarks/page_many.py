@@ -1,4 +1,4 @@
-"""Sections of the performance page about many pours: in one call, in a pool, on a GPU."""
+"""Sections of the performance page about many pours (in one call, in a pool, on a GPU), and about many files."""
 
 from __future__ import annotations
 
@@ -29,6 +29,21 @@ def scenes(record: Record | None) -> str:
         pours cost, and memory does not grow with it."""
     )
     return f"## {title}\n\n{about}\n\n{table(head, rows, 'rrrrrr')}\n{settings([record])}"
+
+
+def validate(record: Record | None) -> str:
+    """What the check of every shipped file costs."""
+    title = "Checking a file"
+    if record is None:
+        return missing(title, "validate_cost.py")
+    r = record["result"]
+    rows = [(f"`{row['file']}`", f"{row['cpu_s']:.2f}") for row in r["files"]]
+    about = prose(
+        f"""CPU seconds, user and system, of `decant validate` for every shipped file: medians of {r["repeats"]} fresh
+        processes, start and imports included, with a warm cache. Required: {r["limit_s"]:g}
+        ({_met(r["within_limit"])})."""
+    )
+    return f"## {title}\n\n{about}\n\n{table(('file', 'CPU s'), rows, 'lr')}\n{settings([record])}"
 
 
 def pool(record: Record | None) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 from orchestrator.catalogue import search
 from orchestrator.catalogue.columns import TABLES
+from orchestrator.catalogue.conditions import Conditions, PourConditions
 from orchestrator.catalogue.index import Catalogue
 from orchestrator.pour_rows import Row
 from sim_engine.extras import require
@@ -16,33 +16,14 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def find_runs(
-    *words: str,
-    since: str | None = None,
-    until: str | None = None,
-    campaign: str | None = None,
-    pourer: str | None = None,
-    receiver: str | None = None,
-    liquid: str | None = None,
-    strategy: str | None = None,
-    mode: str | None = None,
-    state: str | None = None,
-    tag: str | None = None,
-) -> pd.DataFrame:
+def find_runs(*words: str, **conditions: Unpack[Conditions]) -> pd.DataFrame:
     """Runs of this machine, the newest first; `open_run(path)` opens one. Names may hold * and ?.
 
     Args:
         words: that all stand somewhere in a run's names, vessels, tags or notes.
-        since: begun at that date or later: '2030-03-01', '2030-03', '7d' (ago).
-        until: begun at that date or before, to the end of the day or month.
-        campaign: its name.
-        pourer: name of a vessel that was poured from.
-        receiver: name of a vessel that was poured into.
-        liquid: its name.
-        strategy: of calibration or deployment.
-        mode: 'virtual' or 'real'.
-        state: as `decant runs` shows it: 'finished', 'interrupted' …
-        tag: of `decant runs tag`.
+        conditions: any of `since`, `until` ('2030-03-01', '2030-03', '7d' ago; to the end of the day or month),
+            `campaign`, `pourer`, `receiver`, `liquid`, `strategy`, `tag` (names), `mode` ('virtual' or 'real'), and
+            `state` as `decant runs` shows it ('finished', 'interrupted' …). All that are given must hold.
 
     Returns:
         One row for each run; what the columns mean stands in the data dictionary of `decant runs export`.
@@ -51,49 +32,15 @@ def find_runs(
         ValueError: a date or the mode is none.
         RunError: the catalogue can't be read.
     """
-    conditions = search.searching(
-        words=words,
-        since=since,
-        until=until,
-        mode=mode,
-        campaign=campaign,
-        pourer=pourer,
-        receiver=receiver,
-        liquid=liquid,
-        strategy=strategy,
-        state=state,
-        tag=tag,
-    )
-    return _table("run", lambda catalogue: search.find_runs(catalogue, conditions))
+    return _table("run", search.find_runs, search.searching(words=words, **conditions))
 
 
-def find_pours(
-    *words: str,
-    since: str | None = None,
-    until: str | None = None,
-    run: str | Path | None = None,
-    campaign: str | None = None,
-    pourer: str | None = None,
-    receiver: str | None = None,
-    liquid: str | None = None,
-    strategy: str | None = None,
-    mode: str | None = None,
-    tag: str | None = None,
-) -> pd.DataFrame:
+def find_pours(*words: str, **conditions: Unpack[PourConditions]) -> pd.DataFrame:
     """Pours of all runs of this machine, the oldest first: action in display units, masses [g], spillage, loss.
 
     Args:
         words: see `find_runs`.
-        since: weighed at that date or later.
-        until: weighed at that date or before, to the end of the day or month.
-        run: name of a run's folder, or its path.
-        campaign: its name.
-        pourer: vessel that was poured from.
-        receiver: vessel that was poured into.
-        liquid: its name.
-        strategy: that asked for the pour.
-        mode: 'virtual' or 'real'.
-        tag: of the run.
+        conditions: see `find_runs`; dates are those of the weighing. `run` is the name of a run's folder, or its path.
 
     Returns:
         One row for each pour that had begun.
@@ -101,29 +48,18 @@ def find_pours(
     Raises:
         ValueError, RunError: see `find_runs`.
     """
-    conditions = search.searching(
-        words=words,
-        since=since,
-        until=until,
-        mode=mode,
-        run=None if run is None else str(run),
-        campaign=campaign,
-        pourer=pourer,
-        receiver=receiver,
-        liquid=liquid,
-        strategy=strategy,
-        tag=tag,
-    )
-    return _table("pour", lambda catalogue: search.find_pours(catalogue, conditions))
+    run = conditions.pop("run", None)
+    asked = search.searching(words=words, run=None if run is None else str(run), **conditions)
+    return _table("pour", search.find_pours, asked)
 
 
-def _table(name: str, find: Callable[[Catalogue], list[Row]]) -> pd.DataFrame:
+def _table(name: str, find: Callable[[Catalogue, search.Search], list[Row]], asked: search.Search) -> pd.DataFrame:
     require("pandas", "A table")
     import pandas as pd
 
     with Catalogue() as catalogue:
         catalogue.refresh()
-        rows = find(catalogue)
+        rows = find(catalogue, asked)
     table = pd.DataFrame(rows, columns=[column.name for column in TABLES[name]])
     for column in TABLES[name]:
         if column.type == "time":

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.campaign import CampaignResult, read_result
 from orchestrator.config.load import load_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import CampaignPlan
@@ -19,6 +18,7 @@ from orchestrator.report.run_page import REPORT_NAME
 from orchestrator.report.units import loss_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
 from orchestrator.results import Results
+from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.deployment.learnt import Recommended
 from orchestrator.strategies.display import displayed_action

@@ -1,8 +1,7 @@
 """Pictures of the live view for `docs/live-view.md`, by a headless browser: `python docs/make_live_pictures.py`.
 
-It runs the quickstart with `--live` in a folder of its own, looks at it once while it pours, and afterwards at the tabs
-of its recording: a browser without a graphics card draws a minute behind what happens. Needs Playwright and a Chromium
-(`--chromium`), no display; some five minutes on two cores.
+It runs the quickstart with `--live` in a folder of its own, looks at it while it calibrates and while it pours, and
+afterwards at its recording. Needs Playwright and a Chromium (`--chromium`), no display; some five minutes on two cores.
 """
 
 from __future__ import annotations
@@ -15,8 +14,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
 from orchestrator.monitor.live import LiveView
@@ -27,12 +27,14 @@ FOLDER = ROOT / "docs" / "images" / "live"
 
 SIZE = {"width": 1920, "height": 1080}
 
-SETTLING = 35.0
-"""A software rasteriser takes so long to draw what it was sent [s]."""
+SMALL = {"width": 320, "height": 180}
+"""While it catches up: a software rasteriser takes in more between two pictures if these are small."""
 
+SETTLING = 30.0
+"""So long it takes to draw a large picture well [s]."""
 
-TABS = {"calibrating": (60.0, 50.0), "deploying": (146.0, 50.0), "replaying": (240.0, 50.0)}
-"""Where the tabs stand [pixels]: the page is one canvas, and has no elements to be found by name."""
+CATCHING_UP = 60.0
+"""For a recording that is opened at once [s]."""
 
 
 def main() -> None:
@@ -46,22 +48,27 @@ def main() -> None:
     recording = arguments.recording
     if recording is None:
         recording = during_a_run(arguments.chromium, arguments.to)
-    with LiveView(shown=(recording,)) as view:
-        look(arguments.chromium, view.url, {arguments.to / f"{name}.png": at for name, at in TABS.items()})
+    with LiveView(shown=(recording,)) as view, looking(arguments.chromium, view.url) as page:
+        time.sleep(CATCHING_UP)
+        picture(page, arguments.to / "replaying.png")
 
 
 def during_a_run(chromium: str, to: Path) -> Path:
-    """Look at a running quickstart; returns its recording."""
+    """Look at a running quickstart while it calibrates and while it pours; returns its recording."""
     with tempfile.TemporaryDirectory() as name:
         shutil.copytree(ROOT / "configs", Path(name) / "configs")
         campaign = Path(name) / "configs" / "campaigns" / "quickstart.yaml"
-        with running(campaign) as (process, url, run):
-            wait(process, run, poured=2)
-            look(chromium, url, {to / "live.png": None})
+        with running(campaign) as (process, url, run), looking(chromium, url) as page:
+            wait(process, run, stage="calibration", kind=Kind.TOLD, count=22)
+            picture(page, to / "calibrating.png")
+            wait(process, run, stage="deployment", kind=Kind.POUR_FINISHED, count=2)
+            picture(page, to / "deploying.png")
             process.wait(1800.0)
-        kept = Path(tempfile.gettempdir()) / "quickstart.rrd"
-        shutil.copy(run / "campaign.rrd", kept)
-        return kept
+        kept = Path(tempfile.gettempdir()) / "live-quickstart-run"
+        shutil.rmtree(kept, ignore_errors=True)
+        shutil.copytree(run, kept)
+        print(f"the run is kept in {kept}: decant report makes its page anew", flush=True)
+        return kept / "campaign.rrd"
 
 
 @contextlib.contextmanager
@@ -96,18 +103,19 @@ def running(campaign: Path) -> Iterator[tuple[subprocess.Popen[str], str, Path]]
             process.wait(120.0)
 
 
-def wait(process: subprocess.Popen[str], run: Path, poured: int) -> None:
-    """Until so many pours are in a run's journal."""
+def wait(process: subprocess.Popen[str], run: Path, *, stage: str, kind: Kind, count: int) -> None:
+    """Until so many entries of a kind are in a run's journal."""
     while process.poll() is None:
         time.sleep(1.0)
         with contextlib.suppress(JournalError), JournalReader(run / JOURNAL_NAME) as journal:
-            if len(list(journal.entries(kinds=[Kind.POUR_FINISHED]))) >= poured:
+            if len([entry for entry in journal.entries(kinds=[kind]) if entry.stage.startswith(stage)]) >= count:
                 return
     raise SystemExit("the run ended before it could be looked at")
 
 
-def look(chromium: str, url: str, pictures: Mapping[Path, tuple[float, float] | None]) -> None:
-    """Open the viewer's page, and keep what it shows once it has drawn it, of each tab that is clicked at [pixels]."""
+@contextlib.contextmanager
+def looking(chromium: str, url: str) -> Iterator[Any]:
+    """The viewer's page in a browser without a screen."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -116,17 +124,20 @@ def look(chromium: str, url: str, pictures: Mapping[Path, tuple[float, float] | 
             args=["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
         )
         try:
-            page = browser.new_page(viewport=SIZE)  # type: ignore[arg-type]
+            page = browser.new_page(viewport=SMALL)  # type: ignore[arg-type]
             page.goto(url)
-            time.sleep(SETTLING)
-            for picture, tab in pictures.items():
-                if tab is not None:
-                    page.mouse.click(*tab)
-                    time.sleep(SETTLING / 2.0)
-                page.screenshot(path=str(picture), timeout=180_000)
-                print(picture)
+            yield page
         finally:
             browser.close()
+
+
+def picture(page: Any, to: Path) -> None:
+    """Keep what a page shows, drawn large."""
+    page.set_viewport_size(SIZE)
+    time.sleep(SETTLING)
+    page.screenshot(path=str(to), timeout=180_000)
+    page.set_viewport_size(SMALL)
+    print(to, flush=True)
 
 
 if __name__ == "__main__":

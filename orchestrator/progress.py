@@ -18,6 +18,7 @@ from orchestrator.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
+    DecisionMade,
     Event,
     LogLine,
     RequestFinished,
@@ -125,6 +126,8 @@ class ProgressDisplay:
                     self._print(event.text, _LEVEL_STYLE[event.level])
             case _ if event.replayed:
                 return  # an earlier run has told it
+            case DecisionMade() if event.decision.urgent:
+                self._print(event.decision.text, _LEVEL_STYLE["warning"])
             case StageOpened() if self._live is None:
                 self._print(f"{event.stage}: stage {event.index} of {event.count}")
             case StageClosed() if self._live is None:

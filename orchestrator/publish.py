@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from orchestrator.campaign import CampaignResult
 from orchestrator.journal import JOURNAL_NAME, JournalReader
 from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
@@ -18,7 +17,9 @@ from orchestrator.report.campaign import draw_figures
 from orchestrator.report.record import read_record
 from orchestrator.report.results import evaluation_of, theta_of
 from orchestrator.report.run_page import REPORT_NAME, run_page
-from orchestrator.report.summary import PoolUse, RunSummary, Totals, summarise, write_summary
+from orchestrator.report.summarise import summarise
+from orchestrator.report.summary import PoolUse, RunSummary, Totals, write_summary
+from orchestrator.run_result import CampaignResult
 from orchestrator.runs import VERSIONS
 from orchestrator.strategies.calibration.base import CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores

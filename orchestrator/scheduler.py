@@ -291,8 +291,6 @@ class StageScheduler:
         self._decisions += len(decisions)
         for decision in decisions:
             self._watchers.emit(DecisionMade(stage=self._stage, decision=decision))
-            if decision.urgent:
-                self._watchers.log("warning", decision.text, self._stage)
 
     def _report_progress(self, *, urgent: bool = True) -> None:
         """Tell watchers where the strategy stands; often only now and then, as results grow long."""

@@ -201,6 +201,15 @@ def test_page_says_what_is_met_what_is_missed_and_what_is_not_measured(tmp_path:
     assert (tmp_path / "images" / "performance-cost.png").stat().st_size > 1000
 
 
+def test_the_page_tells_what_the_check_of_each_file_costs() -> None:
+    import page_many
+
+    result = {"files": [{"file": "configs/a.yaml", "cpu_s": 2.31}], "limit_s": 2.0, "within_limit": False}
+    page = page_many.validate({"command": "c", "result": {**result, "repeats": 5, "core": None, "machine": MACHINE}})
+    assert "| `configs/a.yaml` | 2.31 |" in page
+    assert "Required: 2 (**missed**)" in page.replace("\n", " ")
+
+
 def test_a_clock_that_seems_to_save_time_is_called_noise() -> None:
     import page_sections
 

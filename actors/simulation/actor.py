@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.cluster.versions import Versions, versions
+from actors.ray_class import actor_class
 from actors.simulation.job_runner import JobRunner, Simulator
 from actors.simulation.parcel import MeshParcel, unpack
 from sim_engine.simulated import SimulatedPour
@@ -96,8 +97,5 @@ def simulator_actor(make: Callable[[], Simulator], *, cpus: float, placement: Ma
         cpus: cores that Ray counts for it.
         placement: Ray's options that say where it runs.
     """
-    import ray
-
-    groups = {CONTROL: 1}
-    options = {"num_cpus": cpus, "max_restarts": 0, "max_task_retries": 0, "concurrency_groups": groups, **placement}
-    return ray.remote(**options)(SimulatorProcess).remote(make)
+    made = actor_class(SimulatorProcess, ((CONTROL, 1),))
+    return made.options(num_cpus=cpus, **placement).remote(make)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,6 +47,10 @@ class Search:
     limit: int | None = None
 
 
+class NoSuchRunError(CatalogueError):
+    """The catalogue has no such run."""
+
+
 def find_runs(catalogue: Catalogue, search: Search) -> list[Row]:
     """Runs, the newest first; see `columns.RUNS`."""
     where, values = _conditions(search, "run")
@@ -70,7 +75,8 @@ def one_run(catalogue: Catalogue, name: str) -> Row:
     """The run of that name, or in that folder; the beginning of a name is enough where only one run has it.
 
     Raises:
-        CatalogueError: there is none, or several.
+        NoSuchRunError: there is none.
+        CatalogueError: there are several.
     """
     path = str(Path(name).absolute())
     runs = catalogue.rows("run", "path = ?", [path])
@@ -79,7 +85,7 @@ def one_run(catalogue: Catalogue, name: str) -> Row:
     if len(runs) == 1:
         return runs[0]
     if not runs:
-        raise CatalogueError(
+        raise NoSuchRunError(
             f"{name}: no such run in the catalogue; `decant runs` lists the newest, `decant runs add FOLDER` enters "
             "runs that it doesn't know"
         )
@@ -147,20 +153,21 @@ def moment(text: str, *, end: bool = False, now: datetime | None = None) -> floa
     Raises:
         ValueError: it is none of these.
     """
-    if ago := re.fullmatch(r"(\d+)\s*([mhdw])", text.strip()):
-        return ((now or datetime.now()) - timedelta(**{_AGO[ago[2]]: int(ago[1])})).timestamp()
-    for form, lasts in _DATES:
-        try:
-            begin = datetime.strptime(text.strip().replace(" ", "T"), form)
-        except ValueError:
-            continue
-        if not end:
-            return begin.timestamp()
-        if lasts < 0:
-            months = begin.month - 1 - lasts
-            return begin.replace(year=begin.year + months // 12, month=months % 12 + 1).timestamp()
-        return (begin + timedelta(seconds=lasts)).timestamp()
+    with contextlib.suppress(OverflowError):  # farther away than dates go
+        if ago := re.fullmatch(r"(\d{1,9})\s*([mhdw])", text.strip(), re.ASCII):
+            return ((now or datetime.now()) - timedelta(**{_AGO[ago[2]]: int(ago[1])})).timestamp()
+        for form, lasts in _DATES:
+            with contextlib.suppress(ValueError):
+                begin = datetime.strptime(text.strip().replace(" ", "T"), form)
+                return (_after(begin, lasts) if end else begin).timestamp()
     raise ValueError(f"'{text}' is not a date: write 2030-03-01, 2030-03, '2030-03-01 14:30', or 7d for 7 days ago")
+
+
+def _after(begin: datetime, lasts: int) -> datetime:
+    if lasts >= 0:
+        return begin + timedelta(seconds=lasts)
+    months = begin.month - 1 - lasts
+    return begin.replace(year=begin.year + months // 12, month=months % 12 + 1)
 
 
 def searching(

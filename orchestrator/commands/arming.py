@@ -15,7 +15,7 @@ from actors.arm.protocol import PathReport
 from actors.arm.spec import ArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, say
 from orchestrator.config.yaml.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
 from orchestrator.strategies.calibration.prior import actions_all_over
@@ -186,10 +186,8 @@ def accepted(plan: CampaignPlan) -> str:
     Raises:
         RefusalError: none was (exit code 2).
     """
-    try:
+    with Refused(SafetyRecordError):
         checksum = accepted_checksum(plan.laboratory_source or plan.source)
-    except SafetyRecordError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     if checksum is None:
         raise RefusalError(
             f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "

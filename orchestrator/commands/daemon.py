@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json, say
 from sim_engine.extras import MissingExtraError, require
 
 if TYPE_CHECKING:
@@ -56,14 +56,13 @@ def serve(path: Path | None, *, state: Path | None, port: int | None, simulators
 
 def _require_extra() -> None:
     for module in ("fastapi", "uvicorn", "httpx", "prometheus_client", "pythonjsonlogger"):
-        try:
+        with Refused(MissingExtraError):
             require(module, "the daemon")
-        except MissingExtraError as error:
-            raise RefusalError(str(error), BAD_INPUT) from None
 
 
 @contextmanager
-def _client(at: At) -> Iterator[Client]:
+def talking(at: At) -> Iterator[Client]:
+    """A client of the daemon there. Its refusals are this command's."""
     _require_extra()
     from orchestrator.daemon.client import Client
     from orchestrator.errors import RunError
@@ -99,7 +98,7 @@ def submit(
         text, files = pack(plan)
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
-    with _client(at) as client:
+    with talking(at) as client:
         body = {"text": text, "files": files, "verb": wanted, "rig": rig, "priority": priority}
         found = client.post("/campaigns", body)
     if as_json:
@@ -113,7 +112,7 @@ def submit(
 
 def list_campaigns(*, at: At, as_json: bool) -> None:
     """Everything at a glance."""
-    with _client(at) as client:
+    with talking(at) as client:
         status, campaigns = client.get("/status"), client.get("/campaigns", limit=50)
         questions = client.get("/questions")
     if as_json:
@@ -153,7 +152,7 @@ def _standing(one: dict[str, Any]) -> str:
 
 def show(key: str, *, at: At, as_json: bool) -> None:
     """One campaign."""
-    with _client(at) as client:
+    with talking(at) as client:
         found = client.get(f"/campaigns/{key}")
     if as_json:
         print_json(found)
@@ -176,7 +175,7 @@ def show(key: str, *, at: At, as_json: bool) -> None:
 
 def logs(key: str | None, *, follow: bool, as_json: bool, at: At) -> None:
     """Events, as lines."""
-    with _client(at) as client:
+    with talking(at) as client:
         only = None if key is None else client.get(f"/campaigns/{key}")["id"]
         try:
             for told in client.events(0, only, follow=follow):
@@ -235,7 +234,7 @@ def _finished(event: dict[str, Any]) -> str:
 
 def act(key: str | None, what: str, *, at: At) -> None:
     """Pause, resume or stop a campaign; without one the queue."""
-    with _client(at) as client:
+    with talking(at) as client:
         found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
     if key is None:
         print("queue paused" if found["queue_paused"] else "queue goes on")
@@ -247,7 +246,7 @@ def abort(key: str | None, *, everything: bool, clear: bool, at: At) -> None:
     """Stop the motion of one campaign, or of all of them."""
     if sum((key is not None, everything, clear)) != 1:
         raise RefusalError("name one campaign, or --all for the emergency stop, or --clear to end one", BAD_INPUT)
-    with _client(at) as client:
+    with talking(at) as client:
         if key is not None:
             found = client.post(f"/campaigns/{key}/abort")
             print(f"{found['id']}: {found['state']}, wanted: {found['wish']}")
@@ -259,7 +258,7 @@ def abort(key: str | None, *, everything: bool, clear: bool, at: At) -> None:
 
 def answer(number: int | None, text: str, *, at: At) -> None:
     """Answer a question, or list those that are open."""
-    with _client(at) as client:
+    with talking(at) as client:
         if number is None:
             questions = client.get("/questions")
             for question in questions:
@@ -293,7 +292,7 @@ def arm(key: str, *, at: At) -> None:
             "hardware is armed by somebody who reads what it will do and types its name: that needs a terminal",
             BAD_INPUT,
         )
-    with _client(at) as client:
+    with talking(at) as client:
         say("planning paths from all over the actions …")
         moves = client.get(f"/campaigns/{key}/arming")
         say(f"\nHARDWARE: laboratory {moves['laboratory']}, {moves['arm']}. This will move:\n")
@@ -312,7 +311,7 @@ def move(key: str, *, before: str | None, priority: int | None, at: At) -> None:
     """Another place in the queue."""
     if before is None and priority is None:
         raise RefusalError("where to? --first, --before CAMPAIGN_ID or --priority N", BAD_INPUT)
-    with _client(at) as client:
+    with talking(at) as client:
         client.post(f"/campaigns/{key}/move", {"before": before, "priority": priority})
         queue = client.get("/campaigns", state="queued")
     for place, one in enumerate(queue, start=1):
@@ -321,7 +320,7 @@ def move(key: str, *, before: str | None, priority: int | None, at: At) -> None:
 
 def shutdown(*, at: At) -> None:
     """End the daemon."""
-    with _client(at) as client:
+    with talking(at) as client:
         client.post("/shutdown")
     print("ending at the next safe point; its queue is kept")
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands.options import Campaign, Json, OtherLaboratory, Seed, call, examples
+from orchestrator.commands.options import Campaign, Json, OtherLaboratory, Seed, call, examples, given
 
 Key = Annotated[
     str,
@@ -55,19 +55,10 @@ def submit(
     as_json: Json = False,
 ) -> None:
     """Put a campaign into the daemon's queue, with copies of everything that it refers to."""
+    options = given(locals(), "campaign", "verb", "url", "state")
     from orchestrator.commands import daemon as module
 
-    call(
-        module.submit,
-        campaign,
-        wanted=verb,
-        rig=rig,
-        priority=priority,
-        laboratory=laboratory,
-        seed=seed,
-        at=(url, state),
-        as_json=as_json,
-    )
+    call(module.submit, campaign, wanted=verb, at=(url, state), **options)
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:

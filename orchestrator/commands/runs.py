@@ -23,20 +23,16 @@ from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, pri
 from orchestrator.report.table import print_table
 
 if TYPE_CHECKING:
+    from orchestrator.catalogue.desk import Desk
     from orchestrator.catalogue.index import Catalogue
-    from orchestrator.catalogue.search import Search
-    from orchestrator.pour_rows import Row
 
 NEWEST = 20
 
 
-def list_runs(conditions: Mapping[str, Any], *, as_json: bool) -> None:
+def list_runs(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: bool) -> None:
     """Runs that conditions hold for, the newest first."""
-    from orchestrator.catalogue.search import find_runs
-
-    search = _search(conditions)
-    with _catalogue() as catalogue:
-        found = find_runs(catalogue, search)
+    with _desk(daemon) as desk:
+        found = desk.runs(conditions)
     if as_json:
         print_json({"runs": found})
         return
@@ -62,13 +58,10 @@ def list_runs(conditions: Mapping[str, Any], *, as_json: bool) -> None:
     print_table(rows, right=("pours",))
 
 
-def list_pours(conditions: Mapping[str, Any], *, as_json: bool) -> None:
+def list_pours(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: bool) -> None:
     """Pours that conditions hold for, the oldest first."""
-    from orchestrator.catalogue.search import find_pours
-
-    search = _search(conditions)
-    with _catalogue() as catalogue:
-        found = find_pours(catalogue, search)
+    with _desk(daemon) as desk:
+        found = desk.pours(conditions)
     if as_json:
         print_json({"pours": found})
     elif found:
@@ -77,17 +70,12 @@ def list_pours(conditions: Mapping[str, Any], *, as_json: bool) -> None:
         mention("no pour that this holds for")
 
 
-def show(name: str, *, as_json: bool) -> None:
+def show(name: str, *, daemon: bool = False, as_json: bool) -> None:
     """One run with all that is known of it."""
-    from orchestrator.catalogue.remarks import read_remarks
-    from orchestrator.catalogue.search import Search, find_pours
-
-    with _catalogue() as catalogue:
-        run = _one(catalogue, name)
-        pours = find_pours(catalogue, Search(run=run["path"]))
-    notes = read_remarks(Path(run["path"])).notes
+    with _desk(daemon) as desk:
+        run = desk.run(name)
     if as_json:
-        print_json({**run, "notes": [note.model_dump() for note in notes], "list_of_pours": pours})
+        print_json(run)
         return
     lines = {
         "run": f"{run['run']}  {mode(run['mode'])}",
@@ -111,80 +99,67 @@ def show(name: str, *, as_json: bool) -> None:
     for key, text in lines.items():
         if text:
             print(f"{key:<{width}}  {text}")
-    for note in notes:
-        print(f"{'note':<{width}}  {date(note.time)} {note.by}: {note.text}")
-    if pours:
+    for note in run["notes"]:
+        print(f"{'note':<{width}}  {date(note['time'])} {note['by']}: {note['text']}")
+    if run["list_of_pours"]:
         print()
-        print_pours(pours, of_one_run=True)
+        print_pours(run["list_of_pours"], of_one_run=True)
 
 
-def compare(names: Sequence[str], *, as_json: bool) -> None:
+def compare(names: Sequence[str], *, daemon: bool = False, as_json: bool) -> None:
     """Settings in which runs differ, and what they came to."""
-    from orchestrator.catalogue.compare import differing_settings, outcomes
-
     if len(names) < 2:
         raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN", BAD_INPUT)
-    with _catalogue() as catalogue:
-        found = [_one(catalogue, name) for name in names]
-    with _refusing():
-        settings = differing_settings([Path(run["path"]) for run in found])
-    came = [outcomes(run) for run in found]
+    with _desk(daemon) as desk:
+        found = desk.compare(names)
     if as_json:
-        print_json({"runs": [run["path"] for run in found], "settings": settings, "outcomes": came})
+        print_json(found)
         return
-    heads = [run["run"] for run in found]
-    heads = heads if len(set(heads)) == len(heads) else [run["path"] for run in found]
-    asked = [compared(place, heads, values) for place, values in settings.items()]
+    heads = [Path(path).name for path in found["runs"]]
+    heads = heads if len(set(heads)) == len(heads) else found["runs"]
+    asked = [compared(place, heads, values) for place, values in found["settings"].items()]
+    came = found["outcomes"]
     keys = dict.fromkeys(key for one in came for key in one)
     ended = [compared(key, heads, [one.get(key) for one in came]) for key in keys]
     print_table(asked or [compared("(the same settings)", heads, [""] * len(heads))], title="asked for")
     print_table(ended, title="came to")
 
 
-def tag(name: str, add: Sequence[str], remove: Sequence[str]) -> None:
+def tag(name: str, add: Sequence[str], remove: Sequence[str], *, daemon: bool = False) -> None:
     """Change a run's tags."""
-    from orchestrator.catalogue.remarks import tag as put
-
     if not add and not remove:
         raise RefusalError("name tags to put on the run, or --remove those to take off", BAD_INPUT)
-    with _catalogue() as catalogue, _refusing():
-        run = _one(catalogue, name)
-        found = put(Path(run["path"]), tuple(add), tuple(remove))
-    print(f"{run['run']}: {', '.join(found.tags) or 'no tags'}")
+    with _desk(daemon) as desk:
+        found = desk.tag(name, add, remove)
+    print(f"{found['run']}: {', '.join(found['tags']) or 'no tags'}")
 
 
-def note(name: str, text: str) -> None:
+def note(name: str, text: str, *, daemon: bool = False) -> None:
     """Write a note about a run."""
-    from orchestrator.catalogue.remarks import note as write
-
-    with _catalogue() as catalogue, _refusing():
-        run = _one(catalogue, name)
-        found = write(Path(run["path"]), text)
-    print(f"{run['run']}: {len(found.notes)} note{'s' * (len(found.notes) > 1)}")
+    with _desk(daemon) as desk:
+        found = desk.note(name, text)
+    print(f"{found['run']}: {len(found['notes'])} note{'s' * (len(found['notes']) > 1)}")
 
 
-def export(folder: Path, conditions: Mapping[str, Any], formats: Sequence[str] | None, *, as_json: bool) -> None:
+def export(
+    folder: Path, conditions: Mapping[str, Any], formats: Sequence[str] | None, *, daemon: bool = False, as_json: bool
+) -> None:
     """Write runs and pours that conditions hold for."""
-    from orchestrator.catalogue import export as files
-    from orchestrator.catalogue.search import find_pours, find_runs
+    from orchestrator.catalogue.export import FORMATS
     from sim_engine.extras import MissingExtraError
 
-    if wrong := sorted(set(formats or ()) - set(files.FORMATS)):
-        raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(files.FORMATS)}", BAD_INPUT)
-    search = _search(conditions)
-    with _catalogue() as catalogue:
-        tables = {"run": find_runs(catalogue, search), "pour": find_pours(catalogue, search)}
+    if wrong := sorted(set(formats or ()) - set(FORMATS)):
+        raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}", BAD_INPUT)
     try:
-        paths = files.export(tables, folder, formats or files.FORMATS)
+        with _desk(daemon) as desk:
+            found = desk.export(folder, conditions, formats or FORMATS)
     except MissingExtraError as error:
         raise RefusalError(f"{error}; or --format csv", BAD_INPUT) from None
-    except OSError as error:
-        raise RefusalError(f"{error.filename or folder}: can't be written: {error.strerror}", BAD_INPUT) from None
     if as_json:
-        print_json({"files": [str(path) for path in paths], **{f"{k}s": len(rows) for k, rows in tables.items()}})
+        print_json(found)
         return
-    mention(f"{len(tables['run'])} runs, {len(tables['pour'])} pours")
-    print("\n".join(map(str, paths)))
+    mention(f"{found['runs']} runs, {found['pours']} pours")
+    print("\n".join(found["files"]))
 
 
 def add(folders: Sequence[Path]) -> None:
@@ -212,6 +187,25 @@ def rebuild() -> None:
 
 
 # -- inside ----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _desk(daemon: bool) -> Iterator[Desk]:
+    """Whoever answers: this machine's catalogue, or the daemon's."""
+    try:
+        if daemon:
+            from orchestrator.commands.daemon import talking
+            from orchestrator.daemon.remote_desk import RemoteDesk
+
+            with talking((None, None)) as client, _refusing():
+                yield RemoteDesk(client)
+        else:
+            from orchestrator.catalogue.desk import LocalDesk
+
+            with _catalogue() as catalogue, _refusing():
+                yield LocalDesk(catalogue)
+    except ValueError as error:  # a date that is none
+        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 @contextlib.contextmanager
@@ -255,19 +249,3 @@ def _refusing() -> Iterator[None]:
         raise RefusalError(str(error), BAD_INPUT) from None
     except OSError as error:
         raise RefusalError(f"{error.filename or ''}: {error.strerror or error}".lstrip(": "), BAD_INPUT) from None
-
-
-def _search(conditions: Mapping[str, Any]) -> Search:
-    from orchestrator.catalogue.search import searching
-
-    try:
-        return searching(**conditions)
-    except ValueError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
-
-
-def _one(catalogue: Catalogue, name: str) -> Row:
-    from orchestrator.catalogue.search import one_run
-
-    with _refusing():
-        return one_run(catalogue, name)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from orchestrator.catalogue.conditions import CONDITIONS
 from orchestrator.commands.options import Json, call, examples
+
+KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 runs = typer.Typer(
     name="runs",
@@ -46,29 +51,63 @@ State = Annotated[
         show_default=False,
     ),
 ]
-Words = Annotated[list[str] | None, typer.Argument(help="Words that stand in a run's names, tags or notes.")]
-Since = Annotated[str | None, typer.Option(help="Begun (of a pour: weighed) at that date or later.")]
-Until = Annotated[str | None, typer.Option(help="… at that date or before; a day or month counts to its end.")]
-Pourer = Annotated[str | None, typer.Option(help="Vessel that was poured from, by name.")]
-Receiver = Annotated[str | None, typer.Option(help="Vessel that was poured into, by name.")]
-Liquid = Annotated[str | None, typer.Option(help="What was poured, by name.")]
-Strategy = Annotated[str | None, typer.Option(help="C1 to C4, D1 to D3, or one of a package.")]
-CampaignName = Annotated[str | None, typer.Option("--campaign", help="Name of the campaign.")]
-Mode = Annotated[str | None, typer.Option(help="'virtual' or 'real'.")]
-RunState = Annotated[str | None, typer.Option("--in-state", help="finished, paused, failed, unknown, interrupted …")]
-Tag = Annotated[str | None, typer.Option(help="A tag of the run.")]
-OneRun = Annotated[str | None, typer.Option("--run", help="One run, by its folder's name or path.")]
+Daemon = Annotated[
+    bool,
+    typer.Option(
+        "--daemon",
+        help="Ask the daemon in place of this machine's catalogue: the one at $DECANT_URL, with $DECANT_TOKEN, or the "
+        "one that has the state directory.",
+    ),
+]
 Which = Annotated[str, typer.Argument(help="A run: its folder's name, the beginning of it, or its path.")]
-Limit = Annotated[int | None, typer.Option(min=1, help="The newest so many.")]
+
+_LIMIT = Annotated[int | None, typer.Option("--limit", min=1, help="The newest so many.")]
+_WORDS = Annotated[
+    list[str] | None, typer.Argument(metavar="[WORDS]", help="Words that stand in a run's names, tags or notes.")
+]
+_OTHERS: dict[str, Any] = {
+    "words": _WORDS,
+    "run": Annotated[str | None, typer.Option("--run", help="One run, by its folder's name or path.")],
+    "limit": _LIMIT,
+}
+_CONDITIONS: dict[str, Any] = {
+    name: Annotated[str | None, typer.Option("--in-state" if name == "state" else f"--{name}", help=text)]
+    for name, text in CONDITIONS.items()
+}
+
+
+def _asking(*others: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A command that takes all conditions of the catalogue, and some of `_OTHERS`: they reach it as one mapping."""
+    options = {name: _OTHERS[name] for name in others} | _CONDITIONS
+
+    def taking(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True).parameters
+        # The state directory is an option as well: a run's state goes by another name until here.
+        names = {f"asked_{name}": name for name in options}
+
+        def call_it(**given: Any) -> None:
+            found = {name: given.pop(key) for key, name in names.items()}
+            command(conditions={**found, "words": found.get("words") or ()}, **given)
+
+        parameters = [
+            *(inspect.Parameter(key, KEYWORD, default=None, annotation=options[name]) for key, name in names.items()),
+            *(one.replace(kind=KEYWORD) for one in own.values() if one.name != "conditions"),
+        ]
+        call_it.__name__, call_it.__doc__ = command.__name__, command.__doc__
+        call_it.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call_it.__annotations__ = {one.name: one.annotation for one in parameters}
+        return call_it
+
+    return taking
 
 
 @runs.callback()
-def newest(context: typer.Context, state: State = None) -> None:
+def newest(context: typer.Context, state: State = None, daemon: Daemon = False) -> None:
     """What `decant runs` does without a verb."""
     if context.invoked_subcommand is None:
         from orchestrator.commands import runs as verb
 
-        call(verb.list_runs, {"limit": verb.NEWEST}, as_json=False)
+        call(verb.list_runs, {"limit": verb.NEWEST}, daemon=daemon, as_json=False)
 
 
 @runs.command(
@@ -76,45 +115,15 @@ def newest(context: typer.Context, state: State = None) -> None:
     epilog=examples(
         "decant runs list --receiver beaker --mode real --since 2030-03",
         "decant runs list water spring-clean   # both words, anywhere: names, vessels, tags, notes",
+        "decant runs list --daemon --since 7d   # on the machine at $DECANT_URL",
     ),
 )
-def list_(
-    words: Words = None,
-    since: Since = None,
-    until: Until = None,
-    campaign: CampaignName = None,
-    pourer: Pourer = None,
-    receiver: Receiver = None,
-    liquid: Liquid = None,
-    strategy: Strategy = None,
-    mode: Mode = None,
-    in_state: RunState = None,
-    tag: Tag = None,
-    limit: Limit = None,
-    state: State = None,
-    as_json: Json = False,
-) -> None:
+@_asking("words", "limit")
+def list_(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """List runs, the newest first; every condition that is given must hold."""
     from orchestrator.commands import runs as verb
 
-    call(
-        verb.list_runs,
-        {
-            "words": words or (),
-            "since": since,
-            "until": until,
-            "campaign": campaign,
-            "pourer": pourer,
-            "receiver": receiver,
-            "liquid": liquid,
-            "strategy": strategy,
-            "mode": mode,
-            "state": in_state,
-            "tag": tag,
-            "limit": limit,
-        },
-        as_json=as_json,
-    )
+    call(verb.list_runs, conditions, daemon=daemon, as_json=as_json)
 
 
 runs.command("search", hidden=True)(list_)
@@ -126,63 +135,33 @@ runs.command("search", hidden=True)(list_)
         "decant runs pours --liquid glycerol --mode real --json",
     )
 )
-def pours(
-    words: Words = None,
-    since: Since = None,
-    until: Until = None,
-    run: OneRun = None,
-    campaign: CampaignName = None,
-    pourer: Pourer = None,
-    receiver: Receiver = None,
-    liquid: Liquid = None,
-    strategy: Strategy = None,
-    mode: Mode = None,
-    tag: Tag = None,
-    limit: Limit = None,
-    state: State = None,
-    as_json: Json = False,
-) -> None:
+@_asking("words", "run", "limit")
+def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """List pours: which action was used, what it spilled, and what had been expected."""
     from orchestrator.commands import runs as verb
 
-    call(
-        verb.list_pours,
-        {
-            "words": words or (),
-            "since": since,
-            "until": until,
-            "run": run,
-            "campaign": campaign,
-            "pourer": pourer,
-            "receiver": receiver,
-            "liquid": liquid,
-            "strategy": strategy,
-            "mode": mode,
-            "tag": tag,
-            "limit": limit,
-        },
-        as_json=as_json,
-    )
+    call(verb.list_pours, conditions, daemon=daemon, as_json=as_json)
 
 
 @runs.command(epilog=examples("decant runs show quickstart-20300301-1"))
-def show(run: Which, state: State = None, as_json: Json = False) -> None:
+def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """Show one run: where it stands, θ*, what it recommends, its pours, tags, notes, and files."""
     from orchestrator.commands import runs as verb
 
-    call(verb.show, run, as_json=as_json)
+    call(verb.show, run, daemon=daemon, as_json=as_json)
 
 
 @runs.command(epilog=examples("decant runs compare quickstart-20300301-1 quickstart-20300301-2"))
 def compare(
     which: Annotated[list[str], typer.Argument(help="Two runs or more.", show_default=False)],
     state: State = None,
+    daemon: Daemon = False,
     as_json: Json = False,
 ) -> None:
     """Set runs side by side: the settings in which they differ, and what they came to."""
     from orchestrator.commands import runs as verb
 
-    call(verb.compare, which, as_json=as_json)
+    call(verb.compare, which, daemon=daemon, as_json=as_json)
 
 
 @runs.command(epilog=examples("decant runs tag quickstart-20300301-1 good paper", "decant runs tag RUN --remove good"))
@@ -191,21 +170,25 @@ def tag(
     tags: Annotated[list[str] | None, typer.Argument(help="Tags to put on it.")] = None,
     remove: Annotated[list[str] | None, typer.Option(help="A tag to take off. Repeat.")] = None,
     state: State = None,
+    daemon: Daemon = False,
 ) -> None:
     """Put tags on a run, or take them off. They are kept in the run's folder, and go wherever it goes."""
     from orchestrator.commands import runs as verb
 
-    call(verb.tag, run, tags or [], remove or [])
+    call(verb.tag, run, tags or [], remove or [], daemon=daemon)
 
 
 @runs.command(epilog=examples("decant runs note quickstart-20300301-1 'the tray was wet from the first pour on'"))
 def note(
-    run: Which, text: Annotated[str, typer.Argument(help="What is to be remembered.")], state: State = None
+    run: Which,
+    text: Annotated[str, typer.Argument(help="What is to be remembered.")],
+    state: State = None,
+    daemon: Daemon = False,
 ) -> None:
     """Write a note about a run, with date and author. It is kept in the run's folder."""
     from orchestrator.commands import runs as verb
 
-    call(verb.note, run, text)
+    call(verb.note, run, text, daemon=daemon)
 
 
 @runs.command(
@@ -213,30 +196,19 @@ def note(
         "decant runs export table/ --since 2030-03 --until 2030-03", "decant runs export table/ --format csv"
     )
 )
+@_asking("words", "limit")
 def export(
     folder: Annotated[Path, typer.Argument(help="Where the files are written.")],
-    since: Since = None,
-    until: Until = None,
-    campaign: CampaignName = None,
-    receiver: Receiver = None,
-    mode: Mode = None,
-    tag: Tag = None,
+    conditions: dict[str, Any],
     formats: Annotated[list[str] | None, typer.Option("--format", help="csv or parquet; both if not given.")] = None,
     state: State = None,
+    daemon: Daemon = False,
     as_json: Json = False,
 ) -> None:
     """Write runs and pours as CSV and Parquet, with a data dictionary: runs.*, pours.*, dictionary.csv."""
     from orchestrator.commands import runs as verb
 
-    conditions: dict[str, Any] = {
-        "since": since,
-        "until": until,
-        "campaign": campaign,
-        "receiver": receiver,
-        "mode": mode,
-        "tag": tag,
-    }
-    call(verb.export, folder, conditions, formats, as_json=as_json)
+    call(verb.export, folder, conditions, formats, daemon=daemon, as_json=as_json)
 
 
 @runs.command(epilog=examples("decant runs add runs/", "decant runs add /media/usb/runs/quickstart-20300301-1"))

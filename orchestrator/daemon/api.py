@@ -9,7 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI, Response
 
-from orchestrator.daemon import deeds, looks
+from orchestrator.daemon import archive, deeds, looks
 from orchestrator.daemon.auth import Tokens
 from orchestrator.daemon.guard import Daemon, Guard
 from orchestrator.daemon.page import page_router
@@ -49,6 +49,7 @@ def create_app() -> FastAPI:
     )
     app.include_router(looks.router, prefix=V1, responses=_ERRORS)
     app.include_router(deeds.router, prefix=V1, responses=_ERRORS)
+    app.include_router(archive.router, prefix=V1, responses=_ERRORS)
     app.add_api_route("/healthz", _health, operation_id="health", response_model=HealthOut)
     app.add_api_route(
         "/readyz",

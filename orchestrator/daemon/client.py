@@ -67,19 +67,23 @@ class Client:
 
     def get(self, path: str, **query: Any) -> Any:
         """Look."""
-        return self._call("GET", path, params={k: v for k, v in query.items() if v is not None})
+        return self._call("GET", path, params=_given(query)).json()
+
+    def fetch(self, path: str, **query: Any) -> bytes:
+        """Have a file."""
+        return self._call("GET", path, params=_given(query)).content
 
     def post(self, path: str, body: Any = None) -> Any:
         """Do something."""
-        return self._call("POST", path, json=body)
+        return self._call("POST", path, json=body).json()
 
-    def _call(self, method: str, path: str, **arguments: Any) -> Any:
+    def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         try:
             answer = self._http.request(method, V1 + path, **arguments)
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
         _check(answer)
-        return answer.json()
+        return answer
 
     def _unreachable(self, error: httpx.HTTPError) -> DaemonError:
         return DaemonError(
@@ -100,7 +104,7 @@ class Client:
             query = {"campaign": campaign, "after": after, "until": None if follow else "true"}
             try:
                 with self._http.stream(
-                    "GET", f"{V1}/events", params={k: v for k, v in query.items() if v is not None},
+                    "GET", f"{V1}/events", params=_given(query),
                     timeout=httpx.Timeout(40.0, connect=5.0),
                 ) as answer:  # fmt: skip
                     if answer.status_code >= 400:
@@ -120,6 +124,10 @@ class Client:
                 if broken > 3:
                     raise DaemonError("the daemon has ended")
             time.sleep(0.3 * broken)
+
+
+def _given(query: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in query.items() if value is not None}
 
 
 def _told_in(lines: Iterator[str]) -> Iterator[Told]:

@@ -29,7 +29,8 @@ NEAREST = 5
 REMEMBERED = 200
 """Simulations of a scene that are kept for that."""
 
-_MOVING = ("approach", "tilt", "hold", "return", "settle")
+_POURING = ("tilt", "hold", "return", "settle", "weigh")
+"""While these last, what is on the balance beyond the tare is what was spilled."""
 
 FloatArray = NDArray[np.float64]
 
@@ -47,6 +48,10 @@ class _Running:
     tilted: float | None = None
     """Wall time."""
     tared: float | None = None
+    verdict: float | None = None
+    """Spilled, as weighed at the end [g]."""
+    begun: bool = False
+    """Whether its film has."""
 
 
 class BalanceStage:
@@ -66,19 +71,23 @@ class BalanceStage:
         self._checkpoint = ""
         for name, label, colour, width in (
             ("shown", "display [g]", style.MEASURED, 3.0),
-            ("expected/low", "expected at the end: least of nearby simulations [g]", "#f0c27a", 1.5),
-            ("expected/middle", "expected at the end: middle [g]", style.PREDICTED, 3.0),
-            ("expected/high", "expected at the end: most [g]", "#f0c27a", 1.5),
-            ("pour/low", "simulated: least [g]", "#f0c27a", 1.5),
-            ("pour/middle", "simulated nearby, middle [g]", style.PREDICTED, 3.0),
-            ("pour/high", "simulated: most [g]", "#f0c27a", 1.5),
-            ("pour/weighed", "display [g]", style.MEASURED, 3.0),
+            ("net", "since the tare [g]", style.MEASURED, 3.0),
+            ("expected/low", "expected, least [g]", "#f0c27a", 1.5),
+            ("expected/middle", "expected at the end [g]", style.PREDICTED, 3.0),
+            ("expected/high", "expected, most [g]", "#f0c27a", 1.5),
+            ("pour/low", "simulated, least [g]", "#f0c27a", 1.5),
+            ("pour/middle", "simulated [g]", style.PREDICTED, 3.0),
+            ("pour/high", "simulated, most [g]", "#f0c27a", 1.5),
+            ("pour/weighed", "balance [g]", style.MEASURED, 3.0),
+            ("pour/liquid", "virtual liquid [g]", style.FALLING, 3.0),
         ):
             looks = rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=width)
             outlet.log(f"{PLACE}/{name}", looks, static=True)
         for name, label, colour, size in (
             ("stable", "stable [g]", style.GOOD, 4.0),
-            ("verdict", "spilled, as weighed [g]", style.BEST, 9.0),
+            ("tare", "tare [g]", style.INK, 6.0),
+            ("verdict", "weighed [g]", style.BEST, 9.0),
+            ("pour/verdict", "weighed [g]", style.BEST, 9.0),
         ):
             outlet.log(
                 f"{PLACE}/{name}",
@@ -97,6 +106,8 @@ class BalanceStage:
         """A pour begins."""
         times, band = self._foretold(pour, scene)
         self._running, self._checkpoint = _Running(scene, band, times), ""
+        for ended in ("net", "expected"):  # no line from one pour to the next
+            self._outlet.log(f"{PLACE}/{ended}", self._rr.Clear(recursive=True))
         if band is not None:
             for name, value in zip(("low", "middle", "high"), band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
@@ -109,6 +120,7 @@ class BalanceStage:
         if told.checkpoint == "tilt" and running.tilted is None:
             running.tilted = wall
             running.tared = running.shown[-1][1] if running.shown else 0.0
+            self._number("tare", running.tared)
         if told.balance is not None:
             grams = 1e3 * told.balance
             if not running.shown or running.shown[-1] != (wall, grams):
@@ -116,6 +128,14 @@ class BalanceStage:
                 self._number("shown", grams)
                 if told.stable:
                     self._number("stable", grams)
+                net = grams - (running.tared or 0.0)
+                # After the verdict somebody puts the pourer there.
+                if (
+                    running.tilted is not None
+                    and told.checkpoint in _POURING
+                    and net <= 1e3 * running.scene.liquid.mass
+                ):
+                    self._number("net", net)
         if told.checkpoint == self._checkpoint:
             return None
         self._checkpoint = told.checkpoint
@@ -125,18 +145,33 @@ class BalanceStage:
         """A pour was weighed; returns what it showed, for `beside`."""
         running, self._running = self._running, None
         self._number("verdict", 1e3 * measured.spilled)
+        if running is not None:
+            running.verdict = 1e3 * measured.spilled
         if running is not None and running.band is not None:
             for name, value in zip(("low", "middle", "high"), running.band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
         return running
 
-    def beside(self, running: _Running | None, time: float) -> None:
-        """What the balance showed at a moment of a pour [s of bench time], beside what simulations foretold."""
+    def beside(self, running: _Running | None, time: float, spilled: float | None) -> None:
+        """What the balance showed at a moment of a pour, beside what simulations foretold.
+
+        Args:
+            running: the pour, as `finish` returned it.
+            time: since it began [s of bench time].
+            spilled: by the liquid of a virtual bench, by then [kg].
+        """
         if running is None:
             return
+        if not running.begun:
+            running.begun = True
+            self._outlet.log(f"{PLACE}/pour", self._rr.Clear(recursive=True))
+            if running.verdict is not None:
+                self._number("pour/verdict", running.verdict)
         if running.band is not None:
             for name, curve in zip(("low", "middle", "high"), running.band, strict=True):
                 self._number(f"pour/{name}", float(np.interp(time, running.times, curve)))
+        if spilled is not None:
+            self._number("pour/liquid", 1e3 * spilled)
         if running.tilted is not None and np.isfinite(self._scale):
             walls, grams = np.array(running.shown).T if running.shown else (np.zeros(0), np.zeros(0))
             wall = running.tilted + time / self._scale

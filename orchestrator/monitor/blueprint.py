@@ -14,6 +14,9 @@ Moment = Literal["calibrating", "deploying", "replaying"]
 
 BACKGROUND = [246, 247, 249]
 
+LEGEND = 0.5
+"""Room beside a curve for its legend, as a share of the curve's time."""
+
 
 def simulation_blueprint() -> rrb.Blueprint:
     """For one simulated pour: the scene above the shares of the liquid."""
@@ -22,43 +25,61 @@ def simulation_blueprint() -> rrb.Blueprint:
     return _blueprint(rrb.Vertical(_simulation(), _shares(), row_shares=[3, 1]), "replaying")
 
 
-def campaign_blueprint(moment: Moment, receivers: Mapping[str, str], loss_label: str) -> rrb.Blueprint:
+def campaign_blueprint(
+    moment: Moment,
+    receivers: Mapping[str, str],
+    loss_label: str,
+    *,
+    theta_slices: bool = False,
+    action_slices: bool = False,
+) -> rrb.Blueprint:
     """For a campaign.
 
     Args:
         moment: 'calibrating', 'deploying', or 'replaying' once it is over.
         receivers: what people call each deployment scene, by its name.
         loss_label: of the pours' loss.
+        theta_slices: θ has more axes than one picture shows.
+        action_slices: actions have.
     """
     import rerun.blueprint as rrb
 
     # Made anew for each tab: a view has one place, and one that were put into two would stay empty in the second.
     def losses() -> list[Any]:
-        return [_loss(safe_name(scene), f"{name}: {loss_label}") for scene, name in receivers.items()]
+        named = [(safe_name(scene), name) for scene, name in receivers.items()]
+        return [_loss(place, f"{name}: {loss_label}") for place, name in named] + [
+            _trust(place, f"{name}: distrust") for place, name in named
+        ]
 
     def maps() -> list[Any]:
-        names = receivers.items()
-        return [_picture(f"/learning/{safe_name(scene)}/surrogate", f"{name}: expected loss") for scene, name in names]
+        views = []
+        for scene, name in receivers.items():
+            views += _surrogate(safe_name(scene), f"{name}: expected loss", sliced=action_slices)
+        return views
 
     def theta() -> list[Any]:
-        return [
-            _picture("/learning/calibration/surrogate", "Discrepancy over θ"),
-            _picture("/learning/calibration/theta", "θ* and which θ fit the pours"),
-        ]
+        found = _picture("/learning/calibration/theta", "θ* and which θ fit the pours")
+        return [*_surrogate("calibration", "Discrepancy over θ", sliced=theta_slices), found]
 
     def calibrated() -> Any:
         return _loss("calibration", "Calibration pours: spilled / poured [%]")
 
+    *discrepancies, found = theta()
     calibrating = rrb.Horizontal(
         rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
-        rrb.Vertical(*theta(), rrb.Horizontal(calibrated(), _shares()), row_shares=[5, 4, 4]),
+        rrb.Vertical(
+            rrb.Tabs(*discrepancies),
+            found,
+            rrb.Horizontal(calibrated(), _shares(), column_shares=[3, 4]),
+            row_shares=[5, 4, 4],
+        ),
         rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
         column_shares=[5, 7, 4],
         name="Calibrating",
     )
     deploying = rrb.Horizontal(
         rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
-        rrb.Vertical(rrb.Tabs(*maps()), rrb.Tabs(*losses()), _weight(), row_shares=[5, 4, 4]),
+        rrb.Vertical(rrb.Tabs(*maps()), rrb.Tabs(*losses()), rrb.Tabs(_weight(), _display()), row_shares=[5, 4, 4]),
         rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
         column_shares=[5, 7, 4],
         name="Deploying",
@@ -122,7 +143,7 @@ def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
 def _cell(under: str = "", name: str = "The cell: planned (orange), done (blue)") -> Any:
     import rerun.blueprint as rrb
 
-    eye = rrb.EyeControls3D(position=(0.55, -1.25, 0.75), look_target=(0.1, 0.15, 0.2), eye_up=(0, 0, 1))
+    eye = rrb.EyeControls3D(position=(0.45, -0.95, 0.62), look_target=(0.12, 0.15, 0.22), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
         origin=f"{under}/cell",
         name=name,
@@ -136,7 +157,7 @@ def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its
     import rerun.blueprint as rrb
 
     # From the side, a little above: the picture in docs/frames.md.
-    eye = rrb.EyeControls3D(position=(-0.05, -0.5, 0.26), look_target=(-0.03, 0.0, 0.1), eye_up=(0, 0, 1))
+    eye = rrb.EyeControls3D(position=(-0.05, -0.36, 0.2), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
         origin=f"{under}/simulation",
         contents=[f"{under}/simulation/{what}" for what in ("pourer/**", "receiver/**", "liquid")],
@@ -147,32 +168,58 @@ def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its
     )
 
 
+def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/**", **more: Any) -> Any:
+    """Curves of the last so many seconds; to the right of now, where nothing is, there is room for the legend."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    at = rr.TimeRangeBoundary.cursor_relative
+    shown = [
+        rrb.VisibleTimeRange(line, start=at(seconds=-before), end=at(seconds=0.0)) for line in ("wall", "sim_time")
+    ]
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(at(seconds=-before), at(seconds=LEGEND * before))),
+        time_ranges=shown,
+        plot_legend=rrb.Corner2D.RightTop,
+        **more,
+    )
+
+
 def _shares() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TimeSeriesView(
-        origin="/simulation/share",
-        name="Simulated: where the liquid is [%]",
-        axis_y=rrb.ScalarAxis(range=(0.0, 100.0)),
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
+    axis = rrb.ScalarAxis(range=(0.0, 100.0))
+    return _recent("/simulation/share", "Simulated: where the liquid is [%]", 12.0, axis_y=axis)
 
 
 def _weight() -> Any:
-    import rerun.blueprint as rrb
+    contents = ["/balance/net", "/balance/verdict", "/balance/expected/**"]
+    return _recent("/balance", "Balance: spilled [g], and what simulations expect", 60.0, contents=contents)
 
-    return rrb.TimeSeriesView(
-        origin="/balance",
-        contents=["/balance/shown", "/balance/stable", "/balance/verdict", "/balance/expected/**"],
-        name="Balance: spilled [g], and what nearby simulations expect",
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
+
+def _display() -> Any:
+    contents = ["/balance/shown", "/balance/stable", "/balance/tare"]
+    return _recent("/balance", "Its display [g]", 60.0, contents=contents)
 
 
 def _weighed_pour(under: str = "", name: str = "Pour: spilled [g], weighed and simulated") -> Any:
+    return _recent(f"{under}/balance/pour", name, 12.0)
+
+
+def _trust(place: str, name: str) -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TimeSeriesView(origin=f"{under}/balance/pour", name=name, plot_legend=rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(
+        origin=f"/learning/{place}", contents=["$origin/trust"], name=name, plot_legend=rrb.Corner2D.RightTop
+    )
+
+
+def _surrogate(place: str, name: str, *, sliced: bool) -> list[Any]:
+    views = [_picture(f"/learning/{place}/surrogate", name)]
+    return [*views, _picture(f"/learning/{place}/slices", f"{name}, two axes at a time")] if sliced else views
 
 
 def _loss(place: str, name: str) -> Any:
@@ -213,5 +260,7 @@ def _status(under: str = "") -> Any:
 def _log() -> Any:
     import rerun.blueprint as rrb
 
-    columns = rrb.TextLogColumns(text_log_columns=[rrb.encodings.TextLogColumn("Body")], timeline_columns=[])
+    # An empty list would stand for the timeline that is watched: a column of cut numbers.
+    hidden = [rrb.encodings.TimelineColumn(timeline, visible=False) for timeline in ("wall", "sim_time", "step")]
+    columns = rrb.TextLogColumns(text_log_columns=[rrb.encodings.TextLogColumn("Body")], timeline_columns=hidden)
     return rrb.TextLogView(origin="/log", name="Events and decisions", columns=columns)

@@ -18,7 +18,7 @@ from orchestrator.monitor.simulated import MAXIMUM_RATE
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.requests import Pour
-from sim_engine.outcome import PourMeasurement
+from sim_engine.outcome import ParticleState, PourMeasurement
 from sim_engine.simulated import RecordedFrames
 from sim_engine.task import Scene
 
@@ -29,6 +29,9 @@ PLACE = "/cell"
 
 SLOW = 3.0
 """A bench whose time runs faster than this is shown by films of its pours: nobody could follow it."""
+
+TRAILING = 5
+"""The path that was executed is drawn again with every so many places of it."""
 
 _TRAY = 0.012
 """Thickness of the tray [m]."""
@@ -128,7 +131,7 @@ class Cell:
             self._trail.append(list(told.pourer[:3]))
         else:
             return
-        if len(self._trail) > 1 and self.time_scale <= SLOW:
+        if len(self._trail) % TRAILING == 2 and self.time_scale <= SLOW:
             self._outlet.log(f"{PLACE}/path/executed", self._line(np.array(self._trail), style.MEASURED, 3e-3))
 
     def _move(self, joints: FloatArray) -> None:
@@ -149,7 +152,7 @@ class Cell:
         *,
         now: float,
         step: int,
-        beside: Callable[[float], object],
+        beside: Callable[[float, float | None], object],
     ) -> None:
         """Show what was done and what the liquid did.
 
@@ -158,7 +161,8 @@ class Cell:
             measured: what came of it.
             now: on the wall clock [s since 1970].
             step: of the campaign.
-            beside: logs what else there is to say of a moment of the pour [s].
+            beside: logs what else there is to say of a moment of the pour [s], and of what a virtual bench's liquid has
+                spilled by then [kg], where that is known.
         """
         moves = self._executed(measured)
         liquid, self._liquid = self._liquid, None
@@ -177,9 +181,11 @@ class Cell:
                     self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
                 if moves is not None:
                     self._move(np.array([np.interp(moment, moves[0], column) for column in moves[1].T]))
+                spilled = None
                 if liquid is not None:
-                    self._pour(liquid, moment, radius, posed=moves is None)
-                beside(moment)
+                    share = self._pour(liquid, moment, radius, posed=moves is None)
+                    spilled = share * measured.loaded
+                beside(moment, spilled)
 
             return log
 
@@ -195,12 +201,14 @@ class Cell:
             return self._figure.tool(moves[1][::5])[:, :3]
         return np.zeros((0, 3)) if liquid is None else np.asarray(liquid.pourer_poses, float)[:, :3]
 
-    def _pour(self, liquid: RecordedFrames, moment: float, radius: float, *, posed: bool) -> None:
+    def _pour(self, liquid: RecordedFrames, moment: float, radius: float, *, posed: bool) -> float:
+        """Show the liquid at a moment; returns the share of it that is spilled."""
         index = int(np.clip(np.searchsorted(liquid.times, moment + 1e-6) - 1, 0, len(liquid.times) - 1))
         states = np.asarray(liquid.states[index])
         self._outlet.log(f"{PLACE}/liquid", shapes.particles(liquid.positions[index], states, radius))
         if posed:
             self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.asarray(liquid.pourer_poses[index], float)))
+        return float(np.mean(states == ParticleState.SPILLED))
 
     # ---- how
 

@@ -31,8 +31,15 @@ PLACE = "/learning"
 
 CALIBRATION = "calibration"
 
-DRAWING_INTERVAL = 20.0
-"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.3 s."""
+MAPPED = 2
+"""Axes that one picture shows; of more, there is a picture of all pairs."""
+
+SLICING_INTERVAL = 180.0
+"""As `DRAWING_INTERVAL`, for pictures whose surrogate has to be fitted once more [s]."""
+
+DRAWING_INTERVAL = 45.0
+"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.4 s of a
+core, which has to stay about a hundredth of it."""
 
 
 class LearningStage:
@@ -57,6 +64,24 @@ class LearningStage:
         """What people are told of the best pour, by the receiver's name."""
         self.trust = ""
         """Whether the simulator is to be trusted, in words."""
+
+    def opened(self) -> None:
+        """A campaign begins: where pictures will come, it is said when."""
+        plan = self._plan
+        if plan.calibration is not None:
+            self._coming(f"{CALIBRATION}/surrogate", "The discrepancy over θ comes with the first simulations.")
+            self._coming(f"{CALIBRATION}/theta", "θ* comes when the calibration ends.")
+            if plan.calibration.parameters.dimension > MAPPED:
+                self._coming(f"{CALIBRATION}/slices", "Slices come with the first simulations.")
+        for scene in plan.deployment.scenes if plan.deployment is not None else ():
+            place, name = safe_name(scene.name), self._names[scene.name]
+            self._coming(f"{place}/surrogate", f"{name}: nothing was simulated or poured yet.")
+            if plan.deployment is not None and plan.deployment.actions.dimension > MAPPED:
+                self._coming(f"{place}/slices", f"{name}: nothing was simulated or poured yet.")
+
+    def _coming(self, place: str, text: str) -> None:
+        picture = pictures.png(pictures.words(text))
+        self._outlet.log(f"{PLACE}/{place}", self._rr.EncodedImage(contents=picture, media_type="image/png"))
 
     def about(self, stage: str, scene: str) -> None:
         """A stage has to do with a scene."""
@@ -110,6 +135,13 @@ class LearningStage:
             event.time,
             lambda: pictures.png(pictures.surrogate_picture(problem, suggestion, unit, title)),
         )
+        if problem.space.dimension > MAPPED:
+            self._picture(
+                f"{PLACE}/{where}/slices",
+                event.time,
+                lambda: pictures.png(pictures.slices_picture(problem, suggestion, unit, title)),
+                SLICING_INTERVAL,
+            )
 
     def learnt(self, result: Learnt, now: float) -> None:
         """A strategy has learnt so much."""
@@ -137,8 +169,8 @@ class LearningStage:
         for entity, draw in list(self._waiting.items()):
             self._draw(entity, now, draw)
 
-    def _picture(self, entity: str, now: float, draw: Callable[[], bytes]) -> None:
-        if now - self._drawn.get(entity, -DRAWING_INTERVAL) < DRAWING_INTERVAL:
+    def _picture(self, entity: str, now: float, draw: Callable[[], bytes], interval: float = DRAWING_INTERVAL) -> None:
+        if now - self._drawn.get(entity, -interval) < interval:
             self._waiting[entity] = draw
             return
         self._draw(entity, now, draw)

@@ -57,9 +57,11 @@ class Machine:
             )
             outlet.log(f"{PLACE}/{name}", looks, static=True)
 
-    def opened(self, simulators: int) -> None:
-        """The pool is so large."""
+    def opened(self, simulators: int, *, arm: bool) -> None:
+        """The pool is so large, and there is an arm or not: nobody works yet."""
         self._simulators = max(simulators, 1)
+        for name in (*(["arm"] if arm else []), "optimiser", *(f"simulator {n + 1}" for n in range(self._simulators))):
+            self.lane(name, None)
         self._load()
 
     def simulation_started(self, key: int, purpose: str) -> None:

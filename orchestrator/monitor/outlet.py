@@ -18,8 +18,11 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-FLUSHING = 0.3
-"""Rows are kept together for so long [s]."""
+FILING = 2.0
+"""Rows of the file are kept together for so long [s]: packing each few of them costs more than making them."""
+
+SENDING = 0.5
+"""Rows for those who watch, likewise [s]."""
 
 LAST_WORDS = 5.0
 """How long a server may take for the last of it [s]."""
@@ -44,15 +47,17 @@ class Outlet:
         path.parent.mkdir(parents=True, exist_ok=True)
         # FileSink only logs that it can't write; find out while somebody still listens.
         path.open("wb").close()
+        self._on_wall = False
         recording_id = uuid.uuid4().hex
         # Some rows at a time: a viewer chokes on many small pieces long before their bytes are many.
-        batches = rr.ChunkBatcherConfig()
-        batches.flush_tick = FLUSHING
-        self._file = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
+        # Not by size either: a film's frames would be packed one by one.
+        filed, sent = rr.ChunkBatcherConfig(), rr.ChunkBatcherConfig()
+        filed.flush_tick, sent.flush_tick = FILING, SENDING
+        self._file = rr.RecordingStream(application, recording_id=recording_id, batcher_config=filed)
         self._file.set_sinks(rr.FileSink(str(path)))
         self._streams = [self._file]
         if url:
-            live = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
+            live = rr.RecordingStream(application, recording_id=recording_id, batcher_config=sent)
             live.set_sinks(rr.GrpcSink(url))
             self._streams.append(live)
         for stream in self._streams:
@@ -65,6 +70,7 @@ class Outlet:
         for stream in self._streams:
             for name, value in times.items():
                 if name == "wall":
+                    self._on_wall = True
                     stream.set_time(name, timestamp=value)
                 elif isinstance(value, int):
                     stream.set_time(name, sequence=value)
@@ -73,6 +79,7 @@ class Outlet:
 
     def without(self, *names: str) -> None:
         """What follows is not on these timelines."""
+        self._on_wall &= "wall" not in names
         for stream in self._streams:
             for name in names:
                 stream.disable_timeline(name)
@@ -83,9 +90,18 @@ class Outlet:
             stream.log(entity, *what, static=static)
 
     def show(self, blueprint: rrb.Blueprint) -> None:
-        """What a viewer shows from now on."""
-        for stream in self._streams:
+        """What those who look now are shown from now on."""
+        for stream in self._streams[1:]:
             stream.send_blueprint(blueprint)
+
+    def keep(self, blueprint: rrb.Blueprint) -> None:
+        """How the file is shown. One for each file: `rerun rrd optimize` shuffles several, and the last one counts."""
+        self._file.send_blueprint(blueprint)
+
+    @property
+    def on_wall(self) -> bool:
+        """Whether what follows is on the wall clock."""
+        return self._on_wall
 
     def close(self) -> None:
         """Complete the file; the server gets a little time for the rest."""

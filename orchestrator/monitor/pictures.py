@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from actors.optimizer.core.slices import slices
 from orchestrator.report import style
 from orchestrator.report.units import LossUnit
 from orchestrator.strategies.calibration.base import CalibratedTheta
@@ -52,6 +53,7 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
         (f"± σ [{unit.unit}]", deviation, "cividis"),
         (f"lower bound, mean − {problem.kappa:g} σ [{unit.unit}]", bound, "viridis_r"),
     )
+    simulated = problem.simulated.points
     across, up = plane.axes
     scales = [style.display_factor(axis.name) for axis in (across, up)]
     places = np.linspace(0.0, 1.0, len(mean))
@@ -61,6 +63,7 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
         bar = figure.colorbar(picture, ax=panel, pad=0.02)
         bar.ax.tick_params(labelsize=13)
         for points, look in (
+            (simulated, {"marker": "o", "s": 14, "facecolor": "none", "edgecolor": style.INK}),
             (problem.data.points, {"marker": "o", "s": 55, "facecolor": "white", "edgecolor": style.INK}),
             (suggestion.points, {"marker": "*", "s": 330, "facecolor": style.BEST, "edgecolor": "white"}),
         ):
@@ -73,7 +76,81 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
         style.frame(panel, up, "y")
         panel.tick_params(labelsize=13)
     axes[0].set_ylabel(style.label(up.name), fontsize=14)
-    axes[1].set_xlabel(f"{style.label(across.name)}      ○ observed   ★ next", fontsize=14)
+    axes[1].set_xlabel(f"{style.label(across.name)}      {_key(problem, suggestion)}", fontsize=14)
+    return figure
+
+
+def slices_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
+    """A surrogate over every two of more axes: below the diagonal its mean, above it its deviation, with data and next.
+
+    Args:
+        problem: that was put to the optimiser, over more than two axes.
+        suggestion: its answer, with a surrogate.
+        unit: of the cost.
+        title: what was searched for.
+    """
+    maps = slices(problem, suggestion)
+    names = [name for name in problem.space.names if any(name in one.axes for one in maps)]
+    if not names:
+        return words(f"{title}: too little for slices")
+    axis_of = dict(zip(problem.space.names, problem.space.axes, strict=True))
+    column_of = {name: problem.space.names.index(name) for name in names}
+    figure, axes = style.new_figure(len(names), len(names), size=(15.0, 9.0), squeeze=False)
+    figure.suptitle(title, fontsize=17, color=style.INK, x=0.01, ha="left")
+    means = [unit.factor * np.maximum(np.asarray(one.mean, float), 0.0) for one in maps]
+    deviations = [unit.factor * np.asarray(one.deviation, float) for one in maps]
+    seen = (
+        (problem.simulated.points, {"marker": "o", "s": 10, "facecolor": "none", "edgecolor": style.INK}),
+        (problem.data.points, {"marker": "o", "s": 30, "facecolor": "white", "edgecolor": style.INK}),
+        (suggestion.points, {"marker": "*", "s": 200, "facecolor": style.BEST, "edgecolor": "white"}),
+    )
+    drawn: dict[str, Any] = {}
+    for one, mean, deviation in zip(maps, means, deviations, strict=True):
+        low, high = (names.index(name) for name in one.axes)
+        # Below the diagonal the first axis lies across; above it the picture is turned over.
+        for kind, (row, column), values, every, colours in (
+            ("mean", (high, low), mean, means, "viridis_r"),
+            ("sd", (low, high), deviation.T, deviations, "cividis"),
+        ):
+            panel, across, up = axes[row, column], axis_of[names[column]], axis_of[names[row]]
+            places = np.linspace(0.0, 1.0, len(values))
+            scales = [style.display_factor(axis.name) for axis in (across, up)]
+            grid = [[axis.decode(u) / scale for u in places] for axis, scale in zip((across, up), scales, strict=True)]
+            span = {"vmin": min(float(v.min()) for v in every), "vmax": max(float(v.max()) for v in every)}
+            drawn[kind] = panel.pcolormesh(*grid, values, shading="nearest", cmap=colours, rasterized=True, **span)
+            for points, look in seen:
+                if points:
+                    places_of = [column_of[across.name], column_of[up.name]]
+                    panel.scatter(*_values(points, places_of, (across, up), scales), zorder=4, **look)
+            style.frame(panel, across, "x")
+            style.frame(panel, up, "y")
+            panel.tick_params(labelsize=12, labelbottom=row == len(names) - 1, labelleft=column == 0)
+    for place, name in enumerate(names):
+        axes[place, place].axis("off")
+        axes[place, place].text(0.5, 0.5, style.label(name).replace(" [", "\n["), ha="center", va="center", fontsize=15)
+        if place:
+            axes[place, 0].set_ylabel(style.label(name), fontsize=13)
+        if place < len(names) - 1:
+            axes[-1, place].set_xlabel(style.label(name), fontsize=13)
+    for kind, text in (("mean", f"below: expected {unit.label}"), ("sd", f"above: ± σ [{unit.unit}]")):
+        bar = figure.colorbar(drawn[kind], ax=axes, pad=0.01, aspect=40)
+        bar.set_label(text, fontsize=13)
+        bar.ax.tick_params(labelsize=12)
+    held = style.display_values(dict(problem.space.decode(maps[0].at)))
+    figure.supxlabel(f"each cut goes through {held}      {_key(problem, suggestion)}", fontsize=13, color=style.INK)
+    return figure
+
+
+def _key(problem: SuggestProblem, suggestion: Suggestion) -> str:
+    marks = ["○ poured   ∘ simulated" if problem.simulated.points else "○ observed"]
+    return "   ".join([*marks, "★ next"] if suggestion.points else marks)
+
+
+def words(text: str) -> Figure:
+    """A line where a picture will come."""
+    figure, axes = style.new_figure(size=(15.0, 5.2))
+    axes.axis("off")
+    axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=26, color=style.GREY)
     return figure
 
 

@@ -7,6 +7,7 @@ films of simulations and pours lie one behind the other.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orchestrator.events import (
     CampaignClosed,
@@ -26,7 +27,7 @@ from orchestrator.monitor.balance import BalanceStage
 from orchestrator.monitor.blueprint import Moment, campaign_blueprint
 from orchestrator.monitor.cell import Cell
 from orchestrator.monitor.films import Films
-from orchestrator.monitor.learning import LearningStage
+from orchestrator.monitor.learning import MAPPED, LearningStage
 from orchestrator.monitor.machine import Machine
 from orchestrator.monitor.outlet import Outlet
 from orchestrator.monitor.simulated import SimulatedStage
@@ -36,6 +37,9 @@ from orchestrator.report.names import receiver_names
 from orchestrator.report.units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
 from sim_engine.task import Scene
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
 
 
 class CampaignRecording:
@@ -60,6 +64,7 @@ class CampaignRecording:
             path, application=f"decant {plan.name}", name=f"{plan.name} · {self.status.reality}", url=url
         )
         self._moment: Moment | None = None
+        outlet.keep(blueprint_of(plan, "replaying"))
         self._show("calibrating" if plan.calibration is not None else "deploying")
         outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         outlet.times(step=0, sim_time=0.0)
@@ -70,6 +75,7 @@ class CampaignRecording:
         self._learning = LearningStage(outlet, plan)
         self._machine = Machine(outlet)
         self._step = 0
+        self._decided = ""
 
     @property
     def next_due(self) -> float | None:
@@ -100,7 +106,8 @@ class CampaignRecording:
         self.status.take(event)
         match event:
             case CampaignOpened():
-                self._machine.opened(event.simulators)
+                self._machine.opened(event.simulators, arm=self._plan.laboratory.bench is not None)
+                self._learning.opened()
                 self._say(f"{event.name}: {'goes on' if event.resumed else 'begins'}, mode {event.mode}")
             case CampaignStateChanged():
                 self._say(f"{event.before} → {event.after}{': ' + event.reason if event.reason else ''}")
@@ -126,7 +133,9 @@ class CampaignRecording:
                 self._learning.learnt(event.result, event.time)
                 self.status.best, self.status.trust = self._learning.best, self._learning.trust
             case DecisionMade():
-                self._say(event.decision.text, source=event.stage)
+                level = "warning" if event.decision.urgent else "info"
+                self._decided = event.decision.text
+                self._say(event.decision.text, level, event.stage)
             case LogLine():
                 self._say(event.text, event.level, event.stage)
         self._machine.status(self.status.page())
@@ -139,11 +148,7 @@ class CampaignRecording:
         if self._moment == moment:
             return
         self._moment = moment
-        deployment = self._plan.deployment
-        names = receiver_names(self._plan)
-        receivers = {s.name: names[s.name] for s in deployment.scenes} if deployment is not None else {}
-        unit = deployment_unit(deployment) if deployment is not None else DISCREPANCY
-        self._outlet.show(campaign_blueprint(moment, receivers, unit.label))
+        self._outlet.show(blueprint_of(self._plan, moment))
 
     def _follow(self, request: Request) -> None:
         """The views follow what is asked for."""
@@ -169,7 +174,8 @@ class CampaignRecording:
                 if pour.predicted is not None:
                     unit = unit_of_pour(self._plan, pour)
                     expected = f", predicted {unit.text(pour.predicted.mean, pour.predicted.deviation)}"
-                self._say(f"pour {pour.number}: {self._action(pour)}{expected}", source=event.stage)
+                if (action := self._action(pour)) not in self._decided:  # most strategies have just said so
+                    self._say(f"pour {pour.number}: {action}{expected}", source=event.stage)
 
     def _finished(self, event: RequestFinished) -> None:
         match event.request:
@@ -196,7 +202,7 @@ class CampaignRecording:
                     measured,
                     now=event.time,
                     step=self._step,
-                    beside=lambda time: self._balance.beside(shown, time),
+                    beside=lambda time, spilled: self._balance.beside(shown, time, spilled),
                 )
             case Suggest() as request, Suggested() as outcome:
                 self._learning.suggested(event, request, outcome)
@@ -231,3 +237,18 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     if plan.deployment is not None:
         scenes.update({scene.name: scene for scene in plan.deployment.scenes})
     return scenes
+
+
+def blueprint_of(plan: CampaignPlan, moment: Moment) -> rrb.Blueprint:
+    """What a viewer shows of a campaign at a moment."""
+    calibration, deployment = plan.calibration, plan.deployment
+    names = receiver_names(plan)
+    receivers = {s.name: names[s.name] for s in deployment.scenes} if deployment is not None else {}
+    unit = deployment_unit(deployment) if deployment is not None else DISCREPANCY
+    return campaign_blueprint(
+        moment,
+        receivers,
+        unit.label,
+        theta_slices=calibration is not None and calibration.parameters.dimension > MAPPED,
+        action_slices=deployment is not None and deployment.actions.dimension > MAPPED,
+    )

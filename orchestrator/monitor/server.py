@@ -7,14 +7,17 @@ program and not its Python package, which serves the viewer's page on all addres
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 OPTIMISING_TIME = 120.0
+
+_PR_SET_PDEATHSIG = 1
 
 
 def rerun_program() -> str:
@@ -72,6 +75,27 @@ def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence
     ]
 
 
+def ended_with_parent() -> Callable[[], None] | None:
+    """For `subprocess.Popen(preexec_fn=)`: the kernel kills the child when this process dies, by SIGKILL even.
+
+    Only for a process with one thread: what runs between fork and exec must not wait for a lock that another one holds,
+    and the kernel means the thread that forked when it speaks of the parent. None where there is no such call: Linux
+    alone has it.
+
+    Source: prctl(2), PR_SET_PDEATHSIG.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl, parent = ctypes.CDLL(None, use_errno=True).prctl, os.getpid()
+
+    def tie() -> None:
+        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it died before it was said
+            os._exit(1)
+
+    return tie
+
+
 def main(arguments: Sequence[str]) -> None:
     """Serve until stdin ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -81,7 +105,12 @@ def main(arguments: Sequence[str]) -> None:
     address, port, web_port, memory, *shown = arguments
     command = serving(address, int(port), int(web_port), memory, shown)
     process = subprocess.Popen(
-        command, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
+        command,
+        env=environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=ended_with_parent(),  # noqa: PLW1509 - there is one thread here
     )
     print(process.pid, flush=True)
     try:

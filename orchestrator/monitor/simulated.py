@@ -19,7 +19,7 @@ MAXIMUM_RATE = 10.0
 
 PLACE = "/simulation"
 
-SHARES = ("in the pourer [%]", "falling [%]", "received [%]", "spilled [%]")
+SHARES = ("in the pourer", "falling", "received", "spilled")
 
 
 class SimulatedStage:
@@ -34,7 +34,7 @@ class SimulatedStage:
         import rerun as rr
 
         self._rr, self._outlet, self._films = rr, outlet, films
-        self._shown: dict[str, str] = {}
+        self._shown: dict[tuple[str, bool], str] = {}
         outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
         for state, name in enumerate(SHARES):
             colour = shapes.rgb(style.PARTICLE_STATES[state][1])
@@ -73,10 +73,13 @@ class SimulatedStage:
         self._films.add(now, step, [float(times[index]) for index in kept], moments)
 
     def _set(self, scene: Scene, title: str) -> None:
+        self._outlet.log(f"{PLACE}/share", self._rr.Clear(recursive=True))  # no line from one film to the next
         self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
         for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
-            if self._shown.get(what) != (key := spec.content_hash()):
-                self._shown[what] = key
+            # What is left out of the wall clock isn't there for those who watch by it.
+            key, place = spec.content_hash(), (what, self._outlet.on_wall)
+            if self._shown.get(place) != key:
+                self._shown[place] = self._shown[what, False] = key
                 self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
 
 

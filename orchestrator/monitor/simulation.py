@@ -37,7 +37,7 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
     scene, outcome = task.scene, result.outcome
     title = title or f"{scene.pourer.name} into {scene.receiver.name}, seed {task.seed}"
     outlet = Outlet(path, application="decant simulation", name=title)
-    outlet.show(simulation_blueprint())
+    outlet.keep(simulation_blueprint())
     outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     films = Films(outlet)
     now = time.time()

@@ -11,10 +11,14 @@ from sim_engine.outcome import ParticleState
 
 SPILLED = int(ParticleState.SPILLED)
 
+LAYERS = 3.0
+"""Cells are as wide and deep as lists reach, and so many times lower: what lies side by side in memory is a column, of
+which a search then takes little more than it needs."""
+
 
 @ti.func
 def cover(f: ti.template(), s, reach):
-    """Cells of at least that edge over all that moves and is in play: their lowest corner, edge and numbers."""
+    """Cells of at least that width over all that moves and is in play: their lowest corner, edges and numbers."""
     low = ti.Vector([1e9, 1e9, 1e9])
     high = ti.Vector([-1e9, -1e9, -1e9])
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -23,7 +27,7 @@ def cover(f: ti.template(), s, reach):
             high = ti.max(high, f.x[i])
     # The domain follows the liquid; if it spreads too far for the table, cells grow. With nobody left it is one cell.
     low = ti.min(low, high)
-    edge = reach
+    edge = ti.Vector([reach, reach, reach / LAYERS])
     size = ti.cast((high - low) / edge, ti.i32) + 1
     while ti.cast(size[0], ti.f32) * size[1] * size[2] > f.cells[s]:
         edge *= 1.25
@@ -82,7 +86,9 @@ def rebuild(f: ti.template(), s, skin):
         q = ti.cast((xi - low) / edge, ti.i32)
         f.first[i] = entries
         # Every pair once, at the particle that comes first: what is left is the rest of the own column of cells and the
-        # columns behind it. Particles of up to three cells of a column lie side by side.
+        # columns behind it. Particles of the cells of a column lie side by side.
+        c0 = ti.max(ti.cast((xi[2] - low[2] - reach) / edge[2], ti.i32), 0)
+        c1 = ti.min(ti.cast((xi[2] - low[2] + reach) / edge[2], ti.i32), size[2] - 1)
         for a in range(q[0], ti.min(q[0] + 2, size[0])):
             b0 = q[1]
             if a > q[0]:
@@ -91,11 +97,10 @@ def rebuild(f: ti.template(), s, skin):
                 column = table + (a * size[1] + b) * size[2]
                 j0 = i + 1
                 if a != q[0] or b != q[1]:
-                    c0 = column + ti.max(q[2] - 1, 0)
                     j0 = begin
-                    if c0 > table:
-                        j0 = f.cell_start[c0 - 1]
-                for j in range(j0, f.cell_start[column + ti.min(q[2] + 1, size[2] - 1)]):
+                    if column + c0 > table:
+                        j0 = f.cell_start[column + c0 - 1]
+                for j in range(j0, f.cell_start[column + c1]):
                     # Branch-free: write always, keep by counting on.
                     r = xi - f.x[j]
                     f.neighbour[entries] = j
@@ -143,6 +148,8 @@ def list_widely(f: ti.template(), s, reach):
         xi = f.x[i]
         q = ti.cast((xi - low) / edge, ti.i32)
         f.first[i] = entries
+        c0 = ti.max(ti.cast((xi[2] - low[2] - reach) / edge[2], ti.i32), 0)
+        c1 = ti.min(ti.cast((xi[2] - low[2] + reach) / edge[2], ti.i32), size[2] - 1)
         for a in range(q[0], ti.min(q[0] + 2, size[0])):
             b0 = q[1]
             if a > q[0]:
@@ -151,11 +158,10 @@ def list_widely(f: ti.template(), s, reach):
                 column = table + (a * size[1] + b) * size[2]
                 k0 = rank + 1
                 if a != q[0] or b != q[1]:
-                    c0 = column + ti.max(q[2] - 1, 0)
                     k0 = begin
-                    if c0 > table:
-                        k0 = f.cell_start[c0 - 1]
-                for k in range(k0, f.cell_start[column + ti.min(q[2] + 1, size[2] - 1)]):
+                    if column + c0 > table:
+                        k0 = f.cell_start[column + c0 - 1]
+                for k in range(k0, f.cell_start[column + c1]):
                     r = xi - f.x_copy[k]
                     f.neighbour[entries] = f.ranked[k]
                     entries += ti.cast(square(r) < reach2, ti.i32)

@@ -40,8 +40,12 @@ class FluidState:
         sag: how much lower each vessel's rim is for this particle [m], see `rims.py`.
         home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
         cell, ranked: in which cell a particle is; particles in the order of cells, where they are not sorted.
-        gradient, squares: Σ∇W and what the constraint's gradients amount to, Σ|∇C|².
+        gradient, squares: of a pass over pairs, a vector and a number; of the density, what the constraint's gradients
+            amount to, Σ|∇C|².
+        sums: Σ∇W and Σ|∇W|² of the neighbours, without their common factor.
+        place, move: position and scaled change of the multiplier; displacement [m], whose fourth means nothing.
         first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
+        pair: the kernel's slope between the two of a pair, where they were when the density was measured last.
     """
 
     def __init__(self, scenes: int, pool: int) -> None:
@@ -63,8 +67,10 @@ class FluidState:
         self.home, self.home_copy, self.name, self.name_copy = (scalars(ti.i32) for _ in range(4))
         self.cell, self.ranked = (scalars(ti.i32) for _ in range(2))
         self.gradient, self.squares = vectors(), scalars()
+        self.sums, self.place, self.move = (ti.Vector.field(4, ti.f32, shape=pool) for _ in range(3))
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
-        self.neighbour = ti.field(ti.i32, shape=pool * NEIGHBOURS + scenes * LIST_RESERVE)
+        entries = pool * NEIGHBOURS + scenes * LIST_RESERVE
+        self.neighbour, self.pair = ti.field(ti.i32, shape=entries), ti.field(ti.f32, shape=entries)
         self.cell_start = ti.field(ti.i32, shape=pool * CELLS + scenes * (LEAST_CELLS + 2))
 
         # Per scene: its place in the pools …
@@ -77,6 +83,7 @@ class FluidState:
         self.spacing = ti.field(ti.f32, shape=scenes)
         self.cohesion = ti.field(ti.f32, shape=scenes)  # scale of its accelerations [m/s²]
         self.viscosity = ti.field(ti.f32, shape=scenes)
+        self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over that at which a pair parts
         self.friction = ti.field(ti.f32, shape=scenes)
         self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
@@ -111,19 +118,20 @@ class FluidState:
         self.grid_origin = ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS))
         self.grid_spacing = ti.field(ti.f32, shape=(scenes, VESSELS))
         self.plane_offset = ti.field(ti.i32, shape=(scenes, VESSELS))  # … of equivalent distances, same size
-        self.swing = ti.field(ti.f32, shape=scenes)  # farthest that the pourer carries a point in this step [m]
+        self.swing = ti.field(ti.f32, shape=(scenes, VESSELS))  # farthest that they carry a point in this step [m]
         self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]
 
     def set_parameters(self, s: int, setup: SceneSetup) -> None:
         """What θ_s of a scene is to the methods."""
         from sim_engine.fluid.tension import cohesion_acceleration, pull_interval
-        from sim_engine.fluid.viscosity import relax_interval
+        from sim_engine.fluid.viscosity import eddy_rate, relax_interval
 
         theta, density, d = setup.parameters, setup.density, setup.spacing
         self.cohesion[s] = cohesion_acceleration(theta.cohesion, density, d)
         self.pull_waited[s], self.pull_wait[s] = 0.0, pull_interval(theta.cohesion, density, d)
         self.viscosity[s] = theta.viscosity
+        self.eddies[s] = eddy_rate(theta.eddies)
         self.waited[s], self.wait[s] = 0.0, relax_interval(theta.viscosity)
         self.friction[s] = theta.friction
         self.lip_drop[s] = theta.lip_drop

@@ -108,9 +108,9 @@ class Stepper:
             v[2] -= f.gravity[s] * dt
             x = x0 + dt * v
             # φ is that of the end of the last step: solid farther off than the way can't be met.
-            reach = STRETCH * (dt * length(v) + f.swing[s]) + 2.0 * clear
+            reach = STRETCH * dt * length(v) + 2.0 * clear
             for b in range(VESSELS):
-                if f.phi[i][b] < reach:
+                if f.phi[i][b] < reach + STRETCH * f.swing[s, b]:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
                     y = swept(f, grids, s, b, y0, y1, clear, f.sag[i][b])
@@ -145,12 +145,13 @@ class Stepper:
         """
         f = self.state
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            x = f.x[i] + f.dx[i]
+            move = ti.Vector([f.move[i][0], f.move[i][1], f.move[i][2]])
+            x = f.x[i] + move
             for b in ti.static(range(VESSELS)):
                 phi = f.phi[i][b]
                 if phi < 4.0 * f.spacing[s]:
                     n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
-                    phi += dot(n, f.dx[i])
+                    phi += dot(n, move)
                     if phi < 0.0:
                         x -= phi * n
                         f.push[i][b] = f.push[i][b] - phi
@@ -204,9 +205,9 @@ class Stepper:
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             x = f.x[i]
             x0 = f.x0[i]
-            reach = STRETCH * (length(x - x0) + f.swing[s]) + d
+            reach = STRETCH * length(x - x0) + d
             for b in range(VESSELS):
-                if f.phi[i][b] < reach:
+                if f.phi[i][b] < reach + STRETCH * f.swing[s, b]:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
                     y = y1
@@ -301,7 +302,7 @@ class Stepper:
         self.place_pourer(s, f.time[s], poses)
         # No point within SWING_ARM of the pourer's origin is carried farther than this in the step.
         turned = f.turn[s, 0] - f.turn0[s, 0]
-        f.swing[s] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * SWING_ARM
+        f.swing[s, 0] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * SWING_ARM
         self.predict(s, dt, grids)
         if f.stale[s] == 1:
             rebuild(f, s, SKIN)

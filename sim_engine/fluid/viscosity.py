@@ -2,10 +2,10 @@
 
 Shear that is felt over a few spacings makes particles climb over each other; what they gain scatters a stream, the
 more the coarser they are. In a liquid such motion decays into eddies smaller than a spacing. Their viscosity is that
-of Smagorinsky, ν = (C d)² |S| with C = 0.17 (Lilly, from Kolmogorov's spectrum) and the strain rate |S| = √(2 S:S). Of
-a pair it is taken from the rate e at which the two part, over their distance: over all directions the mean of e² is
-|S|²/15, and turning as a whole strains nobody. A relaxation at the rate k acts like a kinematic viscosity of k d²/5, so
-to the given rate is added 5 C² √15 |e|, whose viscosity vanishes as spacings do.
+of Smagorinsky, ν = (C d)² |S| with C = 0.17 (Lilly, from Kolmogorov's spectrum; θ may have another one) and the strain
+rate |S| = √(2 S:S). Of a pair it is taken from the rate e at which the two part, over their distance: over all
+directions the mean of e² is |S|²/15, and turning as a whole strains nobody. A relaxation at the rate k acts like a
+kinematic viscosity of k d²/5, so to the given rate is added 5 C² √15 |e|, whose viscosity vanishes as spacings do.
 
 Both are slow, and act only every few steps.
 
@@ -19,9 +19,6 @@ import taichi as ti
 from sim_engine.fluid.kernels import weight
 from sim_engine.fluid.state import SUPPORT
 from sim_engine.fluid.vectors import dot, length, square
-
-EDDIES = 5.0 * 0.17**2 * math.sqrt(15.0)
-"""Rate of relaxation over the rate at which a pair parts."""
 
 LONGEST_WAIT = 0.01
 """Viscosity acts at least that often [s]."""
@@ -46,7 +43,7 @@ def relax(f: ti.template(), s, dt):
             w = weight(ti.max(1.0 - length(r) * inv_h, 0.0))
             u = f.v[j] - vi
             parting = ti.abs(dot(u, r)) / (square(r) + closest)
-            towards = w * (1.0 - ti.exp(-(f.viscosity[s] + EDDIES * parting) * dt)) * u
+            towards = w * (1.0 - ti.exp(-(f.viscosity[s] + f.eddies[s] * parting) * dt)) * u
             total += w
             drift += towards
             f.squares[j] = f.squares[j] + w
@@ -56,6 +53,11 @@ def relax(f: ti.template(), s, dt):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
         f.v[i] = f.v[i] + f.dx[i] / ti.max(f.squares[i], 1.0)
+
+
+def eddy_rate(constant: float) -> float:
+    """Rate of relaxation over the rate at which a pair parts, from Smagorinsky's constant C."""
+    return 5.0 * constant**2 * math.sqrt(15.0)
 
 
 def relax_interval(viscosity: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -148,3 +149,20 @@ def test_nothing_is_left_behind_when_a_live_view_ends() -> None:
     while any(answers(host, port) for port in ports):
         assert time.monotonic() < end
         time.sleep(0.1)
+
+
+def test_server_ends_when_the_process_that_minds_it_is_killed() -> None:
+    live = LiveView()
+    live.open()
+    ports, host, server = live._ports, live.host, live.server_pid
+    try:
+        assert live._process is not None
+        live._process.kill()
+        end = time.monotonic() + PATIENCE
+        while any(answers(host, port) for port in ports):
+            assert time.monotonic() < end, "the server outlives it"
+            time.sleep(0.1)
+    finally:
+        live.close()
+        with contextlib.suppress(OSError):
+            os.kill(server, signal.SIGKILL)

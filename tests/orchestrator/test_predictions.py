@@ -12,7 +12,7 @@ import pytest
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
-from orchestrator.report.summary import summarise
+from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
 from orchestrator.report.units import loss_unit
 from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots

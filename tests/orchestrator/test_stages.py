@@ -16,7 +16,7 @@ from orchestrator.commands.arming import pour_count
 from orchestrator.errors import RunError
 from orchestrator.events import Event, RequestFinished
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour, RecordSet
-from orchestrator.report.summary import summarise
+from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
 from orchestrator.requests import Pour, Simulate
 from orchestrator.stages import scenes_of, stages_of

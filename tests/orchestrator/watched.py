@@ -184,6 +184,9 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
         points = tuple((0.1 * i, 0.5) for i in range(1, number + 1))
         question = SuggestProblem(ACTIONS, Data(points, tuple(0.1 for _ in points)), map_resolution=9)
         yield _answered("narrow cup", 10 * number + 1, question, now)
+        if number == 1:
+            alarm = Decision("after pour 1 the simulator is wrong here", urgent=True)
+            yield DecisionMade(time=now, stage="narrow cup", decision=alarm)
         yield StrategyProgressed(
             time=now, stage="narrow cup", progress=Progress(pours=number, of_pours=pours), result=LEARNT
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,9 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
         raise InvalidActionError(refusal(problems))
     made = followable(motion)
     phases: Phases = tuple((p.name, p.start, p.end) for p in made.phases)
-    approach, approached = _approach(made.sample(np.zeros(1))[0], spec, pourer, receiver, problems)
+    first_pose = tuple(made.sample(np.zeros(1))[0].tolist())
+    approach, approached, wrong = _approach(first_pose, spec, pourer, receiver)
+    problems = list(wrong)
     barred = bool(problems)
     pour = None
     try:
@@ -108,13 +111,21 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     )
 
 
+@lru_cache(maxsize=16)
 def _approach(
-    start: FloatArray, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, problems: list[str]
-) -> tuple[JointPath | None, float]:
-    """The way there with the fewest problems, the shortest of those, and its clearance [m]; notes its problems."""
+    start: tuple[float, ...], spec: UrArmSpec, pourer: Vessel, receiver: Vessel
+) -> tuple[JointPath | None, float, tuple[str, ...]]:
+    """The way there with the fewest problems, the shortest of those, its clearance [m], and its problems.
+
+    Args:
+        start: pose of the pourer in the world that the pour begins with. Pours at one place share it, so that the way
+            there is worked out and looked at once for all of them.
+        spec: of the arm and its cell.
+        pourer, receiver: geometry.
+    """
     over = receiver.rim_height + spec.limits.clearance + OVER
     best: tuple[JointPath | None, float, list[str]] | None = None
-    for knots in routes(home_pose(spec), start, over):
+    for knots in routes(home_pose(spec), np.array(start), over):
         path: JointPath | None = None
         try:
             path = travel(knots, np.array(spec.home), spec)
@@ -135,8 +146,7 @@ def _approach(
         if not found:
             break
     assert best is not None
-    problems += best[2]
-    return best[0], best[1]
+    return best[0], best[1], tuple(best[2])
 
 
 def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSpec) -> JointPath:

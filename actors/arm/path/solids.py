@@ -7,7 +7,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from actors.arm.path.stretch import Stretch
 from actors.arm.path.transforms import cell_transforms
@@ -30,8 +29,39 @@ _hulls: WeakKeyDictionary[Vessel, FloatArray] = WeakKeyDictionary()
 def hull(vessel: Vessel) -> FloatArray:
     """Corners of a vessel's convex hull, shape (V, 3) [m]: no point of it reaches farther."""
     if vessel not in _hulls:
-        _hulls[vessel] = vessel.solid_vertices[ConvexHull(vessel.solid_vertices).vertices]
+        corners = vessel.solid_vertices
+        if vessel.spec.shape.outline() is None:
+            from scipy.spatial import ConvexHull  # takes a third of a second to import
+
+            _hulls[vessel] = corners[ConvexHull(corners).vertices]
+        else:
+            _hulls[vessel] = corners[_outermost_rings(corners)]
     return _hulls[vessel]
+
+
+def _outermost_rings(corners: FloatArray) -> NDArray[np.bool_]:
+    """Which corners (V, 3) of a body of revolution, made of whole rings, are on its convex hull.
+
+    The half section's upper chain by Andrew's monotone chain, seen from the axis: of rings at one height the widest
+    alone, and none that lies within the cone of two others.
+    """
+    radius, height = np.round(np.hypot(corners[:, 0], corners[:, 1]), 12), corners[:, 2]
+    chain: list[tuple[float, float]] = []
+    for z in np.unique(height):
+        r = float(radius[height == z].max())
+        while len(chain) > 1 and _bent_in(chain[-2], chain[-1], (r, float(z))):
+            chain.pop()
+        chain.append((r, float(z)))
+    kept = np.zeros(len(corners), dtype=bool)
+    for r, z in chain:
+        kept |= (height == z) & (radius == r)
+    return kept
+
+
+def _bent_in(below: tuple[float, float], middle: tuple[float, float], above: tuple[float, float]) -> bool:
+    """Whether a ring (radius, height) is no wider than the cone through one below and one above it."""
+    (r0, z0), (r1, z1), (r2, z2) = below, middle, above
+    return (r1 - r0) * (z2 - z0) <= (r2 - r0) * (z1 - z0)
 
 
 @dataclass(frozen=True)

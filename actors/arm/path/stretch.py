@@ -115,7 +115,7 @@ class Stretch:
     def point_speeds(self, points: FloatArray) -> FloatArray:
         """Speeds of the fastest of the TCP and points (V, 3) of the pourer between samples, shape (N − 1,) [m/s]."""
         turn, shift = np.diff(self.pourer.rotation, axis=0), np.diff(self.pourer.position, axis=0)
-        moved = np.linalg.norm(np.einsum("tij,vj->tvi", turn, points) + shift[:, None], axis=-1).max(axis=1)
+        moved = np.sqrt(np.square(turn @ points.T + shift[:, :, None]).sum(axis=1).max(axis=1))
         tool = np.linalg.norm(np.diff(self.tool, axis=0), axis=-1)
         speeds: FloatArray = np.maximum(moved, tool) / self.steps
         return speeds

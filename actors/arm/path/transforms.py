@@ -7,10 +7,10 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from actors.arm.geometry import Pose
 from actors.arm.path.kinematics import MODELS, forward
+from actors.arm.path.turns import about, from_vector, to_quaternions
 from actors.arm.spec import UrArmSpec
 from sim_engine.contact import rotations
 from sim_engine.sampled_motion import SampledMotion
@@ -48,8 +48,7 @@ class Transforms:
 
 def transform_of(pose: Pose) -> Transforms:
     """A pose with a rotation vector as a frame."""
-    turn = Rotation.from_rotvec([pose.rx, pose.ry, pose.rz]).as_matrix()
-    return Transforms(np.asarray(turn, dtype=float), np.array([pose.x, pose.y, pose.z]))
+    return Transforms(from_vector([pose.rx, pose.ry, pose.rz]), np.array([pose.x, pose.y, pose.z]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +71,11 @@ class CellTransforms:
 @lru_cache(maxsize=32)
 def cell_transforms(spec: UrArmSpec) -> CellTransforms:
     """The fixed frames of a cell."""
-    turn = Rotation.from_euler("z", spec.cell.direction).as_matrix()
     tool = transform_of(spec.tool)
-    mount = Rotation.from_euler("zx", [spec.mount.turn, spec.mount.tilt]).as_matrix()
+    mount = about("x", spec.mount.tilt) @ about("z", spec.mount.turn)  # first turned about its own z, then tilted
     return CellTransforms(
-        Transforms(np.asarray(mount, dtype=float), np.zeros(3)),
-        Transforms(np.asarray(turn, dtype=float), np.array(spec.cell.receiver)),
+        Transforms(mount, np.zeros(3)),
+        Transforms(about("z", spec.cell.direction), np.array(spec.cell.receiver)),
         tool,
         tool @ transform_of(spec.grip),
     )
@@ -106,7 +104,7 @@ def flange_transforms(joints: FloatArray, spec: UrArmSpec) -> Transforms:
 
 def quaternions(rotation: FloatArray) -> FloatArray:
     """Unit quaternions (T, 4), w first, of rotation matrices (T, 3, 3); the first has w ≥ 0, then without jumps."""
-    q = np.roll(np.asarray(Rotation.from_matrix(rotation).as_quat(), dtype=float), 1, axis=-1)
+    q = to_quaternions(rotation)
     with_last = np.sum(q[1:] * q[:-1], axis=-1)
     sign = np.cumprod(np.where(with_last < 0.0, -1.0, 1.0))
     first = -1.0 if q[0, 0] < 0.0 else 1.0
@@ -129,7 +127,7 @@ def pourer_motion(joints: FloatArray, times: FloatArray, spec: UrArmSpec, *, gri
     """
     cell = cell_transforms(spec)
     grip = cell.tool.inverse @ cell.pourer
-    slipped = grip.rotation @ Rotation.from_euler("y", grip_tilt).as_matrix() @ grip.rotation.T
+    slipped = grip.rotation @ about("y", grip_tilt) @ grip.rotation.T
     held = cell.tool @ Transforms(slipped, np.zeros(3)) @ grip
     frames = cell.world.inverse @ flange_transforms(joints, spec) @ held
     return SampledMotion(times, np.concatenate([frames.position, quaternions(frames.rotation)], axis=-1))

@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from actors.arm.joint_path import JointPath
 from actors.arm.path.kinematics import MODELS, inverse, posture
 from actors.arm.path.pace import trapezoid
 from actors.arm.path.transforms import cell_transforms, flange_poses, pourer_transforms, quaternions
+from actors.arm.path.turns import between
 from actors.arm.spec import UrArmSpec
 
 FloatArray = NDArray[np.float64]
@@ -157,9 +157,7 @@ def _line(
 
 
 def _between(a: FloatArray, b: FloatArray, s: FloatArray) -> FloatArray:
-    turned = Slerp([0.0, 1.0], Rotation.from_quat(np.stack([np.roll(a[3:], -1), np.roll(b[3:], -1)])))(s)
-    quaternion = np.roll(np.asarray(turned.as_quat(), dtype=float), 1, axis=-1)
-    return np.concatenate([a[:3] + (b[:3] - a[:3]) * s[:, None], quaternion], axis=-1)
+    return np.concatenate([a[:3] + (b[:3] - a[:3]) * s[:, None], between(a[3:], b[3:], s)], axis=-1)
 
 
 def _angle(a: FloatArray, b: FloatArray) -> float:

@@ -72,7 +72,8 @@ def describe(
     if problem.map_resolution and problem.space.dimension >= 2:
         sought = problem.acquisition == "posterior_minimum" and len(points) > 0
         at = np.array(problem.map_at) if problem.map_at else points[0] if sought else known[best]
-        description["surrogate"] = _map(problem, asked.region, model, at)
+        across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
+        description["surrogate"] = mapped(problem, asked.region, model, at, (across, up), problem.map_resolution)
     return description
 
 
@@ -118,10 +119,12 @@ def _axis_names(problem: SuggestProblem) -> list[str]:
     return [*problem.space.names, *(f"context{i + 1}" for i in range(problem.beside))]
 
 
-def _map(problem: SuggestProblem, region: Region, model: Model, at: Array) -> SurrogateMap:
-    """The surrogate on the plane through `at` (dimension,) that its two most important axes span."""
-    across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
-    places = np.linspace(0.0, 1.0, problem.map_resolution)
+def mapped(
+    problem: SuggestProblem, region: Region, model: Model, at: Array, axes: tuple[int, int], resolution: int
+) -> SurrogateMap:
+    """The surrogate on the plane through `at`, shape (dimension,), that two axes of the space span."""
+    across, up = axes
+    places = np.linspace(0.0, 1.0, resolution)
     first, second = np.meshgrid(places, places)
     grid = np.tile(at, (first.size, 1))
     grid[:, across], grid[:, up] = first.ravel(), second.ravel()

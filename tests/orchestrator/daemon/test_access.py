@@ -13,7 +13,10 @@ from orchestrator.daemon.auth import FAILURES, WINDOW, Role, TokenFileError, Tok
 from orchestrator.daemon.packing import PackingError, unpack
 from tests.orchestrator.daemon.served import Served, held, run, serving
 
-LOOKING = ("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report")
+LOOKING = (
+    *("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report"),
+    *("/runs", "/pours", "/runs/compare?run=a&run=b", "/runs/export", "/runs/x", "/runs/x/report"),
+)
 DOING = (
     "/campaigns",
     "/campaigns/x/pause",
@@ -25,6 +28,8 @@ DOING = (
     "/questions/1/answer",
     "/queue/pause",
     "/queue/resume",
+    "/runs/x/tags",
+    "/runs/x/notes",
     "/emergency-stop/clear",
     "/shutdown",
 )

@@ -15,7 +15,7 @@ from orchestrator.config.load import load_campaign
 from orchestrator.plan import CampaignPlan
 from orchestrator.report.names import receiver_names
 from orchestrator.report.regimes import best_action_warnings, campaign_warnings, lines, numbers_line, regimes_of
-from orchestrator.report.summary import summarise
+from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
 from sim_engine.action import DEG
 from sim_engine.liquid import SimulationParameters

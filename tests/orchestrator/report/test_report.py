@@ -26,7 +26,7 @@ from orchestrator.report.results import (
     pour_series,
 )
 from orchestrator.report.style import display_value, display_values, log_ticks
-from orchestrator.report.summary import summarise
+from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
 from orchestrator.report.trust import draw_trust, trust_title
 from orchestrator.report.units import loss_unit

@@ -10,12 +10,12 @@ import jsonschema
 import pytest
 
 from orchestrator.report.style import display_value, display_values
+from orchestrator.report.summarise import summarise
 from orchestrator.report.summary import (
     NotSimulated,
     PoolUse,
     RunSummary,
     Totals,
-    summarise,
     summary_schema,
     write_summary,
 )

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from orchestrator.report.summary import summarise
+from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
 from orchestrator.results import decode_result, encode_result

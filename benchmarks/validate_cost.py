@@ -1,0 +1,75 @@
+"""What `decant validate` costs for every shipped file, in CPU seconds of fresh processes.
+
+    python benchmarks/validate_cost.py [--repeats 5] [--json]
+
+User plus system time of the whole process, start and imports included: other work on the machine hardly spoils it.
+Bytecode and the grids of meshes are there: one run of each file before, not counted, sees to that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from machine import ROOT, describe, say, show, single_threaded
+
+LIMIT = 2.0
+"""What the check of a shipped file may take [CPU s]."""
+
+FOLDERS = ("campaigns", "studies", "laboratories", "vessels")
+
+
+def cost(file: Path, environment: dict[str, str]) -> float:
+    """CPU seconds of one check.
+
+    Raises:
+        SystemExit: the file was refused.
+    """
+    before = os.times()
+    command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "validate", str(file)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    after = os.times()
+    if done.returncode != 0:
+        raise SystemExit(f"{file}: {done.stderr}")
+    return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=5, help="processes for each file")
+    parser.add_argument("--json", action="store_true", help="one line of JSON")
+    options = parser.parse_args()
+    if options.repeats < 1:
+        raise SystemExit(f"--repeats {options.repeats}: at least one process is needed")
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory(prefix="decant-") as kept:
+        # bytecode is kept also where the environment says otherwise: a user's second run finds it
+        environment = {**single_threaded(), "PYTHONPYCACHEPREFIX": kept, "DECANT_CACHE_DIR": kept}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        for folder in FOLDERS:
+            for file in sorted((ROOT / "configs" / folder).glob("*.yaml")):
+                name = file.relative_to(ROOT).as_posix()
+                cost(file, environment)
+                seconds = [cost(file, environment) for _ in range(options.repeats)]
+                rows.append({"file": name, "cpu_s": round(statistics.median(seconds), 2)})
+                say(f"{name}: {rows[-1]['cpu_s']:.2f} CPU s")
+    result = {
+        "files": rows,
+        "limit_s": LIMIT,
+        "within_limit": all(row["cpu_s"] <= LIMIT for row in rows),
+        "repeats": options.repeats,
+        "core": None,
+        "machine": describe(),
+    }
+    show(result, options.json)
+
+
+if __name__ == "__main__":
+    main()

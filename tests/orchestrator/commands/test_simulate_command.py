@@ -1,0 +1,132 @@
+"""`decant simulate`: what it prints, writes, and says about what it does not know."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from orchestrator.commands import single
+from sim_engine.spread import spreads
+from tests.orchestrator import watched
+from tests.orchestrator.commands.typed import SIMULATE, process
+
+
+@pytest.fixture(scope="module")
+def simulated(inputs: Path) -> subprocess.CompletedProcess[str]:
+    """One pour through the command, shown in every way."""
+    return process(f"{SIMULATE} --seed 5 --json --rrd pour.rrd --png pour.png", inputs)
+
+
+def test_simulate_prints_one_line_of_json_and_nothing_else(simulated: subprocess.CompletedProcess[str]) -> None:
+    assert simulated.returncode == 0, simulated.stderr
+    (line,) = simulated.stdout.splitlines()
+    outcome = json.loads(line)
+    fractions = ("received", "spilled", "retained", "in_flight", "escaped")
+    assert sum(outcome[name] for name in fractions) == pytest.approx(1.0, abs=1e-9)
+    assert all(0.0 <= outcome[name] <= 1.0 for name in fractions)
+    assert outcome["received"] > 0.5
+    assert (outcome["particles"], outcome["seed"]) == (300, 5)
+    # 100 mL shared by 300 particles
+    assert outcome["spacing_mm"] == pytest.approx((1e-4 / 998 * 997 / 300) ** (1 / 3) * 1e3, rel=2e-3)
+    assert outcome["steps"] > 100
+    assert outcome["cpu_s"] > 0.0
+
+
+def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
+    simulated: subprocess.CompletedProcess[str],
+) -> None:
+    outcome = json.loads(simulated.stdout)
+    prediction = outcome["prediction"]
+    assert prediction["seeds"] == [5, 6, 7]
+    assert prediction["received"]["count"] == 3
+    assert prediction["band"]["low"] < prediction["spillage"]["mean"] < prediction["band"]["high"]
+    assert prediction["band"]["level"] == 0.9
+    assert prediction["received"]["deviation"] > 0.0
+    assert abs(prediction["received"]["mean"] - outcome["received"]) < 5 * prediction["received"]["deviation"] + 1e-9
+    assert outcome["regimes"]["lip"]["weber"][0] < outcome["regimes"]["lip"]["weber"][1]
+    assert outcome["delivered_g"] == pytest.approx(100.0 * outcome["prediction"]["received"]["mean"])
+    assert outcome["delivered_ml"] == pytest.approx(outcome["delivered_g"] / 0.998)
+    assert outcome["not_covered"] == []
+    assert "not simulated" not in simulated.stderr
+
+
+def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path) -> None:
+    done = process(
+        "simulate small.yaml --set angular_velocity=20 --set max_angle=75 --set x_offset=70 --seeds 2", inputs
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
+    assert "mean ± standard deviation, 2 seeds" in done.stdout
+    assert re.search(
+        r"spilled / poured \d+\.\d ± \d+\.\d %, a pour: \d+\.\d … \d+\.\d %   \(bands of seeds", done.stdout
+    )
+    assert re.search(r"delivered \d+\.\d g, \d+\.\d mL", done.stdout)
+    assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
+
+
+def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
+    theta = {"cohesion": 0.05}
+    draws = [{"theta": {"cohesion": 0.02 * i}, "weight": 1.0} for i in range(4)]
+    (inputs / "theta.json").write_text(
+        json.dumps({"theta": theta, "remaining_discrepancy": {"shift": 0.2}, "posterior": draws}), encoding="utf-8"
+    )
+    done = process(
+        "simulate small.yaml --from pours.csv --parameters theta.json --seeds 2 --csv scored.csv --png scored.png "
+        "--json",
+        inputs,
+    )
+    (inputs / "theta.json").unlink()
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["scene"] == "calibration"
+    assert [pour["measured"] for pour in found["pours"]] == pytest.approx([4 / 90, 8 / 95, 0.09])
+    assert [pour["line"] for pour in found["pours"]] == [2, 3, 4]
+    assert {split: one["pours"] for split, one in found["scores"].items()} == {"train": 2, "test": 1, "all": 3}
+    errors = [abs(pour["measured"] - pour["predicted"]["mean"]) for pour in found["pours"]]
+    assert found["scores"]["all"]["mean_error"] == pytest.approx(sum(errors) / 3)
+    assert found["scores"]["all"]["held"] == sum(pour["inside"] for pour in found["pours"])
+    assert (found["simulations"], found["thetas"]) == (6, 2)
+    assert found["bands"]["discrepancy_shift"] == 0.2
+    for pour in found["pours"]:
+        assert pour["band"]["low"] <= pour["predicted"]["mean"] <= pour["band"]["high"]
+    assert len((inputs / "scored.csv").read_text(encoding="utf-8").splitlines()) == 4
+    assert (inputs / "scored.png").read_bytes().startswith(b"\x89PNG")
+    assert "3 pours, 2 simulations each, bands of seeds, 2 θ of the posterior" in done.stderr
+
+
+def test_one_seed_has_no_spread_and_says_so() -> None:
+    several = [watched.outcome(spilled=s) for s in (0.05, 0.07)]
+    assert "received 92.0 ± 1.4 %  spilled 6.0 ± 1.4 %" in single.told(several, spreads(several))
+    alone = single.told(several[:1], spreads(several[:1]))
+    assert "±" not in alone
+    assert "1 seed, so no spread; --seeds 5 would tell it" in alone
+
+
+def test_simulate_shows_the_pour_as_picture_and_recording(
+    simulated: subprocess.CompletedProcess[str], inputs: Path
+) -> None:
+    assert (inputs / "pour.png").read_bytes().startswith(b"\x89PNG")
+    assert (inputs / "pour.rrd").read_bytes().startswith(b"RRF")
+    assert "pour.png" in simulated.stderr
+    assert "pour.rrd" in simulated.stderr
+
+
+def test_simulate_takes_units_parameters_and_another_receiver(
+    simulated: subprocess.CompletedProcess[str], inputs: Path
+) -> None:
+    (inputs / "theta.json").write_text('{"theta": {"particles": 350}}', encoding="utf-8")
+    command = (
+        "simulate small.yaml --set 'angular_velocity=1.5 rad/s' --set 'x_offset=8 cm' "
+        "--parameters theta.json --receiver tumbler.yaml --json"
+    )
+    done = process(command, inputs)
+    (inputs / "theta.json").unlink()
+    assert done.returncode == 0, done.stderr
+    outcome = json.loads(done.stdout)
+    assert outcome["particles"] == 350
+    assert (outcome["action"]["angular_velocity"], outcome["action"]["x_offset"]) == pytest.approx((1.5, 0.08))
+    assert outcome["scene"] == "beaker into tumbler"
