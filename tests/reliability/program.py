@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 from actors.optimizer.actor import Proposer
+from sim_engine.outcome import PourMeasurement
 from tests.orchestrator.toy import ToyBench, ToyLaboratory
 from tests.reliability.case import AHEAD, BACK, FULL, KILLED, KILLED_AFTER, STOPPED, Case, every
 from tests.reliability.rig import Life, Rig
@@ -20,10 +21,18 @@ class LoggingBench(ToyBench):
         self._life = life
 
     async def pour(self, *arguments: Any, **named: Any) -> Any:
-        measured = await super().pour(*arguments, **named)
+        measured = as_shown(await super().pour(*arguments, **named))
         with (self._life.place / "poured").open("a", encoding="utf-8") as file:
             file.write(f"{named['seed']}\n")
         return measured
+
+
+def as_shown(measured: PourMeasurement) -> PourMeasurement:
+    """Masses as a balance shows them, to a tenth of a gram: one that is typed is the same to the last bit."""
+    loaded, spilled, retained = (
+        float(f"{1e3 * mass:.1f}") * 1e-3 for mass in (measured.loaded, measured.spilled, measured.retained)
+    )
+    return PourMeasurement(loaded, spilled, retained, measured.notes)
 
 
 class Optimizer:

@@ -499,7 +499,7 @@ def record(directory: Path) -> list[Any]:
                 measured = body["outcome"]["measurement"]
                 outcomes[body["id"]] = [round(1e3 * measured[k], 9) for k in ("loaded", "spilled", "retained")]
             case Kind.FINISHED | Kind.POUR_FINISHED:
-                outcomes[body["id"]] = timeless(body["outcome"])
+                outcomes[body["id"]] = rounded(timeless(body["outcome"]))
             case Kind.TOLD:
                 found.append([entry.stage, str(entry.kind), body["id"], outcomes[body["id"]]])
             case Kind.STAGE_OPENED | Kind.ASKED | Kind.REQUESTED | Kind.DECISION | Kind.STAGE_CLOSED:
@@ -508,9 +508,9 @@ def record(directory: Path) -> list[Any]:
 
 
 def rounded(data: Any) -> Any:
-    """To eleven digits: a weight that was typed in grams is not the last bit of one that was weighed."""
+    """To nine digits: a weight that was typed in grams is not the last bit of one that was weighed."""
     if isinstance(data, float):
-        return float(f"{data:.11g}")
+        return float(f"{data:.9g}")
     if isinstance(data, dict):
         return {key: rounded(value) for key, value in data.items()}
     return [rounded(value) for value in data] if isinstance(data, list) else data
