@@ -22,6 +22,8 @@ FAULTS = (KILLED, KILLED_AFTER, STOPPED, CUT, FULL, AHEAD, BACK)
 
 _CLOCKLESS = "reads no clock of the day: `actors` and `sim_engine` use the monotonic one alone (a test sees to it)"
 
+_ANOTHER_TIME = "not tried: its programs can't be given another time than the machine's, which others use"
+
 NO_MEANING: dict[tuple[str, str], str] = {
     ("program", CUT): "has no sockets of its own; those of its devices, its recording and Ray are struck as theirs",
     **{
@@ -34,8 +36,8 @@ NO_MEANING: dict[tuple[str, str], str] = {
     ("worker", FULL): "writes nothing but complaints of its library",
     ("controller", FULL): "writes nothing",
     ("balance", FULL): "writes nothing",
-    ("ray", AHEAD): "not tried: its programs can't be given another time than the machine's, which others use",
-    ("ray", BACK): "likewise",
+    ("ray", AHEAD): _ANOTHER_TIME,
+    ("ray", BACK): _ANOTHER_TIME,
 }
 """Why a fault isn't tried on something."""
 

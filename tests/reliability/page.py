@@ -82,8 +82,10 @@ def work(target: str, number: int, shares: int, results: Path, limit: int | None
 
 def commit() -> str:
     """Of the program that was tried."""
-    command = ["git", "-C", str(ROOT), "rev-parse", "--short=10", "HEAD:orchestrator", "HEAD:actors", "HEAD:sim_engine"]
-    return " ".join(subprocess.run(command, capture_output=True, text=True, check=False).stdout.split())
+    floors = ("HEAD:orchestrator", "HEAD:actors", "HEAD:sim_engine")
+    command = ["git", "-C", str(ROOT), "rev-parse", *floors]
+    said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    return " ".join(word[:10] for word in said.split())
 
 
 def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
@@ -151,7 +153,14 @@ def counted(words: Any) -> str:
 
 def reasons() -> str:
     """What isn't tried, and why."""
-    return "".join(f"- {target}, {fault}: {why}\n" for (target, fault), why in NO_MEANING.items())
+    by_reason: dict[str, dict[str, list[str]]] = defaultdict(dict)
+    for (target, fault), why in NO_MEANING.items():
+        by_reason[why].setdefault(target, []).append(fault)
+    lines = []
+    for why, targets in by_reason.items():
+        faults = dict.fromkeys(fault for some in targets.values() for fault in some)
+        lines.append(f"- {', '.join(targets)}; {', '.join(faults)}: {why}\n")
+    return "".join(lines)
 
 
 def write(results: Path) -> int:
