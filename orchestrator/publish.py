@@ -131,6 +131,24 @@ def summary_of(
     )
 
 
+def report_on(
+    plan: CampaignPlan, result: CampaignResult, path: Path | None = None, formats: tuple[str, ...] = (".svg",)
+) -> tuple[Path, dict[str, Path]]:
+    """Draw a run's figures anew, and write the page about it, wherever the run stands.
+
+    Args:
+        path: of the page; in the run's folder unless given.
+        formats: of the figures.
+
+    Raises:
+        OSError: a file can't be written.
+        RunError: the journal can't be read.
+    """
+    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats)
+    summary = summary_of(plan, result, figures)
+    return write_report(path or result.directory / REPORT_NAME, plan, summary, result.directory), figures
+
+
 def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory: Path) -> Path:
     """Write the page about a run, whole or not at all.
 

@@ -230,6 +230,17 @@ def report_lines(report: PathReport) -> list[str]:
     ]
 
 
+def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "") -> None:
+    """Show what hardware would do, before its laboratory's name is typed."""
+    say(f"\nHARDWARE: laboratory {laboratory}, {arm}. This will move:\n")
+    for line in lines:
+        say(f"  {line}")
+    say(
+        "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of the "
+        f"box.\nType the laboratory's name ({laboratory}) to arm it{lasting}; anything else ends here."
+    )
+
+
 def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     """Show what hardware would do, and have its laboratory's name typed.
 
@@ -243,14 +254,7 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
             "its name: that needs a terminal, with nothing piped into it",
             BAD_INPUT,
         )
-    say(f"\nHARDWARE: laboratory {laboratory.name}, {laboratory.arm.title}. This will move:\n")
-    for line in lines:
-        say(f"  {line}")
-    say(
-        "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of the "
-        "box.\n"
-        f"Type the laboratory's name ({laboratory.name}) to arm it for this run; anything else ends here."
-    )
+    announce(laboratory.name, laboratory.arm.title, lines, " for this run")
     termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # keys pressed before this was read mean something else
     print("> ", end="", file=sys.stderr, flush=True)
     typed = sys.stdin.readline()

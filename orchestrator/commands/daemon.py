@@ -82,6 +82,9 @@ def submit(
     priority: int,
     laboratory: Path | None,
     seed: int | None,
+    parameters: Path | None = None,
+    receiver: Path | None = None,
+    iterations: int | None = None,
     at: At,
     as_json: bool,
 ) -> None:
@@ -94,6 +97,18 @@ def submit(
     from orchestrator.daemon.packing import pack
 
     plan = read_campaign(path, laboratory, seed)
+    if (parameters, receiver, iterations) != (None, None, None):
+        from orchestrator.commands.campaigns import planning_plan
+
+        if wanted != "plan":
+            raise RefusalError("--parameters, --receiver and --iterations go with --verb plan", BAD_INPUT)
+        plan = planning_plan(plan, parameters, receiver, iterations)
+        if plan.deployment is not None and plan.deployment.thetas:
+            raise RefusalError(
+                f"{path}: deployment.risk.theta: 'posterior': draws of θ don't travel to a daemon; 'decant plan' bears "
+                "them here",
+                BAD_INPUT,
+            )
     try:
         text, files = pack(plan)
     except OSError as error:
@@ -287,6 +302,8 @@ def _print_question(question: dict[str, Any]) -> None:
 
 def arm(key: str, *, at: At) -> None:
     """Show what hardware would do, and have its laboratory's name typed."""
+    from orchestrator.commands.arming import announce
+
     if not sys.stdin.isatty():
         raise RefusalError(
             "hardware is armed by somebody who reads what it will do and types its name: that needs a terminal",
@@ -295,13 +312,7 @@ def arm(key: str, *, at: At) -> None:
     with talking(at) as client:
         say("planning paths from all over the actions …")
         moves = client.get(f"/campaigns/{key}/arming")
-        say(f"\nHARDWARE: laboratory {moves['laboratory']}, {moves['arm']}. This will move:\n")
-        for line in moves["lines"]:
-            say(f"  {line}")
-        say(
-            "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of "
-            f"the box.\nType the laboratory's name ({moves['laboratory']}) to arm it; anything else ends here."
-        )
+        announce(moves["laboratory"], moves["arm"], moves["lines"])
         print("> ", end="", file=sys.stderr, flush=True)
         found = client.post(f"/campaigns/{key}/arm", {"laboratory": sys.stdin.readline().strip()})
     say(f"armed for the coming part of its run: {found['id']}")

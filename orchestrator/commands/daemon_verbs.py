@@ -8,14 +8,25 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands.options import Campaign, Json, OtherLaboratory, Seed, call, examples, given
+from orchestrator.commands.options import (
+    Campaign,
+    Json,
+    OtherLaboratory,
+    Parameters,
+    Receiver,
+    Seed,
+    call,
+    examples,
+    given,
+)
 
 Key = Annotated[
     str,
     typer.Argument(metavar="CAMPAIGN_ID", help="As 'decant list' shows it; its beginning will do.", show_default=False),
 ]
 Url = Annotated[
-    str | None, typer.Option(help="Of the daemon; else $DECANT_URL, or the one on this machine.", show_default=False)
+    str | None,
+    typer.Option(help="The daemon's address; else $DECANT_URL, or this machine's.", show_default=False),
 ]
 State = Annotated[
     Path | None, typer.Option(help="The daemon's state directory; else $DECANT_STATE.", show_default=False)
@@ -50,6 +61,12 @@ def submit(
     priority: Annotated[int, typer.Option(help="Higher ones come first.")] = 0,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
+    parameters: Parameters = None,
+    receiver: Receiver = None,
+    iterations: Annotated[
+        int | None,
+        typer.Option(min=1, help="With --verb plan: simulations in place of the campaign's.", show_default=False),
+    ] = None,
     url: Url = None,
     state: State = None,
     as_json: Json = False,
@@ -76,7 +93,9 @@ def show(key: Key, url: Url = None, state: State = None, as_json: Json = False) 
 
 
 def logs(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Of all unless given.")] = None,
+    key: Annotated[
+        str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Whose events; all of them unless given.")
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes; Ctrl-C ends it.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Every event as one line of JSON.")] = False,
     url: Url = None,
@@ -182,7 +201,11 @@ _VERBS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
     "serve": (serve, ("decant serve", "decant serve lab.yaml --port 0", "decant serve --state /tmp/try --in-process")),
     "submit": (
         submit,
-        ("decant submit configs/campaigns/quickstart.yaml", "decant submit my.yaml --rig left --priority 5"),
+        (
+            "decant submit configs/campaigns/quickstart.yaml",
+            "decant submit my.yaml --rig left --priority 5",
+            "decant submit my.yaml --verb plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
+        ),
     ),
     "list": (list_campaigns, ("decant list", "decant list --json")),
     "show": (show, ("decant show quickstart-3f2a1c",)),

@@ -107,7 +107,7 @@ def given(options: dict[str, Any], *left_out: str) -> dict[str, Any]:
 
 
 def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
-    """Run a verb; a refusal is told, with its exit code."""
+    """Run a verb; a refusal is printed, and ends with its exit code."""
     try:
         verb(*args, **kwargs)
     except RefusalError as refusal:

@@ -82,9 +82,7 @@ def _nothing_there(folder: Path) -> str:
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
     from orchestrator.errors import RunError
     from orchestrator.journal import JOURNAL_NAME, JournalReader
-    from orchestrator.publish import FIGURES, summary_of, write_report
-    from orchestrator.report.campaign import draw_figures
-    from orchestrator.report.run_page import REPORT_NAME
+    from orchestrator.publish import report_on
     from orchestrator.run_result import read_result
 
     plan = _plan_of(folder)
@@ -92,8 +90,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
     try:
         with JournalReader(folder / JOURNAL_NAME) as journal:
             result = read_result(journal, folder)
-        figures = draw_figures(folder / FIGURES, plan, result.results, formats)
-        page = write_report(output or folder / REPORT_NAME, plan, summary_of(plan, result, figures), folder)
+        page, figures = report_on(plan, result, output, formats)
     except RunError as error:
         raise RefusalError(str(error)) from None
     except OSError as error:

@@ -43,9 +43,9 @@ def simulate(
     ] = None,
     parameters: Parameters = None,
     receiver: Receiver = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the initial positions; the first of several.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the initial positions; the first of several.")] = 0,
     seeds: Annotated[
-        int, typer.Option(min=1, max=1000, help="How many seeds of a pour: SEED, SEED + 1, … Their spread is told.")
+        int, typer.Option(min=1, max=1000, help="How many seeds of a pour: SEED, SEED + 1, … Their spread is shown.")
     ] = 3,
     thetas: Thetas = None,
     scene: SceneName = None,
