@@ -132,6 +132,6 @@ class WarmSimulators:
                     await proposer.close()
                 await pool.close()
             if not self._spec.in_process:
-                from actors.ray_runtime import stop_ray
+                from actors.ray_runtime import abandon_ray, stop_ray
 
-                await asyncio.to_thread(stop_ray)
+                await asyncio.to_thread(abandon_ray if lost else stop_ray)
