@@ -73,7 +73,7 @@ def start_ray(spec: LaboratorySpec) -> None:
             _close_cluster(cluster)
             raise
         _cluster = cluster
-        atexit.register(abandon_ray)
+        atexit.register(_stop_at_exit)
     keep_signals()
 
 
@@ -87,7 +87,7 @@ def stop_ray() -> None:
         if _cluster.uses > 0:
             return
         cluster, _cluster = _cluster, None
-        atexit.unregister(abandon_ray)
+        atexit.unregister(_stop_at_exit)
         _close_cluster(cluster)
 
 
@@ -133,8 +133,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + number)
 
 
-def abandon_ray() -> None:
-    """End Ray whoever else still counts on it: it has died, or the program ends."""
+def _stop_at_exit() -> None:
     with _guard:
         if _cluster is not None:
             _cluster.uses = 1
