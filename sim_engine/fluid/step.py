@@ -2,7 +2,7 @@
 
 Step: move the pourer, predict, sweep against the walls, refresh neighbour lists if needed, look up wall distances, warm
 start, iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion,
-lower rims, classify.
+lower rims; every few steps classify.
 
 Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 """
@@ -14,7 +14,7 @@ from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
-from sim_engine.fluid.vectors import dot, length, square, turned
+from sim_engine.fluid.vectors import dot, length, square, turned, turned_back
 from sim_engine.fluid.viscosity import relax
 from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
 from sim_engine.outcome import ParticleState
@@ -45,6 +45,8 @@ CONTACT = 0.2
 WARM = 0.3
 """Share of the last step's multipliers that a step starts with. From one half on, deep liquid swings up: multipliers
 then answer to what was, not to what is (docs/how-it-works.md has the analysis)."""
+LOOK = 4
+"""Every so many steps, and at last, one looks where everybody is. Nothing acts differently on who is in a cup."""
 TREACLE = 0.7
 """Before the start velocities shrink to this part in every step: a lattice settles without splashing."""
 
@@ -125,14 +127,13 @@ class Stepper:
     def look_at_walls(self, s, planes: ti.template()):
         """Distance and normal of both vessels' equivalent planes at all moving particles, to be linearised."""
         f = self.state
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            x = f.x[i]
-            for b in range(VESSELS):
-                look = distance_and_gradient(
-                    f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False), f.sag[i][b]
-                )
+        for b in range(VESSELS):
+            turn, origin = f.turn[s, b], f.origin[s, b]
+            for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+                y = turned_back(turn, f.x[i] - origin)
+                look = distance_and_gradient(f, planes, f.plane_offset[s, b], s, b, y, f.sag[i][b])
                 f.phi[i][b] = look[3]
-                n = turned(f.turn[s, b], look)
+                n = turned(turn, look)
                 for c in ti.static(range(3)):
                     f.normal[i][b, c] = n[c]
 
@@ -249,8 +250,14 @@ class Stepper:
                 f.fault[s] = 2
 
     @ti.func
-    def classify(self, s, cavities: ti.template()):
-        """Where every moving particle is now. Half a spacing above its opening plane still belongs to the receiver."""
+    def classify(self, s, cavities: ti.template(), steps):
+        """Where every moving particle is now. Half a spacing above its opening plane still belongs to the receiver.
+
+        Args:
+            s: scene.
+            cavities: nodes of the grids that count as inside.
+            steps: since the last look.
+        """
         f = self.state
         lift = ti.Vector([0.0, 0.0, 0.5 * f.spacing[s]])
         compressed = ti.cast(0.0, ti.f32)
@@ -274,7 +281,7 @@ class Stepper:
                     inside += 1
                     compressed += ti.max(f.density[i] - 1.0, 0.0)
         if inside > 0:
-            f.compression[s] += compressed / inside
+            f.compression[s] += steps * compressed / inside
 
     @ti.func
     def let_fall(self, s, dt):
@@ -288,7 +295,7 @@ class Stepper:
                 f.x[i] = x
 
     @ti.func
-    def step(self, s, grids: ti.template(), planes: ti.template(), cavities: ti.template(), poses: ti.template()):
+    def step(self, s, grids: ti.template(), planes: ti.template(), poses: ti.template()):
         """One time step of one scene."""
         f = self.state
         fastest = self.top_speed(s)
@@ -325,7 +332,6 @@ class Stepper:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] + f.drift[s]
         lower_rims(f, s, dt)
-        self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1
 
@@ -360,7 +366,11 @@ class Stepper:
         f = self.state
         for s in range(s0, s1):
             while f.time[s] < until[s] and f.fault[s] == 0:
-                self.step(s, grids, planes, cavities, poses)
+                steps = 0
+                while steps < LOOK and f.time[s] < until[s] and f.fault[s] == 0:
+                    self.step(s, grids, planes, poses)
+                    steps += 1
+                self.classify(s, cavities, steps)
 
     @ti.kernel
     def census(self, s0: ti.i32, s1: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=2)):
