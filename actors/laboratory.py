@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-from actors.bench.opening import OpenBench, needs_person, open_bench
+from actors.bench.opening import MakeDevice, OpenBench, needs_person, open_bench
 from actors.device import Device, LocalDevice
 from actors.operator import Operator
 from actors.optimizer.actor import DeviceOptimizer, Proposer
@@ -87,10 +88,12 @@ def open_laboratory(
             f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
         )
     if spec.in_process:
-        return InProcessLaboratory(spec if need_bench else None, make, operator, kept, optimizer)
-    if spec.ray is not None:
-        kept = optimizer = None
-    return RayLaboratory(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer)
+        kind: type[InProcessLaboratory | RayLaboratory] = InProcessLaboratory
+    else:
+        kind = RayLaboratory
+        if spec.ray is not None:
+            kept = optimizer = None
+    return kind(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer)
 
 
 class ClosablePool(SimulatorPool, Protocol):
@@ -102,11 +105,30 @@ class ClosablePool(SimulatorPool, Protocol):
 
 
 class _OpenLaboratory:
-    """What both kinds of laboratory have in common once they are open."""
+    """What both kinds of laboratory have in common.
 
-    def __init__(self) -> None:
+    Args:
+        spec: see each of them.
+        make: makes simulators, where they run.
+        operator: a person, where one answers.
+        kept: simulators to use in place of its own; they stay open.
+        optimizer: to use in place of its own; it stays open.
+    """
+
+    def __init__(
+        self,
+        spec: LaboratorySpec,
+        make: Callable[[], Simulator] = pour_simulator,
+        *,
+        need_bench: bool = False,
+        operator: Operator | None = None,
+        kept: ClosablePool | None = None,
+        optimizer: Optimizer | None = None,
+    ) -> None:
+        self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
+        self._kept_optimizer = optimizer
+        self._needs_bench = need_bench and spec.pours
         self._pool: ClosablePool | None = None
-        self._kept: ClosablePool | None = None
         self._apart: ClosablePool | None = None
         self._devices: list[Device] = []
         self._opened: OpenBench | None = None
@@ -170,6 +192,11 @@ class _OpenLaboratory:
         self._devices.append(proposer)
         return DeviceOptimizer(proposer)
 
+    async def _open_bench(self, make: MakeDevice, liquid: SimulatorPool | None) -> None:
+        self._opened = await open_bench(self._spec, make, liquid, self._operator, self._tell)
+        self._devices += self._opened.devices
+        self._bench = self._opened.bench
+
     async def _close_all(self) -> None:
         opened, self._opened = self._opened, None
         if opened is not None:
@@ -182,52 +209,27 @@ class _OpenLaboratory:
         self._devices = []
 
 
+def _local(name: str, cls: type[Any], *args: Any) -> Device:
+    return LocalDevice(name, lambda: cls(*args))
+
+
 class InProcessLaboratory(_OpenLaboratory):
     """Everything in threads of this process: for fast tests and single commands.
 
     The hidden liquid shares the one simulator with the pool (a process has one Taichi), so that nothing is simulated
     while the bench computes its liquid. Outcomes are those of `RayLaboratory`.
-
-    Args:
-        spec: of the bench; None where no pours are needed.
-        make: makes the simulator.
-        operator: a person, where one answers.
-        kept: simulators to use in place of its own; they stay open.
-        optimizer: to use in place of its own; it stays open.
     """
-
-    def __init__(
-        self,
-        spec: LaboratorySpec | None,
-        make: Callable[[], Simulator] = pour_simulator,
-        operator: Operator | None = None,
-        kept: ClosablePool | None = None,
-        optimizer: Optimizer | None = None,
-    ) -> None:
-        super().__init__()
-        self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
-        self._kept_optimizer = optimizer
 
     async def __aenter__(self) -> InProcessLaboratory:
         self._pool = self._kept or InProcessSimulatorPool(make=self._make)
         self._optimizer = self._kept_optimizer or self._own_optimizer(LocalDevice("optimiser", Proposer))
         try:
-            await self._open_bench(self._pool)
+            if self._needs_bench:
+                await self._open_bench(_local, self._pool)
         except BaseException:
             await self._close_all()
             raise
         return self
-
-    async def _open_bench(self, pool: SimulatorPool) -> None:
-        if self._spec is None or not self._spec.pours:
-            return
-
-        def device(name: str, cls: type[Any], *args: Any) -> Device:
-            return LocalDevice(name, lambda: cls(*args))
-
-        self._opened = await open_bench(self._spec, device, pool, self._operator, self._tell)
-        self._devices += self._opened.devices
-        self._bench = self._opened.bench
 
     async def __aexit__(self, *exc: object) -> None:
         await self._close_all()
@@ -236,31 +238,11 @@ class InProcessLaboratory(_OpenLaboratory):
 class RayLaboratory(_OpenLaboratory):
     """Everything in processes of its own: on this machine, or on the machines of a cluster.
 
-    Args:
-        spec: size of the pool, memory, the cluster if there is one; the bench.
-        make: makes simulators, in their processes.
-        need_bench: whether pours are needed.
-        operator: a person, where one answers.
-        kept: simulators to use in place of its own; they stay open.
-        optimizer: to use in place of its own; it stays open.
+    `spec` says how large the pool is, how much memory there is, which cluster is to be joined, if any.
     """
 
-    def __init__(
-        self,
-        spec: LaboratorySpec,
-        make: Callable[[], Simulator] = pour_simulator,
-        *,
-        need_bench: bool = False,
-        operator: Operator | None = None,
-        kept: ClosablePool | None = None,
-        optimizer: Optimizer | None = None,
-    ) -> None:
-        super().__init__()
-        self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
-        self._kept_optimizer = optimizer
-        self._needs_bench = need_bench and spec.pours
-        self._cluster: JoinedCluster | None = None
-        self._liquid: RaySimulatorPool | None = None
+    _cluster: JoinedCluster | None = None
+    _liquid: RaySimulatorPool | None = None
 
     async def __aenter__(self) -> RayLaboratory:
         from actors.ray_runtime import keep_signals, start_ray
@@ -299,12 +281,7 @@ class RayLaboratory(_OpenLaboratory):
         if self._spec.bench is not None:
             self._apart = self._liquid = self._open_liquid()
 
-        def device(name: str, cls: type[Any], *args: Any) -> Device:
-            return RayDevice(name, cls, *args, node=node)
-
-        self._opened = await open_bench(self._spec, device, self._liquid, self._operator, self._tell)
-        self._devices += self._opened.devices
-        self._bench = self._opened.bench
+        await self._open_bench(partial(RayDevice, node=node), self._liquid)
 
     def _open_pool(self) -> RaySimulatorPool:
         from actors.cluster.versions import versions

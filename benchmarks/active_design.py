@@ -28,11 +28,11 @@ from typing import Any
 
 import numpy as np
 from machine import describe, pin, say, show
+from players import play, simulated
 from scipy.special import ndtr
 
-from actors.optimizer.core.propose import propose
 from orchestrator.plan import CalibrationPlan, DeploymentPlan
-from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
+from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated
 from orchestrator.stages import POURS, known_simulations
 from orchestrator.strategies.calibration.active import ActivePours
 from orchestrator.strategies.calibration.c4 import C4Settings, ContinuousBayesianCalibration
@@ -43,7 +43,7 @@ from orchestrator.strategies.protocol import Strategy
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.outcome import PourMeasurement
 from sim_engine.space import Axis, Space
 from sim_engine.task import Scene
 from sim_engine.vessel.spec import cylinder
@@ -94,16 +94,9 @@ class Bench:
 
     def play(self, strategy: Strategy) -> None:
         """From the first question to the last answer."""
-        waiting: list[Request] = []
-        while not strategy.finished:
-            busy = sum(isinstance(one, Simulate) for one in waiting), sum(isinstance(one, Pour) for one in waiting)
-            waiting += strategy.ask(Slots(1 - busy[0], 1 - busy[1]))
-            request = waiting.pop(0)
-            strategy.tell(request, self._answer(request))
+        play(strategy, self._answer, pours_last=False)
 
     def _answer(self, request: Request) -> Outcome:
-        if isinstance(request, Suggest):
-            return Suggested(propose(request.problem))
         assert isinstance(request, Simulate | Pour)
         chance = float(np.random.default_rng(request.seed).standard_normal())
         if isinstance(request, Pour):
@@ -111,8 +104,7 @@ class Bench:
             weighed = min(max(mean + (0.005 + 0.06 * mean * (1.0 - mean)) * chance, 0.0), 1.0)
             return Poured(PourMeasurement(0.2, 0.2 * weighed, 0.0))
         mean = spilled(self._scenes[request.scene], request.action, request.parameters)
-        share = min(max(mean + 0.01 * chance, 0.0), 1.0)
-        return Simulated(PourOutcome(1 - share, share, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, 1.0, request.seed))
+        return Simulated(simulated(mean + 0.01 * chance, request.seed))
 
 
 def plan_of(pours: int, simulations: int) -> CalibrationPlan:

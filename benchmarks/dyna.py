@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import random
 import tempfile
 import time
 from collections.abc import Callable
@@ -32,6 +31,7 @@ import numpy as np
 from hybrid_models import SCATTER, WORLDS
 from machine import describe, pin, say, show
 from optimiser_problems import BY_NAME, Floats, Instance, Problem
+from players import AXES, SCENE, interval, simulated, unit
 from skipping_clock import SkippingLoop, run
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
@@ -47,28 +47,13 @@ from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.trust import TrustSettings
-from sim_engine.action import DEG
-from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.outcome import PourMeasurement
 from sim_engine.simulated import SimulatedPour
-from sim_engine.space import Axis, Space
+from sim_engine.space import Space
 from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import cylinder
 
-AXES = (
-    Axis("angular_velocity", 15 * DEG, 120 * DEG),
-    Axis("x_offset", 0.08, 0.15),
-    Axis("height", 0.03, 0.1),
-    Axis("max_angle", 70 * DEG, 125 * DEG),
-)
-SCENE = Scene(
-    "cup",
-    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
-    cylinder("cup", inner_radius=0.03, inner_height=0.08),
-    Liquid(mass=0.2),
-    fixed={"height": 0.03},
-)
 AFTER = (1, 3, 5, 10, 15)
 SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
     **WORLDS,
@@ -136,16 +121,14 @@ class Bench:
     async def simulate(self, task: PourTask) -> SimulatedPour:
         """One of the pool's members takes its time."""
         rng = np.random.default_rng(task.seed)
-        unit = self._space.encode({name: getattr(task.action, name) for name in self._space.names})
-        cost = self._simulated(self._world, unit, self._sign) + SCATTER * float(rng.standard_normal())
-        spilled, seconds = min(max(cost, 0.0), 1.0), self._asked.simulation * rng.uniform(0.8, 1.2)
+        cost = self._simulated(self._world, unit(self._space, task.action), self._sign)
+        cost, seconds = cost + SCATTER * float(rng.standard_normal()), self._asked.simulation * rng.uniform(0.8, 1.2)
         async with self._free:
             self.occupancy.simulation_started(self._clock.time())
             await asyncio.sleep(seconds)
             self.occupancy.simulation_finished(self._clock.time())
         self.simulations += 1
-        outcome = PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, seconds, task.seed)
-        return SimulatedPour(outcome)
+        return SimulatedPour(simulated(cost, task.seed, seconds))
 
     async def pour(
         self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
@@ -154,8 +137,7 @@ class Bench:
         self.before_first = self.before_first if self.poured else self.simulations
         self.occupancy.pour_started(self._clock.time())
         await asyncio.sleep(self._asked.pour)
-        unit = self._space.encode({name: getattr(action, name) for name in self._space.names})
-        cost = self._world.true(unit)
+        cost = self._world.true(unit(self._space, action))
         self.poured.append(cost)
         noise = (0.01 + 0.12 * cost) * float(np.random.default_rng(seed).standard_normal())
         self.occupancy.pour_finished(self._clock.time())
@@ -215,11 +197,9 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
     return values
 
 
-def interval(values: list[float]) -> list[float]:
-    """Mean, and its 95 % bootstrap interval."""
-    draws = random.Random(0)
-    means = sorted(float(np.mean(draws.choices(values, k=len(values)))) for _ in range(2000))
-    return [round(v, 4) for v in (float(np.mean(values)), means[50], means[1949])]
+def rounded(values: list[float]) -> list[float]:
+    """Mean and interval as they are printed."""
+    return [round(v, 4) for v in interval(values)]
 
 
 def rows_of(asked: argparse.Namespace) -> list[dict[str, Any]]:
@@ -239,7 +219,7 @@ def rows_of(asked: argparse.Namespace) -> list[dict[str, Any]]:
                 if key.startswith("longest"):
                     row[key] = round(max(known), 1)
                 elif known:
-                    row[key] = interval(known)
+                    row[key] = rounded(known)
             rows.append(row)
     return rows
 

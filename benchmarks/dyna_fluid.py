@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dyna import AFTER, Bench, interval
+from dyna import AFTER, Bench, rounded
 from machine import describe, pin, say, show
 from skipping_clock import run
 
@@ -204,7 +204,7 @@ def main() -> None:
         row: Row = {"arm": name}
         for key in runs[0]:
             known = [run[key] for run in runs if run[key] is not None]
-            row[key] = max(known) if key.startswith("longest") else interval(known) if known else None
+            row[key] = max(known) if key.startswith("longest") else rounded(known) if known else None
         rows.append(row)
     show({"settings": vars(asked), "rows": rows, "machine": describe()}, asked.json)
 

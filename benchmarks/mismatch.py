@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import random
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -32,21 +31,17 @@ from typing import Any
 
 import numpy as np
 from mismatch_worlds import LEVELS, SIMULATED_SCATTER, Valley
+from players import SCENE, Numbers, interval, play
 
-from actors.optimizer.core.propose import propose
 from orchestrator.plan import DeploymentPlan
-from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.stages import DEPLOYMENT, with_bench
 from orchestrator.strategies.deployment.base import Deployment
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.trust import TrustSettings
 from orchestrator.strategies.learnt import Learnt
-from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.task import Scene
-from sim_engine.vessel.spec import cylinder
 
 ARMS: dict[str, Callable[[int, int], Any]] = {
     "D2": lambda pours, _: D2Settings(pours=pours),
@@ -66,46 +61,11 @@ GOOD, BAD = 0.01, 0.10
 PAGE = Path(__file__).parents[1] / "docs" / "optimiser.md"
 FEWEST = 20
 """Seeds of a row on the page."""
-SCENE = Scene(
-    "cup",
-    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
-    cylinder("cup", inner_radius=0.03, inner_height=0.08),
-    Liquid(mass=0.2),
-    fixed={"height": 0.03},
-)
 
 
-class Numbers:
-    """Answers a strategy until it has finished."""
-
-    def __init__(self, valley: Valley) -> None:
-        self._valley = valley
-        self.poured: list[float] = []
-
-    def play(self, strategy: Deployment[Any]) -> None:
-        """From the first question to the last answer."""
-        waiting: list[Request] = []
-        while not strategy.finished:
-            busy = sum(isinstance(one, Simulate) for one in waiting), sum(isinstance(one, Pour) for one in waiting)
-            waiting += strategy.ask(Slots(1 - busy[0], 1 - busy[1]))
-            waiting.sort(key=lambda one: isinstance(one, Pour))  # a pour takes longest
-            request = waiting.pop(0)
-            strategy.tell(request, self._answer(request))
-
-    def _answer(self, request: Request) -> Outcome:
-        if isinstance(request, Suggest):
-            return Suggested(propose(request.problem))
-        assert isinstance(request, Simulate | Pour)
-        space = self._valley.space
-        unit = space.encode({name: getattr(request.action, name) for name in space.names})
-        if isinstance(request, Pour):
-            spilled = self._valley.observe(unit, len(self.poured))
-            self.poured.append(self._valley.true(unit))
-            return Poured(PourMeasurement(0.2, 0.2 * spilled, 0.0))
-        scatter = SIMULATED_SCATTER * float(np.random.default_rng(request.seed).standard_normal())
-        spilled = min(max(self._valley.simulated(unit) + scatter, 0.0), 1.0)
-        outcome = PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, 1.0, request.seed)
-        return Simulated(outcome)
+def numbers(valley: Valley) -> Numbers:
+    """What answers in that world."""
+    return Numbers(valley.space, valley.true, valley.observe, valley.simulated, SIMULATED_SCATTER)
 
 
 def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> dict[str, Any]:
@@ -113,11 +73,11 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> d
     valley = Valley(level, seed)
     settings = ARMS[arm](pours, simulations)
     plan = DeploymentPlan(settings, (SCENE,), valley.space, Loss())
-    strategy, numbers = settings.build(plan, SCENE, SimulationParameters(), seed), Numbers(valley)
-    numbers.play(strategy)
+    strategy, world = settings.build(plan, SCENE, SimulationParameters(), seed), numbers(valley)
+    play(strategy, world.answer)
     best = strategy.best_values
     reported = 1.0 if best is None else valley.true(valley.space.encode(best))
-    return {"arm": arm, "level": level, "seed": seed, "poured": numbers.poured, "reported": reported}
+    return {"arm": arm, "level": level, "seed": seed, "poured": world.poured, "reported": reported}
 
 
 def receivers(level: str, bench: int, carried: bool, pours: int, simulations: int) -> list[dict[str, float]]:
@@ -128,15 +88,15 @@ def receivers(level: str, bench: int, carried: bool, pours: int, simulations: in
         valley = Valley(level, 4 * bench + number, bench)
         plan = DeploymentPlan(ARMS["adaptive"](pours, simulations), (SCENE,), valley.space, Loss())
         plan = with_bench(plan, results if carried else {}, SimulationParameters())
-        strategy, numbers = plan.settings.build(plan, SCENE, SimulationParameters(), bench), Numbers(valley)
+        strategy, world = plan.settings.build(plan, SCENE, SimulationParameters(), bench), numbers(valley)
         assert isinstance(strategy, Deployment)
-        numbers.play(strategy)
+        play(strategy, world.answer)
         results[f"{DEPLOYMENT}{number}"] = strategy.result()
-        good = [i for i, lost in enumerate(numbers.poured, start=1) if lost < GOOD]
+        good = [i for i, lost in enumerate(world.poured, start=1) if lost < GOOD]
         found.append(
             {
-                "first pour": numbers.poured[0],
-                "mean": float(np.mean(numbers.poured)),
+                "first pour": world.poured[0],
+                "mean": float(np.mean(world.poured)),
                 "pours until below 1 %": float(good[0] if good else pours + 1),
             }
         )
@@ -171,13 +131,6 @@ def figures(run: dict[str, Any]) -> dict[str, float]:
         "from the fourth": float(poured[3:].mean()),
         "reported": float(run["reported"]),
     }
-
-
-def interval(values: list[float]) -> tuple[float, float, float]:
-    """Mean, and its 95 % bootstrap interval."""
-    draws = random.Random(0)
-    means = sorted(float(np.mean(draws.choices(values, k=len(values)))) for _ in range(2000))
-    return float(np.mean(values)), means[50], means[1949]
 
 
 def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:

@@ -17,22 +17,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from dyna import AXES, SCENE
 from hybrid_models import SCATTER, WORLDS
 from machine import describe, pin, say, show
 from optimiser_problems import BY_NAME, Floats, Instance
+from players import AXES, SCENE, Numbers, play
 
-from actors.optimizer.core.propose import propose
 from orchestrator.plan import DeploymentPlan
-from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.deployment.base import Deployment
 from orchestrator.strategies.deployment.d2 import D2Settings, RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.deployment.trust import Compared, TrustSettings
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.space import Space
 
 SPACE = Space(AXES[:2])
@@ -44,37 +40,11 @@ SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
 ARMS: dict[str, TrustSettings | str] = {"D3": TrustSettings(), "D3, no alarm": "always"}
 
 
-class Numbers:
-    """Answers a strategy until it has finished."""
-
-    def __init__(self, world: Instance, simulator: str) -> None:
-        self._world, self._simulator = world, SIMULATORS[simulator]
-        self._sign = np.random.default_rng([world.seed, 999]).choice([-1.0, 1.0], SPACE.dimension)
-        self.poured: list[float] = []
-
-    def play(self, strategy: Deployment[Any]) -> None:
-        """From the first question to the last answer."""
-        waiting: list[Request] = []
-        while not strategy.finished:
-            busy = sum(isinstance(one, Simulate) for one in waiting), sum(isinstance(one, Pour) for one in waiting)
-            waiting += strategy.ask(Slots(1 - busy[0], 1 - busy[1]))
-            waiting.sort(key=lambda one: isinstance(one, Pour))  # a pour takes longest
-            request = waiting.pop(0)
-            strategy.tell(request, self._answer(request))
-
-    def _answer(self, request: Request) -> Outcome:
-        if isinstance(request, Suggest):
-            return Suggested(propose(request.problem))
-        assert isinstance(request, Simulate | Pour)
-        unit = SPACE.encode({name: getattr(request.action, name) for name in SPACE.names})
-        if isinstance(request, Pour):
-            spilled = self._world.observe(unit, len(self.poured))
-            self.poured.append(self._world.true(unit))
-            return Poured(PourMeasurement(0.2, 0.2 * spilled, 0.0))
-        scatter = SCATTER * float(np.random.default_rng(request.seed).standard_normal())
-        spilled = min(max(self._simulator(self._world, unit, self._sign) + scatter, 0.0), 1.0)
-        outcome = PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, 1.0, request.seed)
-        return Simulated(outcome)
+def numbers(world: Instance, simulator: str) -> Numbers:
+    """What answers in a world with such a simulator."""
+    sign = np.random.default_rng([world.seed, 999]).choice([-1.0, 1.0], SPACE.dimension)
+    known = SIMULATORS[simulator]
+    return Numbers(SPACE, world.true, world.observe, lambda at: known(world, at, sign), SCATTER)
 
 
 def campaign(arm: str, simulator: str, seed: int, asked: argparse.Namespace) -> dict[str, float]:
@@ -85,13 +55,13 @@ def campaign(arm: str, simulator: str, seed: int, asked: argparse.Namespace) -> 
         pours=asked.pours, prior_simulations=asked.simulations, model=asked.model, trust=ARMS[arm]
     )  # fmt: skip
     plan = DeploymentPlan(settings, (SCENE,), SPACE, Loss())
-    strategy, numbers = kind(plan, SCENE, SimulationParameters(), seed), Numbers(world, simulator)
-    numbers.play(strategy)
+    strategy, toy = kind(plan, SCENE, SimulationParameters(), seed), numbers(world, simulator)
+    play(strategy, toy.answer)
     best = strategy.best_values
     trust = strategy.result().trust
     return {
-        "best of 3": min(numbers.poured[:3]),
-        "mean": float(np.mean(numbers.poured)),
+        "best of 3": min(toy.poured[:3]),
+        "mean": float(np.mean(toy.poured)),
         "reported": 1.0 if best is None else world.true(SPACE.encode(best)),
         "alarm": float(isinstance(trust, Compared) and trust.followed is not None),
     }

@@ -7,18 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.campaign import CampaignResult, read_result
 from orchestrator.config.load import load_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import CampaignPlan
 from orchestrator.pour_rows import Answer, Row, answers, pour_row
-from orchestrator.publish import FIGURES, Published, summary_of, write_report
+from orchestrator.publish import Published, report_on
 from orchestrator.publish import publish as write
 from orchestrator.report.results import deployments_of, predictions_of, theta_of
-from orchestrator.report.run_page import REPORT_NAME
 from orchestrator.report.units import loss_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
 from orchestrator.results import Results
+from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.deployment.learnt import Recommended
 from orchestrator.strategies.display import displayed_action
@@ -114,13 +113,7 @@ class Run:
             OSError: it can't be written.
             RunError: the journal can't be read.
         """
-        from orchestrator.report.campaign import draw_figures
-
-        figures = draw_figures(self.directory / FIGURES, self.campaign, self.results)
-        summary = summary_of(self.campaign, self.result, figures)
-        return write_report(
-            self.directory / REPORT_NAME if path is None else Path(path), self.campaign, summary, self.directory
-        )
+        return report_on(self.campaign, self.result, None if path is None else Path(path))[0]
 
     def save_tables(self, directory: Path | str | None = None) -> list[Path]:
         """Write all tables as Parquet files.

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from actors.protocols import Laboratory, Notice, Telling
@@ -23,7 +23,7 @@ from orchestrator.events import (
     Watchers,
 )
 from orchestrator.fingerprint import fingerprint
-from orchestrator.journal import JOURNAL_NAME, Journal, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, Journal, Kind
 from orchestrator.journal_file import Header, JournalError
 from orchestrator.lanes import Deadlines, LaneError, Lanes
 from orchestrator.plan import CampaignPlan
@@ -31,34 +31,13 @@ from orchestrator.rehearsal import Rehearsal
 from orchestrator.replay import StageHistory, read_history, replayed_events
 from orchestrator.reserve import NoSpaceError
 from orchestrator.results import Results, decode_results
+from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.runs import write_provenance
 from orchestrator.scheduler import StageScheduler
 from orchestrator.stages import StageDefinition, scenes_of, stage_seed, stages_of
 from orchestrator.states import RESTING, State, check_transition
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.unknown import AskOperator, OperatorNeededError, settle_open_questions, settle_unknown_pours
-
-
-@dataclass(frozen=True)
-class CampaignResult:
-    """What a campaign came to.
-
-    Attributes:
-        results: of the closed stages by name, in order.
-        simulations: finished ones, failed ones included.
-        pours: finished ones, failed ones included.
-        cpu_s: CPU seconds of all simulations and suggestions.
-        seconds: wall time of this process' part of the run.
-    """
-
-    name: str
-    directory: Path
-    state: State
-    results: Results = field(default_factory=dict)
-    simulations: int = 0
-    pours: int = 0
-    cpu_s: float = 0.0
-    seconds: float = 0.0
 
 
 async def run_campaign(
@@ -345,31 +324,3 @@ class _Run:
         result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)
         self._watchers.emit(CampaignClosed(state=str(result.state), results=result.results))
         return result
-
-
-def read_result(journal: JournalReader, directory: Path, *, seconds: float = 0.0) -> CampaignResult:
-    """What the journal of a run, finished or not, says it came to."""
-    simulations = pours = 0
-    cpu_s = 0.0
-    for entry in journal.entries(kinds=[Kind.FINISHED, Kind.POUR_FINISHED]):
-        outcome = entry.body["outcome"]
-        match outcome["type"]:
-            case "Suggested":
-                cpu_s += outcome["suggestion"]["seconds"]
-                continue
-            case "Simulated":
-                cpu_s += outcome["outcome"]["cpu_s"]
-        if entry.kind == Kind.POUR_FINISHED:
-            pours += 1
-        else:
-            simulations += 1
-    return CampaignResult(
-        journal.header.name,
-        directory,
-        journal.state(),
-        decode_results(journal.stage_results()),
-        simulations,
-        pours,
-        cpu_s,
-        seconds,
-    )

@@ -26,6 +26,7 @@ from orchestrator.commands.options import (
     Thetas,
     call,
     examples,
+    given,
 )
 
 app = typer.Typer(
@@ -79,21 +80,10 @@ def _campaign_verb(name: str, text: str, *lines: str) -> None:
         as_json: Json = False,
         quiet: Quiet = False,
     ) -> None:
+        options = given(locals(), "campaign", "name")
         from orchestrator.commands import campaigns
 
-        options = campaigns.RunOptions(
-            resume=resume,
-            run_id=run_id,
-            answer=answer,
-            in_process=in_process,
-            laboratory=laboratory,
-            seed=seed,
-            as_json=as_json,
-            armed=arm,
-            live=live,
-            live_at=live_at,
-        )
-        call(getattr(campaigns, name), campaign, options)
+        call(getattr(campaigns, name), campaign, campaigns.RunOptions(**options))
 
     app.command(name, help=text, epilog=examples(*lines))(verb)
 
@@ -145,21 +135,10 @@ def plan(
 
     Nothing is poured. Actions are shown in deg, deg/s, mm and s.
     """
+    options = given(locals(), "campaign")
     from orchestrator.commands import campaigns
 
-    call(
-        campaigns.plan_pour,
-        campaign,
-        parameters=parameters,
-        receiver=receiver,
-        iterations=iterations,
-        seed=seed,
-        seeds=seeds,
-        thetas=thetas,
-        laboratory=laboratory,
-        in_process=in_process,
-        as_json=as_json,
-    )
+    call(campaigns.plan_pour, campaign, **options)
 
 
 @app.command(

@@ -10,7 +10,7 @@ from typing import Literal
 from orchestrator.requests import Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
 
 Order = Literal["logical", "completion"]
-"""In which outcomes are told; see `orchestrator.scheduler`."""
+"""The order in which outcomes are told; see `orchestrator.scheduler`."""
 
 _LOGICAL_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
 """What is told first when several are under way: quick things before slow ones, so that a free slot is never kept

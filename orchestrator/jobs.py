@@ -14,7 +14,6 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.stages import StageDefinition, calibration_stages, deployment_stages, prediction_stages, stages_of
 
 Verb = Literal["run", "calibrate", "plan"]
-VERBS: tuple[Verb, ...] = ("run", "calibrate", "plan")
 
 PREDICTION_SEEDS = 5
 

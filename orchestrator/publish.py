@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from orchestrator.campaign import CampaignResult
 from orchestrator.journal import JOURNAL_NAME, JournalReader
 from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
@@ -20,6 +19,7 @@ from orchestrator.report.results import evaluation_of, theta_of
 from orchestrator.report.run_page import REPORT_NAME, run_page
 from orchestrator.report.summarise import summarise
 from orchestrator.report.summary import PoolUse, RunSummary, Totals, write_summary
+from orchestrator.run_result import CampaignResult
 from orchestrator.runs import VERSIONS
 from orchestrator.strategies.calibration.base import CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
@@ -129,6 +129,24 @@ def summary_of(
         best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
         totals=_totals(plan, result),
     )
+
+
+def report_on(
+    plan: CampaignPlan, result: CampaignResult, path: Path | None = None, formats: tuple[str, ...] = (".svg",)
+) -> tuple[Path, dict[str, Path]]:
+    """Draw a run's figures anew, and write the page about it, wherever the run stands.
+
+    Args:
+        path: of the page; in the run's folder unless given.
+        formats: of the figures.
+
+    Raises:
+        OSError: a file can't be written.
+        RunError: the journal can't be read.
+    """
+    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats)
+    summary = summary_of(plan, result, figures)
+    return write_report(path or result.directory / REPORT_NAME, plan, summary, result.directory), figures
 
 
 def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory: Path) -> Path:

@@ -22,10 +22,10 @@ RESERVE = 12 * MB
 before it is copied into the journal, and so does the journal then [bytes]."""
 
 FOR_A_POUR = 8 * MB
-"""That has to be free beside the reserve when a pour begins: recording and figures grow beside the journal [bytes]."""
+"""What has to be free beside the reserve when a pour begins: recording and figures grow beside the journal [bytes]."""
 
 TO_BEGIN = RESERVE + FOR_A_POUR + 20 * MB
-"""That has to be free where a run begins: its journal, a recording and the figures of a small campaign [bytes]."""
+"""What has to be free where a run begins: its journal, a recording and the figures of a small campaign [bytes]."""
 
 
 class NoSpaceError(RunError):

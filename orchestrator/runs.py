@@ -28,19 +28,16 @@ class RunNotFoundError(JournalError):
     """There is no run to resume."""
 
 
-def create_run(plan: CampaignPlan, root: Path | None = None) -> Path:
-    """Make the directory of a new run: ROOT/NAME-DATE-N (NAME-hardware-DATE-N), N counting the day's.
+def create_run(plan: CampaignPlan) -> Path:
+    """Make the directory of a new run, NAME-DATE-N (NAME-hardware-DATE-N), N counting the day's.
 
-    It is entered into the catalogue of runs.
-
-    Args:
-        root: where runs are kept; the plan's output directory if not given.
+    It is made in the plan's output directory, and entered into the catalogue of runs.
 
     Raises:
         NoSpaceError: there is too little room for a run.
         OSError: it can't be made.
     """
-    parent = root or plan.outputs.directory
+    parent = plan.outputs.directory
     require_space(parent, TO_BEGIN, "to begin a run")
     parent.mkdir(parents=True, exist_ok=True)
     name = plan.name if plan.laboratory.mode == "virtual" else f"{plan.name}-{plan.laboratory.mode}"
@@ -86,7 +83,7 @@ def versions() -> dict[str, Any]:
     }
 
 
-def find_run(plan: CampaignPlan, run_id: str | None = None, root: Path | None = None) -> Path:
+def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
     """The run to resume: the one named, or the campaign's newest unfinished one.
 
     Among several, one that was begun with the same settings is preferred; if there is none, the newest is returned,
@@ -95,7 +92,7 @@ def find_run(plan: CampaignPlan, run_id: str | None = None, root: Path | None = 
     Raises:
         RunNotFoundError: no such run, or none that is unfinished.
     """
-    parent = root or plan.outputs.directory
+    parent = plan.outputs.directory
     if run_id is not None:
         directory = parent / run_id
         if not (directory / JOURNAL_NAME).is_file():

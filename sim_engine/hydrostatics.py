@@ -33,7 +33,7 @@ FLOW_LIMIT = 1e-7
 """Flow below which a pour counts as over: 0.1 mL/s, about two drips a second [m³/s]."""
 
 BINS = 4096
-"""In which points of a pool are counted by their height: 0.03 mm each."""
+"""Bins in which points of a pool are counted by their height: 0.03 mm each."""
 
 TIME_STEP = 0.01
 """Time step of the outflow equation [s]."""

@@ -1,4 +1,4 @@
-"""Where the balance stands, what therefore has to be weighed, and what the weighings say about a pour. Pure.
+"""Where the balance stands, and what therefore has to be weighed. Pure; what the weighings say is in `masses`.
 
 Four masses belong to a pour: loaded = received + spilled + retained. No balance reads all of them at once. Each
 placement is a list of steps and a table that says each mass as a sum of weighings: uncertainties follow from the same
@@ -7,21 +7,10 @@ table, and what is in two weighings (the pourer's own mass) cancels where it doe
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Literal
-
-from actors.balance.errors import BalanceError
-from sim_engine.outcome import PourMeasurement
-
-SURE = 4.0
-"""Standard deviations beyond which a mass below nothing is a mistake and no noise."""
-
-
-class WeighingError(BalanceError):
-    """The weighings of a pour are incomplete, or can't all be right."""
+from typing import Literal
 
 
 class Placement(StrEnum):
@@ -41,19 +30,6 @@ class Placement(StrEnum):
 
     MANUAL = "manual"
     """Anywhere, and not connected: the operator weighs and types."""
-
-
-@dataclass(frozen=True)
-class Weighed:
-    """One weighing.
-
-    Attributes:
-        mass: net [kg].
-        uncertainty: standard deviation [kg].
-    """
-
-    mass: float
-    uncertainty: float = 0.0
 
 
 When = Literal["once", "before", "pour", "after"]
@@ -83,7 +59,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
     """A placement: steps, and each mass as Σ coefficient · weighing."""
 
     steps: tuple[Step, ...]
@@ -102,8 +78,8 @@ def _tare(about: str, put: str, when: When, *, hands: bool = True) -> Step:
     return Step("tare", put, when, hands=hands, about=about)
 
 
-_PLANS: dict[Placement, _Plan] = {
-    Placement.TRAY: _Plan(
+PLANS: dict[Placement, Plan] = {
+    Placement.TRAY: Plan(
         (
             _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
             Step("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
@@ -120,7 +96,7 @@ _PLANS: dict[Placement, _Plan] = {
         ),
         {"loaded": _LOADED, "spilled": {"spilled": 1.0}, "retained": _RETAINED},
     ),
-    Placement.RECEIVER: _Plan(
+    Placement.RECEIVER: Plan(
         (
             _tare("cleared", "Take everything off the balance.", "before"),
             Step("weigh", _DRY, "once", "pourer_empty"),
@@ -138,7 +114,7 @@ _PLANS: dict[Placement, _Plan] = {
             "retained": _RETAINED,
         },
     ),
-    Placement.EVERYTHING: _Plan(
+    Placement.EVERYTHING: Plan(
         (
             _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
             Step("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
@@ -162,7 +138,7 @@ _PLANS: dict[Placement, _Plan] = {
             "retained": {"pourer_full": 1.0, "pourer_empty": -1.0, "poured": -1.0},
         },
     ),
-    Placement.TARED: _Plan(
+    Placement.TARED: Plan(
         (
             _tare("dry_pourer", "Put a dry pourer on the balance, alone; it counts as nothing.", "before"),
             Step("weigh", "Put the filled pourer on the balance in its place.", "before", "pourer_full"),
@@ -174,7 +150,7 @@ _PLANS: dict[Placement, _Plan] = {
         ),
         {"loaded": {"pourer_full": 1.0}, "spilled": {"spilled": 1.0}, "retained": {"pourer_after": 1.0}},
     ),
-    Placement.MANUAL: _Plan(
+    Placement.MANUAL: Plan(
         (
             Step("weigh", "Weigh the empty, dry pourer.", "once", "pourer_empty", "operator"),
             Step("weigh", "Fill the pourer and weigh it.", "before", "pourer_full", "operator"),
@@ -188,17 +164,15 @@ _PLANS: dict[Placement, _Plan] = {
 }
 
 
-def weighings(
-    placement: Placement, *, known: Mapping[str, Weighed] | None = None, pourer_elsewhere: bool = False
-) -> tuple[Step, ...]:
+def weighings(placement: Placement, *, known: Collection[str] = (), pourer_elsewhere: bool = False) -> tuple[Step, ...]:
     """What has to be done, in order, the pour among it.
 
     Args:
         placement: where the balance stands.
-        known: weighings of before that still hold; their 'once' steps are left out.
+        known: keys of weighings of before that still hold; their 'once' steps are left out.
         pourer_elsewhere: the pourer is weighed on another balance and typed.
     """
-    steps = [step for step in _PLANS[placement].steps if not (step.when == "once" and step.key in (known or {}))]
+    steps = [step for step in PLANS[placement].steps if not (step.when == "once" and step.key in known)]
     if not pourer_elsewhere or placement is Placement.MANUAL:
         return tuple(steps)
     elsewhere = [_elsewhere(step) if step.key.startswith("pourer") else step for step in steps]
@@ -207,69 +181,7 @@ def weighings(
 
 def needed(placement: Placement) -> tuple[str, ...]:
     """Keys of all weighings that a measurement is made of."""
-    return tuple(step.key for step in _PLANS[placement].steps if step.key)
-
-
-def loaded_mass(placement: Placement, weighed: Mapping[str, Weighed]) -> float:
-    """What was filled in [kg], by the weighings before the pour."""
-    return sum(c * weighed[key].mass for key, c in _PLANS[placement].masses["loaded"].items())
-
-
-def measurement(
-    placement: Placement,
-    weighed: Mapping[str, Weighed],
-    *,
-    nominal: float | None = None,
-    tolerance: float = math.inf,
-) -> PourMeasurement:
-    """The masses of a pour.
-
-    A mass that comes out a little below nothing, within `SURE` standard deviations, is nothing; the notes keep what was
-    read.
-
-    Args:
-        placement: where the balance stood.
-        weighed: all that `needed` names.
-        nominal: load that was asked for [kg].
-        tolerance: how far the load may lie from it [kg].
-
-    Raises:
-        WeighingError: a weighing is missing or no number, a mass is less than nothing beyond noise, more came out
-            than was in, or the load is not the one that was asked for. Nothing is assumed in place of what is missing.
-    """
-    _check_complete(placement, weighed)
-    table = _PLANS[placement].masses
-    mass = {name: sum(c * weighed[key].mass for key, c in row.items()) for name, row in table.items()}
-    sigma = {name: _sigma(row, weighed) for name, row in table.items()}
-    received = dict(_difference(table))
-    mass["received"] = sum(c * weighed[key].mass for key, c in received.items())
-    sigma["received"] = _sigma(received, weighed)
-    _check_sense(mass, sigma, nominal, tolerance)
-    spilled = max(mass["spilled"], 0.0)
-    retained = min(max(mass["retained"], 0.0), mass["loaded"])
-    return PourMeasurement(
-        loaded=mass["loaded"],
-        spilled=spilled,
-        retained=retained,
-        notes={
-            "placement": str(placement),
-            "received_g": _grams(max(mass["loaded"] - spilled - retained, 0.0)),
-            "uncertainty_g": {name: _grams(sigma[name]) for name in ("loaded", "received", "spilled", "retained")},
-            "as_weighed_g": {name: _grams(mass[name]) for name in ("loaded", "received", "spilled", "retained")},
-            "weighings_g": {key: _grams(weighed[key].mass) for key in needed(placement)},
-        },
-    )
-
-
-def weighing_uncertainty(step: float, repeatability: float, *, tared: bool = True) -> float:
-    """Standard deviation of one weighing [kg].
-
-    Args:
-        step: of the display [kg]; a value within it is as likely as another.
-        repeatability: standard deviation of weighing the same thing again [kg].
-        tared: net of a tare, which was a weighing too.
-    """
-    return math.sqrt((step**2 / 12.0 + repeatability**2) * (2.0 if tared else 1.0))
+    return tuple(step.key for step in PLANS[placement].steps if step.key)
 
 
 def _elsewhere(step: Step) -> Step:
@@ -291,68 +203,3 @@ def _idle(steps: list[Step], index: int) -> bool:
         if step.do == "weigh" and step.by == "balance":
             return False
     return True
-
-
-def _difference(table: Mapping[str, Mapping[str, float]]) -> Mapping[str, float]:
-    """received = loaded − spilled − retained, by weighings; what cancels is left out."""
-    total: dict[str, float] = {}
-    for name, sign in (("loaded", 1.0), ("spilled", -1.0), ("retained", -1.0)):
-        for key, c in table[name].items():
-            total[key] = total.get(key, 0.0) + sign * c
-    return {key: c for key, c in total.items() if c != 0.0}
-
-
-def _sigma(row: Mapping[str, float], weighed: Mapping[str, Weighed]) -> float:
-    return math.sqrt(sum((c * weighed[key].uncertainty) ** 2 for key, c in row.items()))
-
-
-def _check_complete(placement: Placement, weighed: Mapping[str, Weighed]) -> None:
-    asked = {step.key: step.put for step in _PLANS[placement].steps if step.key}
-    missing = [key for key in asked if key not in weighed]
-    if missing:
-        what = "; ".join(f"{key} ('{asked[key]}')" for key in missing)
-        raise WeighingError(
-            f"not weighed: {what}. Without it the pour can't be counted; nothing is assumed in its place"
-        )
-    for key in asked:
-        one = weighed[key]
-        if not (math.isfinite(one.mass) and math.isfinite(one.uncertainty) and one.uncertainty >= 0.0):
-            raise WeighingError(f"{key} is not a weight: {one.mass} kg ± {one.uncertainty} kg")
-
-
-def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float | None, tolerance: float) -> None:
-    """Refuse what can't be; rounding of the sums is not an offence."""
-    slack = {name: SURE * sigma[name] + 1e-9 for name in mass}
-    shown = {name: f"{_grams(mass[name]):g} ± {_grams(sigma[name]):g} g" for name in mass}
-    if mass["loaded"] <= slack["loaded"]:
-        raise WeighingError(
-            f"loaded {shown['loaded']}: the filled pourer weighed no more than the empty one. Was it filled? "
-            "Were the two mixed up?"
-        )
-    if nominal is not None and abs(mass["loaded"] - nominal) > tolerance:
-        raise WeighingError(
-            f"loaded {shown['loaded']}, but {_grams(nominal):g} ± {_grams(tolerance):g} g was asked for. Fill anew, or "
-            "weigh anew if it was filled right"
-        )
-    hints = {
-        "spilled": "the tray got lighter: was something taken off it, or did the zero drift?",
-        "retained": "the pourer got lighter than when it was dry and empty: was another one weighed?",
-        "received": "more was spilled and left over than was in the pourer: was it refilled, or a weighing mixed up?",
-    }
-    for name, hint in hints.items():
-        if mass[name] < -slack[name]:
-            raise WeighingError(f"{name} {shown[name]} is less than nothing: {hint} All: {_all(shown)}")
-        if mass[name] > mass["loaded"] + slack[name] + slack["loaded"]:
-            raise WeighingError(
-                f"{name} {shown[name]} is more than was loaded, {shown['loaded']}: did something else fall on the "
-                f"balance, or was a weighing mixed up? All: {_all(shown)}"
-            )
-
-
-def _all(shown: dict[str, str]) -> str:
-    return ", ".join(f"{name} {text}" for name, text in shown.items())
-
-
-def _grams(mass: float) -> Any:
-    """[g], with a microgram's digits: the rest is noise of the computer."""
-    return round(1e3 * mass, 6)

@@ -72,24 +72,13 @@ class SerialBalance:
     # What counts.
 
     def connect(self) -> str:
-        """Open the port and find out what is not set.
-
-        Returns:
-            What was found, for people.
-
-        Raises:
-            NoConnectionError: no port, or nobody understandable there.
-        """
+        """See `BalanceDriver.connect`: open the port and find out what is not set."""
         with self._exclusive():
             self._open()
         return self.describe()
 
     def tare(self) -> None:
-        """Wait for rest, count what is on the balance as nothing, and see it do so.
-
-        Raises:
-            BalanceError: not at rest in time, refused, without effect, or lost.
-        """
+        """See `BalanceDriver.tare`; refused, or without effect, is an error, too."""
         self._open()
         self._set_reference("tare", self._conversation.dialect.tare)
 
@@ -106,20 +95,14 @@ class SerialBalance:
         self._set_reference("zero", dialect.zero)
 
     def weigh(self) -> Weight:
-        """Wait until the weight has settled.
-
-        Raises:
-            ReferenceLostError: the connection was lost since the last tare.
-            NotStableError: not settled within the rule's deadline.
-            BalanceError: out of range, another unit, a fault, no answer.
-        """
+        """See `BalanceDriver.weigh`: wait until the weight has settled."""
         settled, seen = self._settle(reference_needed=True), self._display
         return Weight(settled.mass, True, settled.time, str(Status.STABLE), seen.step, seen.last.shown)
 
     # What only watches.
 
     def read(self) -> Weight:
-        """What the display shows; never fails. While another call waits for an answer, the last reading."""
+        """See `BalanceDriver.read`. While another call waits for an answer, the last reading."""
         if not self._lock.acquire(timeout=self._spec.answer_time / 4.0):
             return self._display.last
         try:
@@ -168,15 +151,15 @@ class SerialBalance:
     # Control.
 
     def keep_reference(self) -> None:
-        """After a lost connection: a person has seen that the balance stayed on and its tare still holds."""
+        """See `BalanceDriver.keep_reference`."""
         self._reference_lost = False
 
     def interrupt(self) -> None:
-        """End the wait that is under way, and later ones at once, until `resume`."""
+        """See `BalanceDriver.interrupt`."""
         self._interrupted.set()
 
     def resume(self) -> None:
-        """Let waits last again."""
+        """See `BalanceDriver.resume`."""
         self._interrupted.clear()
 
     def close(self) -> None:

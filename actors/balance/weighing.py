@@ -13,7 +13,8 @@ from actors.balance.errors import (
     ReferenceLostError,
     UnitError,
 )
-from actors.balance.placement import Step, Weighed, loaded_mass, measurement, weighing_uncertainty, weighings
+from actors.balance.masses import Weighed, loaded_mass, measurement, weighing_uncertainty
+from actors.balance.placement import Step, weighings
 from actors.balance.spec import BalanceSpec
 from actors.balance.typed import typed_weight
 from actors.operator import Question

@@ -6,7 +6,7 @@ import asyncio
 from typing import Any
 
 from actors.arm.protocol import PlannedPour
-from actors.balance.placement import Weighed
+from actors.balance.masses import Weighed
 from actors.bench.consent import Setup
 from actors.bench.procedure import PourProcedure
 from actors.protocols import InvalidActionError, ProgressCallback

@@ -15,7 +15,7 @@ from typing import Any
 from actors.arm.errors import ArmLostError, ArmRefusedError, ArmStoppedError
 from actors.arm.protocol import ArmFacts, ArmState, Executed, PlannedPour
 from actors.balance.errors import BalanceError
-from actors.balance.placement import Weighed
+from actors.balance.masses import Weighed
 from actors.balance.weighing import Weighings
 from actors.bench.consent import STUCK, Consent, Setup
 from actors.bench.progress import PourReport

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from actors.arm.protocol import Executed, PlannedPour
 from actors.arm.spec import UrArmSpec
 from actors.bench.device_stand_ins import DeviceStandIns
+from actors.bench.executed import executed_pour, slipped
 from actors.bench.hidden import draw_pose_error, hidden_pour, spill_of, stream
 from actors.bench.spec import VirtualBenchSpec
 from actors.bench.stand_ins import History
@@ -31,20 +31,10 @@ from sim_engine.sampled_motion import SampledMotion
 from sim_engine.simulated import RecordedFrames
 from sim_engine.task import PoseError, PourTask, Scene
 
-FloatArray = NDArray[np.float64]
 T = TypeVar("T")
-
-AT_START = 2e-3
-"""How near the pour's first pose the arm stands when it begins [rad]."""
-
-AT_REST = 1e-6
-"""Joints that change by less from sample to sample stand still [rad]."""
 
 UPRIGHT = math.radians(0.5)
 """Below this tilt [rad] a pourer is upright; ways to and from a pour keep it so."""
-
-LONGEST_REST = 6.0
-"""Rest in the middle of a motion is simulated for so long [s]: what runs out meanwhile has run out by then."""
 
 NOTING_INTERVAL = 40.0
 """Between two looks at what the arm did [s of its time]; a virtual controller remembers two minutes."""
@@ -307,58 +297,6 @@ class FollowedBench(VirtualBench):
         return pourer_motion(joints[:end], times[:end], self._arm, grip_tilt=grip_tilt)
 
 
-def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
-    """The motion of a pourer that sits in the fingers turned by so much [rad] about the y axis of its underside."""
-    c, s = math.cos(0.5 * grip_tilt), math.sin(0.5 * grip_tilt)
-    w, x, y, z = (motion.poses[:, k] for k in range(3, 7))
-    turned = np.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x], axis=-1)
-    return SampledMotion(motion.times, np.concatenate([motion.poses[:, :3], turned], axis=-1))
-
-
 def _missed(history: History, since: float) -> float:
     """How long nothing is known of the motion, from a time on that was asked for until what was kept of it [s]."""
     return max((history.times[0] if history.times else history.now) - since, 0.0)
-
-
-def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """The part of a history that is the pour: from the first movement away from its first pose to the last movement.
-
-    The clock plays no part in where it begins or ends, and long rests are shortened, so that the same motion is cut the
-    same however long anybody took over it.
-
-    Args:
-        times: shape (T,), increasing [s].
-        joints: shape (T, 6) [rad].
-        start: the pour's first joints, shape (6,) [rad].
-
-    Returns:
-        Times from 0, and joints; None if nothing moved after the arm had stood there.
-    """
-    away = np.max(np.abs(joints - start), axis=1) >= AT_START
-    moves = np.max(np.abs(np.diff(joints, axis=0)), axis=1) > AT_REST
-    rests = np.flatnonzero(~away[:-1] & ~moves)
-    if len(rests) == 0:
-        return None
-    first = int(rests[0])
-    left = np.flatnonzero(away[first:])
-    if len(left) == 0:
-        return None
-    begin = first + int(left[0])
-    while begin > first and moves[begin - 1]:
-        begin -= 1
-    end = begin + int(np.flatnonzero(moves[begin:])[-1]) + 1
-    return _without_long_rests(np.diff(times[begin : end + 1]), moves[begin:end], joints[begin : end + 1])
-
-
-def _without_long_rests(
-    gaps: FloatArray, moved: NDArray[np.bool_], joints: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Times from 0; of a rest only its beginning is kept."""
-    kept, now, rest = [(0.0, 0)], 0.0, 0.0
-    for i, (gap, moves) in enumerate(zip(gaps, moved, strict=True), start=1):
-        allowed = float(gap) if moves else min(float(gap), LONGEST_REST - rest)
-        rest = 0.0 if moves else rest + allowed
-        if allowed > 0.0:
-            now += allowed
-            kept.append((now, i))
-    return np.array([t for t, _ in kept]), joints[[i for _, i in kept]]

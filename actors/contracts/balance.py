@@ -58,6 +58,9 @@ class BalanceBench:
 class BalanceContract:
     """Derive from this, in a class whose name begins with Test, with a fixture `bench`."""
 
+    # Tests are skipped for what a bench can't do, never for what a driver can't: beside a real one nobody may be there
+    # who trips it or pulls its plug, and its author is to see what was not tried. Ours leave out as little as they can.
+
     def test_it_says_who_it_is(self, bench: BalanceBench) -> None:
         """People read it in `decant doctor`."""
         assert bench.driver.connect().strip()

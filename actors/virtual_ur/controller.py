@@ -306,8 +306,7 @@ class Controller:
                 self._bite(*due)
             else:
                 self._run()
-        if self.secondary:
-            self._run_secondary()
+        self.secondary = [program for program in self.secondary if self._goes_on(program)]
         try:
             self.robot.step(self.now, self.dt)
         except (ViolationError, ValueError, ArithmeticError) as violation:
@@ -317,8 +316,8 @@ class Controller:
                 self.protective_stop(str(violation))
         if self.runtime in (RuntimeState.STOPPING, RuntimeState.PAUSING) and not self._in_motion():
             self.runtime = RuntimeState.STOPPED if self.runtime is RuntimeState.STOPPING else RuntimeState.PAUSED
-        if not self.safety.may_move:
-            self._after_stop()
+        if self.safety.mode in _POWERLESS and self.power.powered and not self._in_motion():
+            self.power.off()
 
     def _bite(self, action: str, why: str) -> None:
         self.tell("key", why)
@@ -330,34 +329,18 @@ class Controller:
     def _in_motion(self) -> bool:
         return any(abs(v) > 1e-6 for v in self.robot.mover.qd)
 
-    def _after_stop(self) -> None:
-        if self.safety.mode in _POWERLESS and self.power.powered and not self._in_motion():
-            self.power.off()
-
     def _run(self) -> None:
         program = self.program
-        if program is None:
-            return
-        self.running = program
-        try:
-            goes_on = program.tick()
-        except ScriptError as error:
-            self.tell("exception", error.text, error.line)
-            goes_on = False
-        finally:
-            self.running = None
-        if not goes_on and self.program is program:
+        if program is not None and not self._goes_on(program) and self.program is program:
             self.stop()
 
-    def _run_secondary(self) -> None:
-        alive = []
-        for program in self.secondary:
-            self.running = program
-            try:
-                if program.tick():
-                    alive.append(program)
-            except ScriptError as error:
-                self.tell("exception", error.text, error.line)
-            finally:
-                self.running = None
-        self.secondary = alive
+    def _goes_on(self, program: Program) -> bool:
+        """One cycle of a program: whether it wants another."""
+        self.running = program
+        try:
+            return program.tick()
+        except ScriptError as error:
+            self.tell("exception", error.text, error.line)
+            return False
+        finally:
+            self.running = None

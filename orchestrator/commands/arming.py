@@ -15,7 +15,7 @@ from actors.arm.protocol import PathReport
 from actors.arm.spec import ArmSpec
 from actors.optimizer.core.problem import Linear
 from actors.protocols import InvalidActionError
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, say
 from orchestrator.config.yaml.errors import shown_path
 from orchestrator.safety import SafetyRecordError, accepted_checksum
 from orchestrator.strategies.calibration.prior import actions_all_over
@@ -186,10 +186,8 @@ def accepted(plan: CampaignPlan) -> str:
     Raises:
         RefusalError: none was (exit code 2).
     """
-    try:
+    with Refused(SafetyRecordError):
         checksum = accepted_checksum(plan.laboratory_source or plan.source)
-    except SafetyRecordError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     if checksum is None:
         raise RefusalError(
             f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "
@@ -232,6 +230,17 @@ def report_lines(report: PathReport) -> list[str]:
     ]
 
 
+def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "") -> None:
+    """Show what hardware would do, before its laboratory's name is typed."""
+    say(f"\nHARDWARE: laboratory {laboratory}, {arm}. This will move:\n")
+    for line in lines:
+        say(f"  {line}")
+    say(
+        "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of the "
+        f"box.\nType the laboratory's name ({laboratory}) to arm it{lasting}; anything else ends here."
+    )
+
+
 def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     """Show what hardware would do, and have its laboratory's name typed.
 
@@ -245,14 +254,7 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
             "its name: that needs a terminal, with nothing piped into it",
             BAD_INPUT,
         )
-    say(f"\nHARDWARE: laboratory {laboratory.name}, {laboratory.arm.title}. This will move:\n")
-    for line in lines:
-        say(f"  {line}")
-    say(
-        "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of the "
-        "box.\n"
-        f"Type the laboratory's name ({laboratory.name}) to arm it for this run; anything else ends here."
-    )
+    announce(laboratory.name, laboratory.arm.title, lines, " for this run")
     termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # keys pressed before this was read mean something else
     print("> ", end="", file=sys.stderr, flush=True)
     typed = sys.stdin.readline()

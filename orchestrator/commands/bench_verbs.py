@@ -18,6 +18,7 @@ from orchestrator.commands.options import (
     Quiet,
     SceneName,
     call,
+    given,
 )
 
 
@@ -85,20 +86,7 @@ def pour(
 
     A pour with liquid is journalled and weighed as a small run of its own; `--empty` leaves a record, pour.json.
     """
+    options = given(locals(), "campaign")
     from orchestrator.commands import pour as verb
 
-    call(
-        verb.pour,
-        campaign,
-        assignments=assignments or [],
-        scene_name=scene,
-        dry_run=dry_run,
-        connect=connect,
-        png=png,
-        empty=empty,
-        slow=slow,
-        armed=arm,
-        laboratory=laboratory,
-        in_process=in_process,
-        as_json=as_json,
-    )
+    call(verb.pour, campaign, **options)

@@ -14,7 +14,7 @@ from orchestrator.commands.common import (
     read_campaign,
     run_in_front_of_people,
 )
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -40,18 +40,18 @@ _TOLD = {
 class RunOptions:
     """What `run` and `calibrate` are told on the command line beside their campaign."""
 
-    resume: bool
-    run_id: str | None
+    resume: bool = False
+    run_id: str | None = None
     """With resume: which run; None is the newest unfinished one."""
-    answer: str | None
+    answer: str | None = None
     """With resume: what came of the pour that was under way; None lets a person be asked."""
-    in_process: bool
-    laboratory: Path | None
+    in_process: bool = False
+    laboratory: Path | None = None
     """In place of the campaign's."""
-    seed: int | None
+    seed: int | None = None
     """In place of the campaign's."""
-    as_json: bool
-    armed: bool
+    as_json: bool = False
+    arm: bool = False
     """Hardware may move in this run."""
     live: bool = False
     """A live view is served while it runs …"""
@@ -255,7 +255,7 @@ def planning_plan(
             "by C4",
             BAD_INPUT,
         )
-    try:
+    with Refused(ConfigError):
         if isinstance(parameters, Path):
             theta = load_parameters(parameters, plan.parameters)
             if posterior:
@@ -263,8 +263,6 @@ def planning_plan(
         elif parameters is not None:
             theta = parameters
         vessel = load_vessel(receiver) if isinstance(receiver, Path) else receiver
-    except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     if deployment is None:
         raise RefusalError(
             f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)",
@@ -295,7 +293,7 @@ def _run(
             f"--answer {options.answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT
         )
     chosen = stages_of(plan) if stages is None else stages
-    checksum = arm_campaign(plan, chosen, armed=options.armed, verb=verb)
+    checksum = arm_campaign(plan, chosen, armed=options.arm, verb=verb)
     if any(stage.pours for stage in chosen):
         check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(plan, chosen, in_process=options.in_process)

@@ -14,6 +14,7 @@ from orchestrator.commands.speaking import (
     FAILED,
     INTERRUPTED,
     RefusalError,
+    Refused,
     is_quiet,
     mention,
     say,
@@ -23,10 +24,10 @@ from orchestrator.commands.waiting import Waiting
 
 if TYPE_CHECKING:
     from actors.protocols import Laboratory
-    from orchestrator.campaign import CampaignResult
     from orchestrator.monitor.live import LiveView
     from orchestrator.plan import CampaignPlan
     from orchestrator.publish import Published
+    from orchestrator.run_result import CampaignResult
     from orchestrator.stages import StageDefinition
 
 
@@ -39,10 +40,8 @@ def read_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
     from orchestrator.config.load import load_campaign
     from orchestrator.config.yaml.errors import ConfigError
 
-    try:
+    with Refused(ConfigError):
         return load_campaign(path, laboratory, seed)
-    except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> None:
@@ -81,10 +80,8 @@ def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinitio
     laboratory = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
     if laboratory.ray is not None and not laboratory.in_process:
         mention(f"looking at the Ray cluster at {laboratory.ray.address} …")
-    try:
+    with Refused(LaboratoryError):
         check_laboratory(laboratory, need_bench=any(stage.pours for stage in stages))
-    except LaboratoryError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 def check_output(path: Path | None, option: str, suffix: str) -> None:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json, say
 from sim_engine.extras import MissingExtraError, require
 
 if TYPE_CHECKING:
@@ -56,10 +56,8 @@ def serve(path: Path | None, *, state: Path | None, port: int | None, simulators
 
 def _require_extra() -> None:
     for module in ("fastapi", "uvicorn", "httpx", "prometheus_client", "pythonjsonlogger"):
-        try:
+        with Refused(MissingExtraError):
             require(module, "the daemon")
-        except MissingExtraError as error:
-            raise RefusalError(str(error), BAD_INPUT) from None
 
 
 @contextmanager
@@ -289,6 +287,8 @@ def _print_question(question: dict[str, Any]) -> None:
 
 def arm(key: str, *, at: At) -> None:
     """Show what hardware would do, and have its laboratory's name typed."""
+    from orchestrator.commands.arming import announce
+
     if not sys.stdin.isatty():
         raise RefusalError(
             "hardware is armed by somebody who reads what it will do and types its name: that needs a terminal",
@@ -297,13 +297,7 @@ def arm(key: str, *, at: At) -> None:
     with talking(at) as client:
         say("planning paths from all over the actions …")
         moves = client.get(f"/campaigns/{key}/arming")
-        say(f"\nHARDWARE: laboratory {moves['laboratory']}, {moves['arm']}. This will move:\n")
-        for line in moves["lines"]:
-            say(f"  {line}")
-        say(
-            "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of "
-            f"the box.\nType the laboratory's name ({moves['laboratory']}) to arm it; anything else ends here."
-        )
+        announce(moves["laboratory"], moves["arm"], moves["lines"])
         print("> ", end="", file=sys.stderr, flush=True)
         found = client.post(f"/campaigns/{key}/arm", {"laboratory": sys.stdin.readline().strip()})
     say(f"armed for the coming part of its run: {found['id']}")

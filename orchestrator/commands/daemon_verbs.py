@@ -8,14 +8,15 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands.options import Campaign, Json, OtherLaboratory, Seed, call, examples
+from orchestrator.commands.options import Campaign, Json, OtherLaboratory, Seed, call, examples, given
 
 Key = Annotated[
     str,
     typer.Argument(metavar="CAMPAIGN_ID", help="As 'decant list' shows it; its beginning will do.", show_default=False),
 ]
 Url = Annotated[
-    str | None, typer.Option(help="Of the daemon; else $DECANT_URL, or the one on this machine.", show_default=False)
+    str | None,
+    typer.Option(help="The daemon's address; else $DECANT_URL, or this machine's.", show_default=False),
 ]
 State = Annotated[
     Path | None, typer.Option(help="The daemon's state directory; else $DECANT_STATE.", show_default=False)
@@ -55,19 +56,10 @@ def submit(
     as_json: Json = False,
 ) -> None:
     """Put a campaign into the daemon's queue, with copies of everything that it refers to."""
+    options = given(locals(), "campaign", "verb", "url", "state")
     from orchestrator.commands import daemon as module
 
-    call(
-        module.submit,
-        campaign,
-        wanted=verb,
-        rig=rig,
-        priority=priority,
-        laboratory=laboratory,
-        seed=seed,
-        at=(url, state),
-        as_json=as_json,
-    )
+    call(module.submit, campaign, wanted=verb, at=(url, state), **options)
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
@@ -85,7 +77,9 @@ def show(key: Key, url: Url = None, state: State = None, as_json: Json = False) 
 
 
 def logs(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Of all unless given.")] = None,
+    key: Annotated[
+        str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Whose events; all of them unless given.")
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes; Ctrl-C ends it.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Every event as one line of JSON.")] = False,
     url: Url = None,

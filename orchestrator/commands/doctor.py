@@ -12,7 +12,7 @@ from actors.arm.look import ArmLook, SafetyRecord
 from actors.checks import Check
 from orchestrator.commands.doctor_balance import look_at_balance
 from orchestrator.commands.hands_on import reached
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, Refused, print_json, say
 from orchestrator.plugins import broken
 from orchestrator.safety import SafetyRecordError, read_record, record_path, write_record
 
@@ -92,10 +92,8 @@ def read_laboratory(path: Path) -> LaboratorySpec:
     from orchestrator.config.load import load_laboratory
     from orchestrator.config.yaml.errors import ConfigError
 
-    try:
+    with Refused(ConfigError):
         return load_laboratory(path)
-    except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
 
 
 def print_table(checks: list[Check]) -> None:

@@ -1,4 +1,4 @@
-"""With what a verb foretells pours: θ, draws of its posterior, and what calibration left over."""
+"""With what a verb foretells pours: what was asked for, θ, draws of its posterior, what calibration left over."""
 
 from __future__ import annotations
 
@@ -6,11 +6,37 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
+    from sim_engine.backend import Backend
     from sim_engine.liquid import SimulationParameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions:
+    """What `simulate` is told on the command line beside its campaign."""
+
+    assignments: list[str] | None = None
+    """Values of the action, `name=value`."""
+    source: Path | None = None
+    """CSV of weighed pours, in place of an action."""
+    parameters: Path | None = None
+    """theta.json; None: the campaign's θ."""
+    receiver: Path | None = None
+    """In place of the scene's."""
+    thetas: int | None = None
+    """Draws of the posterior that a pour's simulations take turns with; None: as many as `seeds`, if there is one."""
+    seed: int = 0
+    seeds: int = 3
+    """Simulations of each pour; as many as `thetas` where those are more."""
+    scene: str | None = None
+    csv: Path | None = None
+    rrd: Path | None = None
+    png: Path | None = None
+    as_json: bool = False
+    backend: Backend = "cpu"
 
 
 @dataclass(frozen=True)
@@ -68,11 +94,9 @@ def foretelling(plan: CampaignPlan, parameters: Path | None, thetas: int | None,
         if thetas:
             raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration", BAD_INPUT)
         return Foretelling(plan.parameters)
-    try:
+    with Refused(ConfigError):
         theta = load_parameters(parameters, plan.parameters)
         if thetas is None:
             thetas = seeds if has_posterior(parameters) else 0
         drawn = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
         return Foretelling(theta, drawn, load_discrepancy(parameters))
-    except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from actors.arm.errors import NotAcceptedError
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, say
+from orchestrator.commands.speaking import RefusalError, Refused, say
 from orchestrator.safety import SafetyRecordError, read_record
 
 if TYPE_CHECKING:
@@ -59,10 +59,8 @@ def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm,
     cls, arguments = spec.arm.driver((accepted or "") if spec.mode == "hardware" else None)
     arm: Arm = cls(*arguments)
     try:
-        try:
+        with Refused(NotAcceptedError):
             facts = arm.connect()
-        except NotAcceptedError as error:
-            raise RefusalError(str(error), BAD_INPUT) from None
         if facts.problem:
             raise RefusalError(f"{spec.arm.title}: {facts.problem}; 'decant doctor' says what to do about it")
         yield arm, facts
@@ -76,10 +74,8 @@ def accepted_for(path: Path) -> str | None:
     Raises:
         RefusalError: the record can't be read (exit code 2).
     """
-    try:
+    with Refused(SafetyRecordError):
         record = read_record(path)
-    except SafetyRecordError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     return None if record is None else record.checksum
 
 

@@ -62,13 +62,13 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
 
     Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
     """
-    from orchestrator.campaign import read_result
     from orchestrator.codec import digest
     from orchestrator.fingerprint import fingerprint
     from orchestrator.journal import JOURNAL_NAME, JournalReader
     from orchestrator.publish import FIGURES, summary_of, write_report
     from orchestrator.report.campaign import draw_figures
     from orchestrator.report.run_page import REPORT_NAME
+    from orchestrator.run_result import read_result
 
     with contextlib.suppress(Exception, KeyboardInterrupt), JournalReader(directory / JOURNAL_NAME) as journal:
         if digest(journal.header.fingerprint) != digest(fingerprint(plan)):

@@ -14,7 +14,7 @@ from actors.protocols import LaboratoryError
 from orchestrator.commands.arming import confirm, require_flag
 from orchestrator.commands.doctor import read_laboratory, without_arm
 from orchestrator.commands.hands_on import accepted_for, connected, reached, stoppable, typed_line
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, say
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, Refused, say
 
 if TYPE_CHECKING:
     from actors.arm.protocol import Arm
@@ -212,11 +212,8 @@ def jog(path: Path, *, armed: bool) -> None:
         confirm(spec, ["steps          one at a time, as typed: at most 10 deg at 5 deg/s, or 50 mm at 20 mm/s"])
     else:
         say(f"laboratory {spec.name}, virtual: nothing moves but numbers")
-    try:
-        with reached(spec) as ready:
-            assert ready.arm is not None
-            with connected(replace(ready, arm=ready.arm.announced(ANNOUNCEMENT)), accepted) as (arm, facts):
-                say(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed")
-                Jogging(arm, typed_line).run()
-    except LaboratoryError as error:
-        raise RefusalError(str(error), FAILED) from None
+    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
+        assert ready.arm is not None
+        with connected(replace(ready, arm=ready.arm.announced(ANNOUNCEMENT)), accepted) as (arm, facts):
+            say(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed")
+            Jogging(arm, typed_line).run()

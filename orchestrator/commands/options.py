@@ -96,8 +96,18 @@ def examples(*commands: str) -> str:
     return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
 
 
+def given(options: dict[str, Any], *left_out: str) -> dict[str, Any]:
+    """A verb's options by name, for the function that does its work.
+
+    Args:
+        options: `locals()` at the verb's beginning.
+        left_out: what is not for that function; `--quiet` has had its effect already.
+    """
+    return {name: value for name, value in options.items() if name not in ("quiet", *left_out)}
+
+
 def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
-    """Run a verb; a refusal is told, with its exit code."""
+    """Run a verb; a refusal is printed, and ends with its exit code."""
     try:
         verb(*args, **kwargs)
     except RefusalError as refusal:

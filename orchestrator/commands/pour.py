@@ -12,7 +12,7 @@ from actors.arm.protocol import PathReport, PlannedPour
 from orchestrator.commands.arming import accepted, confirm, report_lines, require_flag
 from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.single import scene_to_simulate, wanted_in
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, mention, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, Refused, mention, print_json, say
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -42,14 +42,14 @@ class Chosen:
 def pour(
     path: Path,
     *,
-    assignments: list[str],
-    scene_name: str | None,
+    assignments: list[str] | None,
+    scene: str | None,
     dry_run: bool,
     connect: bool,
     png: Path | None,
     empty: bool,
     slow: float,
-    armed: bool,
+    arm: bool,
     laboratory: Path | None,
     in_process: bool,
     as_json: bool,
@@ -59,13 +59,13 @@ def pour(
     Args:
         path: campaign.
         assignments: of the action, `name=value`.
-        scene_name: 'calibration', 'transfer' or a receiver's name; the first receiver if not given.
+        scene: 'calibration', 'transfer' or a receiver's name; the first receiver if not given.
         dry_run: plan and check the whole path, and move nothing.
         connect: with `dry_run`: also read where the arm stands.
         png: picture of the path.
         empty: the whole cycle with an empty pourer, nothing weighed.
         slow: with `empty`, fraction of the planned speed.
-        armed: whether `--arm` was given.
+        arm: whether `--arm` was given.
         laboratory: file in place of the campaign's.
         in_process: without Ray.
         as_json: print the result as JSON.
@@ -75,7 +75,7 @@ def pour(
     """
     _check_options(dry_run=dry_run, connect=connect, empty=empty, slow=slow)
     check_output(png, "--png", ".png")
-    chosen = _chosen(path, laboratory, assignments, scene_name)
+    chosen = _chosen(path, laboratory, assignments or [], scene)
     bench = chosen.plan.laboratory
     if chosen.path is None and (dry_run or empty or png is not None):
         raise RefusalError(
@@ -88,7 +88,7 @@ def pour(
         _dry_run(chosen, connect=connect, as_json=as_json)
         return
     verb = f"decant pour {path}" + ("" if laboratory is None else f" --laboratory {laboratory}")
-    require_flag(bench, armed=armed, again=f"{verb} … --arm")
+    require_flag(bench, armed=arm, again=f"{verb} … --arm")
     if empty:
         from orchestrator.commands.pour_empty import pour_empty
 
@@ -122,10 +122,8 @@ def _chosen(path: Path, laboratory: Path | None, assignments: list[str], scene_n
 
     plan = read_campaign(path, laboratory)
     scene, space = scene_to_simulate(plan, scene_name)
-    try:
+    with Refused(ValueError, at="--set: "):
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
-    except ValueError as error:
-        raise RefusalError(f"--set: {error}", BAD_INPUT) from None
     problems = check_vessels(scene, plan.source, wanted_in(plan, scene, scene_name))
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
@@ -207,12 +205,9 @@ def _stands_at_home(chosen: Chosen) -> bool:
     from actors.protocols import LaboratoryError
     from orchestrator.commands.hands_on import reached
 
-    try:
-        with reached(chosen.plan.laboratory) as ready:
-            assert ready.arm is not None
-            check = ready.arm.look().at_home()
-    except LaboratoryError as error:
-        raise RefusalError(str(error), FAILED) from None
+    with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
+        assert ready.arm is not None
+        check = ready.arm.look().at_home()
     say(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
     return check.state == "ok"
 

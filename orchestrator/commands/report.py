@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orchestrator.commands.options import Json, Quiet, call, examples
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -80,20 +80,17 @@ def _nothing_there(folder: Path) -> str:
 
 
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
-    from orchestrator.campaign import read_result
     from orchestrator.errors import RunError
     from orchestrator.journal import JOURNAL_NAME, JournalReader
-    from orchestrator.publish import FIGURES, summary_of, write_report
-    from orchestrator.report.campaign import draw_figures
-    from orchestrator.report.run_page import REPORT_NAME
+    from orchestrator.publish import report_on
+    from orchestrator.run_result import read_result
 
     plan = _plan_of(folder)
     mention("drawing the figures …")
     try:
         with JournalReader(folder / JOURNAL_NAME) as journal:
             result = read_result(journal, folder)
-        figures = draw_figures(folder / FIGURES, plan, result.results, formats)
-        page = write_report(output or folder / REPORT_NAME, plan, summary_of(plan, result, figures), folder)
+        page, figures = report_on(plan, result, output, formats)
     except RunError as error:
         raise RefusalError(str(error)) from None
     except OSError as error:
@@ -106,10 +103,8 @@ def _plan_of(folder: Path) -> CampaignPlan:
     from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.runs import RESOLVED
 
-    try:
+    with Refused(ConfigError, at="the run's own campaign can't be read:\n"):
         return load_campaign(folder / RESOLVED)
-    except ConfigError as error:
-        raise RefusalError(f"the run's own campaign can't be read:\n{error}", BAD_INPUT) from None
 
 
 def _of_study(what: Path) -> Path:
@@ -117,9 +112,7 @@ def _of_study(what: Path) -> Path:
     from orchestrator.study.folder import StudyError, check_settings, file_of
     from orchestrator.study.report.page import write_report
 
-    try:
+    with Refused(StudyError):
         plan = read_study(what if what.is_file() else file_of(what))
         check_settings(plan)
         return write_report(plan, plan.folder)
-    except StudyError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None

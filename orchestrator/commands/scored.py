@@ -4,49 +4,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.commands.common import check_output, read_campaign
 from orchestrator.commands.single import scene_to_simulate
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, mention, print_json, stdout_for_results
+from orchestrator.commands.speaking import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    Refused,
+    mention,
+    print_json,
+    stdout_for_results,
+)
 from orchestrator.commands.waiting import waiting_for
 
 if TYPE_CHECKING:
+    from orchestrator.commands.foretelling import SimulateOptions
     from orchestrator.config.campaign.records import Table
     from orchestrator.plan import CampaignPlan, RecordedPour, RecordSet
     from orchestrator.scoring import ScoredRow
-    from sim_engine.backend import Backend
     from sim_engine.liquid import SimulationParameters
     from sim_engine.outcome import PourOutcome
     from sim_engine.pour import PourSimulator
     from sim_engine.task import PourTask, Scene
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoringOptions:
-    """What `simulate --from` is told on the command line beside its campaign."""
-
-    source: Path
-    """CSV of weighed pours."""
-    parameters: Path | None
-    """theta.json; None: the campaign's θ."""
-    receiver: Path | None
-    """In place of the scene's."""
-    thetas: int | None
-    """Draws of the posterior that a pour's simulations take turns with; None: as many as `seeds`, if there is one."""
-    seed: int
-    seeds: int
-    """Simulations of each pour; as many as `thetas` where those are more."""
-    scene: str | None
-    csv: Path | None
-    png: Path | None
-    as_json: bool
-    backend: Backend
-
-
-def predict_table(path: Path, options: ScoringOptions) -> None:
+def predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     """All pours of a table, in the simulator of this process."""
     from orchestrator.commands.foretelling import foretelling
     from orchestrator.scoring import scores
@@ -56,18 +41,16 @@ def predict_table(path: Path, options: ScoringOptions) -> None:
 
     plan = read_campaign(path)
     known = foretelling(plan, options.parameters, options.thetas, options.seeds)
-    scene, records = _scene(plan, options)
-    table, pours = _pours(scene, records, options.source)
+    scene, records = _scene(plan, options, source)
+    table, pours = _pours(scene, records, source)
     check_output(options.csv, "--csv", ".csv")
     check_output(options.png, "--png", ".png")
-    try:
+    with Refused(BackendError, at="--backend: "):
         require_backend(options.backend)
-    except BackendError as error:
-        raise RefusalError(f"--backend: {error}", BAD_INPUT) from None
     simulator = PourSimulator(options.backend)
     count = max(options.seeds, len(known.thetas))
     tasks = [_tasks(scene, pour, known.thetas, options.seed, count) for pour in pours]
-    _check(simulator, table, options.source, [some[0] for some in tasks])
+    _check(simulator, table, source, [some[0] for some in tasks])
     mention(f"{scene.name}: {len(pours)} pours, {count} simulations each, {known.said}")
     outcomes = _simulated(simulator, tasks)
     rows = [
@@ -89,7 +72,7 @@ def predict_table(path: Path, options: ScoringOptions) -> None:
         print_json(
             {
                 "scene": scene.name,
-                "from": options.source,
+                "from": source,
                 "scores": {split: one.as_json() for split, one in found.items()},
                 "level": LEVEL,
                 "theta": known.theta.model_dump(),
@@ -110,7 +93,7 @@ def predict_table(path: Path, options: ScoringOptions) -> None:
         raise RefusalError("no simulation could be used", FAILED)
 
 
-def _scene(plan: CampaignPlan, options: ScoringOptions) -> tuple[Scene, RecordSet | None]:
+def _scene(plan: CampaignPlan, options: SimulateOptions, source: Path) -> tuple[Scene, RecordSet | None]:
     """Where the pours were made: the scene named, else that whose file this is, else calibration's, else the first.
 
     Returns:
@@ -123,16 +106,14 @@ def _scene(plan: CampaignPlan, options: ScoringOptions) -> tuple[Scene, RecordSe
 
     calibration = plan.calibration
     sets = {} if calibration is None else {"calibration": calibration.records, "transfer": calibration.transfer}
-    name, same = options.scene, options.source.absolute().resolve()
+    name, same = options.scene, source.absolute().resolve()
     if name is None:
         own = [key for key, records in sets.items() if records is not None and records.path.resolve() == same]
         name = own[0] if own else ("calibration" if calibration is not None else None)
     scene, _ = scene_to_simulate(plan, name)
     if options.receiver is not None:
-        try:
+        with Refused(ConfigError):
             vessel = load_vessel(options.receiver)
-        except ConfigError as error:
-            raise RefusalError(str(error), BAD_INPUT) from None
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     records = sets.get(name or "") or sets.get("calibration")
     return scene, records

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,6 +18,7 @@ from orchestrator.commands.options import (
     SceneName,
     Thetas,
     call,
+    given,
 )
 from orchestrator.commands.speaking import BAD_INPUT, RefusalError
 
@@ -42,9 +43,9 @@ def simulate(
     ] = None,
     parameters: Parameters = None,
     receiver: Receiver = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the initial positions; the first of several.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the initial positions; the first of several.")] = 0,
     seeds: Annotated[
-        int, typer.Option(min=1, max=1000, help="How many seeds of a pour: SEED, SEED + 1, … Their spread is told.")
+        int, typer.Option(min=1, max=1000, help="How many seeds of a pour: SEED, SEED + 1, … Their spread is shown.")
     ] = 3,
     thetas: Thetas = None,
     scene: SceneName = None,
@@ -71,83 +72,26 @@ def simulate(
     spillage, Spearman's rank correlation, and how many pours lie inside their band. The scene is the one whose file it
     is, else calibration's, unless `--scene` names another.
     """
-    call(
-        _simulate,
-        campaign,
-        assignments=assignments or [],
-        source=source,
-        parameters=parameters,
-        receiver=receiver,
-        seed=seed,
-        seeds=seeds,
-        thetas=thetas,
-        scene=scene,
-        as_json=as_json,
-        rrd=rrd,
-        png=png,
-        csv=csv,
-        backend=backend.value,
-    )
+    options = given(locals(), "campaign")
+    call(_simulate, campaign, options)
 
 
-def _simulate(
-    campaign: Path,
-    *,
-    assignments: list[str],
-    source: Path | None,
-    parameters: Path | None,
-    receiver: Path | None,
-    seed: int,
-    seeds: int,
-    thetas: int | None,
-    scene: str | None,
-    as_json: bool,
-    rrd: Path | None,
-    png: Path | None,
-    csv: Path | None,
-    backend: str,
-) -> None:
-    """One pour or a table of them."""
-    chosen = "cuda" if backend == "cuda" else "cpu"
-    if source is None:
+def _simulate(campaign: Path, told: dict[str, Any]) -> None:
+    """One pour, or a table of them."""
+    from orchestrator.commands.foretelling import SimulateOptions
+
+    options = SimulateOptions(**told)
+    if options.source is None:
         from orchestrator.commands import single
 
-        if csv is not None:
-            raise RefusalError(f"--csv {csv}: goes with --from, a table of weighed pours", BAD_INPUT)
-        single.simulate(
-            campaign,
-            assignments=assignments,
-            parameters=parameters,
-            receiver=receiver,
-            seed=seed,
-            seeds=seeds,
-            thetas=thetas,
-            scene_name=scene,
-            as_json=as_json,
-            rrd=rrd,
-            png=png,
-            backend="cuda" if chosen == "cuda" else "cpu",
-        )
+        if options.csv is not None:
+            raise RefusalError(f"--csv {options.csv}: goes with --from, a table of weighed pours", BAD_INPUT)
+        single.simulate(campaign, options)
         return
-    from orchestrator.commands.scored import ScoringOptions, predict_table
+    from orchestrator.commands.scored import predict_table
 
-    if assignments:
+    if options.assignments:
         raise RefusalError("--set: the table given with --from says what is poured; remove one of them", BAD_INPUT)
-    if rrd is not None:
-        raise RefusalError(f"--rrd {rrd}: records one pour; it does not go with --from", BAD_INPUT)
-    predict_table(
-        campaign,
-        ScoringOptions(
-            source=source,
-            parameters=parameters,
-            receiver=receiver,
-            thetas=thetas,
-            seed=seed,
-            seeds=seeds,
-            scene=scene,
-            csv=csv,
-            png=png,
-            as_json=as_json,
-            backend="cuda" if chosen == "cuda" else "cpu",
-        ),
-    )
+    if options.rrd is not None:
+        raise RefusalError(f"--rrd {options.rrd}: records one pour; it does not go with --from", BAD_INPUT)
+    predict_table(campaign, options, options.source)

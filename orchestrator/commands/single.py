@@ -10,12 +10,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.commands.common import check_output, read_campaign
-from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, mention, print_json, stdout_for_results
+from orchestrator.commands.speaking import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    Refused,
+    mention,
+    print_json,
+    stdout_for_results,
+)
 from orchestrator.commands.waiting import waiting_for
 
 if TYPE_CHECKING:
+    from orchestrator.commands.foretelling import SimulateOptions
     from orchestrator.plan import CampaignPlan
-    from sim_engine.backend import Backend
     from sim_engine.outcome import PourOutcome
     from sim_engine.pour import PourSimulator
     from sim_engine.regimes import Regimes
@@ -25,21 +33,7 @@ if TYPE_CHECKING:
     from sim_engine.task import PourTask, Scene
 
 
-def simulate(
-    path: Path,
-    *,
-    assignments: list[str],
-    parameters: Path | None,
-    receiver: Path | None,
-    seed: int,
-    seeds: int,
-    thetas: int | None,
-    scene_name: str | None,
-    as_json: bool,
-    rrd: Path | None,
-    png: Path | None,
-    backend: Backend = "cpu",
-) -> None:
+def simulate(path: Path, options: SimulateOptions) -> None:
     """One pour in the simulator of this process, with several seeds: their mean and spread are the prediction."""
     from orchestrator.commands.foretelling import foretelling
     from orchestrator.config.campaign.assignments import assigned_action
@@ -53,47 +47,38 @@ def simulate(
     from sim_engine.task import PourTask
 
     plan = read_campaign(path)
-    known = foretelling(plan, parameters, thetas, seeds)
-    try:
-        vessel = None if receiver is None else load_vessel(receiver)
-    except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
-    scene, space = scene_to_simulate(plan, scene_name)
+    known = foretelling(plan, options.parameters, options.thetas, options.seeds)
+    with Refused(ConfigError):
+        vessel = None if options.receiver is None else load_vessel(options.receiver)
+    scene, space = scene_to_simulate(plan, options.scene)
     if vessel is not None:
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
-    try:
-        action = assigned_action(assignments, fixed=scene.fixed, space=space)
-    except ValueError as error:
-        raise RefusalError(f"--set: {error}", BAD_INPUT) from None
-    check_output(rrd, "--rrd", ".rrd")
-    check_output(png, "--png", ".png")
-    problems = check_vessels(scene, plan.source, wanted_in(plan, scene, scene_name))
+    with Refused(ValueError, at="--set: "):
+        action = assigned_action(options.assignments or [], fixed=scene.fixed, space=space)
+    check_output(options.rrd, "--rrd", ".rrd")
+    check_output(options.png, "--png", ".png")
+    problems = check_vessels(scene, plan.source, wanted_in(plan, scene, options.scene))
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
-    record_rate = 20.0 if rrd or png else 0.0
+    record_rate = 20.0 if options.rrd or options.png else 0.0
     turns = known.thetas
     tasks = [
-        PourTask(scene, action, turns[i % len(turns)], seed + i, record_rate if i == 0 else 0.0)
-        for i in range(max(seeds, len(turns)))
+        PourTask(scene, action, turns[i % len(turns)], options.seed + i, record_rate if i == 0 else 0.0)
+        for i in range(max(options.seeds, len(turns)))
     ]
-    try:
-        require_backend(backend)
-    except BackendError as error:
-        raise RefusalError(f"--backend: {error}", BAD_INPUT) from None
-    simulator = PourSimulator(backend)
-    try:
+    with Refused(BackendError, at="--backend: "):
+        require_backend(options.backend)
+    simulator = PourSimulator(options.backend)
+    with Refused(InvalidSceneError):
         simulator.prepare(tasks[0])  # refused before Taichi starts
-    except InvalidSceneError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     regime = _regimes(tasks[0])
     runs = _simulated(simulator, tasks)
     outcomes = [run.outcome for run in runs]
-    if rrd is not None or png is not None:
-        _show(tasks[0], runs[0], rrd, png)
+    _show(tasks[0], runs[0], options)
     over_seeds, where = spreads(outcomes), band_of(outcomes, known.discrepancy)
     received = over_seeds.get("received")
     delivered = None if received is None else received.mean * scene.liquid.mass
-    if as_json:
+    if options.as_json:
         prediction = {name: spread.as_json() for name, spread in over_seeds.items()}
         print_json(
             {
@@ -216,15 +201,15 @@ def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scen
     return scenes[name]
 
 
-def _show(task: PourTask, pour: SimulatedPour, rrd: Path | None, png: Path | None) -> None:
-    if rrd is not None:
+def _show(task: PourTask, pour: SimulatedPour, options: SimulateOptions) -> None:
+    if options.rrd is not None:
         from orchestrator.monitor.simulation import simulation_rrd
 
-        mention(f"recording: {simulation_rrd(rrd, task, pour)} (open it with: rerun {rrd})")
-    if png is not None:
+        mention(f"recording: {simulation_rrd(options.rrd, task, pour)} (open it with: rerun {options.rrd})")
+    if options.png is not None:
         from orchestrator.report.scene import simulation_png
 
-        mention(f"picture: {simulation_png(png, task, pour)}")
+        mention(f"picture: {simulation_png(options.png, task, pour)}")
 
 
 def schema(which: str) -> None:

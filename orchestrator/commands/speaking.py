@@ -23,6 +23,26 @@ class RefusalError(Exception):
         self.code = code
 
 
+class Refused:
+    """Whatever of some kinds is raised inside is a refusal, in its own words.
+
+    Args:
+        kinds: of errors whose text is for the person who can mend it.
+        code: exit code.
+        at: what stands before the text: an option, a file.
+    """
+
+    def __init__(self, *kinds: type[Exception], code: int = BAD_INPUT, at: str = "") -> None:
+        self._kinds, self._code, self._at = kinds, code, at
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, self._kinds):
+            raise RefusalError(f"{self._at}{error}", self._code) from None
+
+
 def say(text: str) -> None:
     """A line for people: stderr, so that stdout stays for results."""
     with contextlib.suppress(OSError):  # a terminal that was closed is not a reason to leave an arm where it is

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.speaking import BAD_INPUT, INTERRUPTED, RefusalError, mention, print_json
+from orchestrator.commands.speaking import INTERRUPTED, RefusalError, Refused, mention, print_json
 
 if TYPE_CHECKING:
     from orchestrator.study.cells import Cell
@@ -30,7 +30,7 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
 
     plan = read_study(path)
     cells = cells_of(plan)
-    try:
+    with Refused(StudyError):
         if dry_run:
             check_settings(plan)
             _tell_what_is_left(plan, cells, as_json)
@@ -38,8 +38,6 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
         with opened(plan) as folder:
             status = None if report_only else _run(plan, folder, jobs or os.cpu_count() or 1, path)
             page = _report(plan, folder)
-    except StudyError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     if as_json:
         finished = len(status.finished) if status is not None else None
         print_json({"study": plan.name, "folder": folder, "page": page, "cells": len(cells), "finished": finished})
@@ -63,10 +61,8 @@ def read_study(path: Path) -> StudyPlan:
     from orchestrator.config.study.sections import load_study
     from orchestrator.config.yaml.errors import ConfigError
 
-    try:
+    with Refused(ConfigError):
         plan = load_study(path)
-    except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     deployment = plan.deployments[0].plan if plan.deployments else None
     check_campaign_can_run(replace(plan.base, source=plan.source, deployment=deployment))
     return plan

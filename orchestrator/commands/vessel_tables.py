@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused
 from orchestrator.config.yaml.quantities import QuantityError, parse_quantity
 
 if TYPE_CHECKING:
@@ -115,10 +115,8 @@ def read_points(path: Path, unit: LengthUnit | None, up: str) -> Floats:
     if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points[:, :3]).all():
         raise RefusalError(f"{path}: should have x, y, z in each row, all of them finite numbers", BAD_INPUT)
     points = points[:, :3]
-    try:
+    with Refused(VesselError):
         scale = UNITS[unit or likely_unit(float(np.ptp(points, axis=0).max()), path)]
-    except VesselError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
     result: Floats = points @ to_z(up).T * scale
     return result
 

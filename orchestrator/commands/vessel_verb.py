@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands.options import Json, Quiet, call, examples
+from orchestrator.commands.options import Json, Quiet, call, examples, given
 
 
 def vessel(
@@ -39,26 +39,10 @@ def vessel(
     Sources for a turned vessel can be joined: each says what it knows, with its own uncertainty. Beside the file there
     is a picture with the section, its band and what was measured. What was measured is said in the file.
     """
+    sources = given(locals(), "out", "name", "as_json")
     from orchestrator.commands import vessel as verb
 
-    sources = verb.Sources(
-        height=height,
-        diameters=diameters,
-        photo=photo,
-        known_height=known_height,
-        known_width=known_width,
-        points=points,
-        mesh=mesh,
-        unit=unit,
-        up=up,
-        fill=fill,
-        tilt=tilt,
-        brimful=brimful,
-        density=density,
-        wall=wall,
-        floor=floor,
-    )
-    call(verb.vessel, out, sources, name=name, as_json=as_json)
+    call(verb.vessel, out, verb.Sources(**sources), name=name, as_json=as_json)
 
 
 EXAMPLES = examples(

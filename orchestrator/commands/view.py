@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orchestrator.commands.options import LiveAt, Quiet, call, examples
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, say
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, say
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -183,7 +183,5 @@ def _plan_of(run: Path) -> CampaignPlan:
     from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.runs import RESOLVED
 
-    try:
+    with Refused(ConfigError, at="the run's own campaign can't be read:\n"):
         return load_campaign(run / RESOLVED)
-    except ConfigError as error:
-        raise RefusalError(f"the run's own campaign can't be read:\n{error}", BAD_INPUT) from None

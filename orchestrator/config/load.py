@@ -14,7 +14,7 @@ from actors.spec import LaboratorySpec
 from orchestrator.config.campaign.resolve import resolve_campaign
 from orchestrator.config.campaign.sections import CampaignFile
 from orchestrator.config.laboratory.sections import LaboratoryFile, resolve_laboratory
-from orchestrator.config.motion import parameter_quantity
+from orchestrator.config.parameters import parameter_quantity
 from orchestrator.config.vessel import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.errors import ConfigError, Problem
 from orchestrator.config.yaml.files import resolved

@@ -1,42 +1,18 @@
-"""Motions, action spaces and parameter spaces as written in files, derived from the declarations in `sim_engine`."""
+"""Motions and action spaces as written in files, derived from the declarations in `sim_engine.action`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag, create_model, model_validator
-from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic import Discriminator, Field, Tag, create_model
 
+from orchestrator.config.ranges import EXAMPLES, RangeSection, described, range_model, title
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import MADE, Section, Text
 from orchestrator.plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
-from sim_engine.liquid import ParameterInfo, SimulationParameters
-from sim_engine.space import Axis, Scale, Space
+from sim_engine.space import Space
 from sim_engine.task import Pivot
-
-EXAMPLES = {
-    "angular_velocity": "40 deg/s",
-    "max_angle": "110 deg",
-    "angular_acceleration": "600 deg/s^2",
-    "hold_time": "1.5 s",
-    "return_velocity": "90 deg/s",
-    "x_offset": "90 mm",
-    "y_offset": "0 mm",
-    "height": "60 mm",
-} | {
-    # A parameter's default is a good example of it.
-    name: f"{default / info.factor:g}" + ("" if info.shown == "1" else f" {info.shown}")
-    for (name, info), default in zip(
-        SimulationParameters.info().items(), SimulationParameters().model_dump().values(), strict=True
-    )
-}
-"""A right value of every action dimension and simulation parameter, for messages and schemas."""
-
-
-SEARCHED_TOLERANCES = 3.0
-"""A measured value is searched so many of its standard deviations to both sides."""
 
 DEVIATIONS = {"rad/s": "20 deg/s", "rad": "10 deg", "rad/s^2": "200 deg/s^2", "s": "0.5 s", "m": "15 mm"}
 """A right standard deviation of a dimension in each unit."""
@@ -51,88 +27,6 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
         dimension.upper,
         words=(dimension.switched_off,) if words and dimension.optional else (),
     )
-
-
-def parameter_quantity(name: str) -> Quantity:
-    """Annotation of a simulation parameter."""
-    info = SimulationParameters.info()[name]
-    return Quantity(info.unit, EXAMPLES[name], info.lower, info.upper, whole=info.integer)
-
-
-class RangeSection(Section):
-    """Bounds of a searched quantity: `[lowest, highest]`, or with a scale `{range: [...], scale: log}`."""
-
-    required: ClassVar[dict[str, str]] = {"range": "[lowest, highest]"}
-
-    range: tuple[Any, Any] | None = None
-    """[lowest, highest]"""
-
-    scale: Scale = "linear"
-    """How the search spreads over the range."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_form(cls, data: Any) -> Any:
-        if isinstance(data, Mapping):
-            data = dict(data)
-        elif isinstance(data, list):
-            data = {"range": data}
-        else:
-            raise PydanticCustomError("range", "should be a range [lowest, highest]")
-        bounds = data.get("range")
-        if bounds is not None and not (isinstance(bounds, list) and len(bounds) == 2):
-            raise PydanticCustomError("range", "a range has two ends: [lowest, highest]")
-        return data
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.range is not None and not self.range[0] < self.range[1]:
-            raise PydanticCustomError("range", "bounds should increase: [lowest, highest]")
-        if self.range is not None and self.scale == "log" and self.range[0] <= 0.0:
-            raise PydanticCustomError("range", "a log scale needs a lowest value above 0")
-        return self
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        long_form = handler.resolve_ref_schema(handler(schema))
-        return {"anyOf": [long_form["properties"]["range"], dict(long_form)]}
-
-    def axis(self, name: str, *, integer: bool = False) -> Axis:
-        """The axis of a space."""
-        assert self.range is not None
-        return Axis(name, float(self.range[0]), float(self.range[1]), self.scale, integer)
-
-
-class ParameterRangeSection(RangeSection):
-    """What calibration searches: `[lowest, highest]`, all values alike beforehand; or what was measured,
-    `{measured: …, tolerance: …}`, a normal prior that a range beside it cuts off.
-    """
-
-    required: ClassVar[dict[str, str]] = {}
-
-    measured: Any = None
-    """C4: what was measured or is known of it."""
-
-    tolerance: Any = None
-    """C4: standard deviation of that; without a range three of them to both sides are searched."""
-
-    info: ClassVar[ParameterInfo]
-
-    def searched(self) -> Axis | None:
-        """The axis that is searched; None where something is wrong here."""
-        info = self.info
-        if self.range is not None:
-            return self.axis(info.name, integer=info.integer)
-        if self.measured is None or self.tolerance is None:
-            return None
-        low, high = (self.measured + sign * SEARCHED_TOLERANCES * self.tolerance for sign in (-1.0, 1.0))
-        return Axis(info.name, max(low, info.lower), min(high, info.upper), self.scale, info.integer)
-
-    def normal(self) -> NormalPrior | None:
-        """The prior; None where all values are alike, or where something is wrong here."""
-        if self.measured is None or self.tolerance is None:
-            return None
-        return NormalPrior(self.info.name, float(self.measured), float(self.tolerance))
 
 
 class PriorSection(Section):
@@ -159,53 +53,20 @@ class ActionRangeSection(RangeSection):
         return NormalPrior(name, float(prior.mean), float(prior.deviation))
 
 
-def _range_model(
-    name: str, quantity: Quantity, base: type[RangeSection] = RangeSection, **further: Any
-) -> type[RangeSection]:
-    end = Annotated[float, quantity]
-    fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]")), **further}
-    model: type[RangeSection] = create_model(
-        f"{_title(name)}Range", __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields
-    )
-    return model
-
-
-def _parameter_range_model(info: ParameterInfo) -> type[ParameterRangeSection]:
-    quantity = parameter_quantity(info.name)
-    typical = (info.tolerance or (info.upper - info.lower) / 20.0) / info.factor
-    example = f"{typical:.2g}" + ("" if info.shown == "1" else f" {info.shown}")
-    spread = Quantity(info.unit, example, 0.0, info.upper - info.lower, positive=True)
-    further: Any = {
-        key: (Annotated[float, number] | None, Field(default=None, description=_described(ParameterRangeSection, key)))
-        for key, number in (("measured", quantity), ("tolerance", spread))
-    }
-    model: Any = _range_model(info.name, quantity, ParameterRangeSection, **further)
-    model.info = info
-    return model  # type: ignore[no-any-return]
-
-
 def _action_range_model(dimension: Dimension) -> type[RangeSection]:
     name, quantity = dimension.name, dimension_quantity(dimension)
     width = dimension.upper - dimension.lower
     spread = Quantity(dimension.unit, DEVIATIONS[dimension.unit], 0.0, width, positive=True)
     fields: Any = {
-        key: (Annotated[float, number] | None, Field(default=None, description=_described(PriorSection, key)))
+        key: (Annotated[float, number] | None, Field(default=None, description=described(PriorSection, key)))
         for key, number in (("mean", quantity), ("deviation", spread))
     }
     prior: Any = create_model(
-        f"{_title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, __cls_kwargs__=MADE, **fields
+        f"{title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, __cls_kwargs__=MADE, **fields
     )
     prior.required = {"mean": quantity.example, "deviation": spread.example}
-    field = (prior | None, Field(default=None, description=_described(ActionRangeSection, "prior")))
-    return _range_model(name, quantity, ActionRangeSection, prior=field)
-
-
-def _title(name: str) -> str:
-    return name.title().replace("_", "")
-
-
-def _described(section: type[Section], field: str) -> str | None:
-    return section.model_fields[field].description
+    field = (prior | None, Field(default=None, description=described(ActionRangeSection, "prior")))
+    return range_model(name, quantity, ActionRangeSection, prior=field)
 
 
 class PivotPoint(Section):
@@ -306,58 +167,5 @@ def _actions_model() -> type[ActionsBase]:
     return model
 
 
-def _parameter_form(value: Any) -> str:
-    return "searched" if isinstance(value, (list, Mapping)) else "fixed"
-
-
-class ParametersBase(Section):
-    """Parameters: a value fixes one; a range, or what was measured with a tolerance, has it searched by calibration."""
-
-    def fixed(self) -> dict[str, float]:
-        """Parameters with a value, SI."""
-        return {name: float(v) for name in self.written_keys() if isinstance(v := self.value(name), (int, float))}
-
-    def ranges(self) -> dict[str, ParameterRangeSection]:
-        """Parameters that are to be searched."""
-        given = {name: self.value(name) for name in self.written_keys()}
-        return {name: section for name, section in given.items() if isinstance(section, ParameterRangeSection)}
-
-    def searched(self) -> dict[str, Axis]:
-        """Axes of parameters that are to be searched."""
-        axes = {name: section.searched() for name, section in self.ranges().items()}
-        return {name: axis for name, axis in axes.items() if axis is not None}
-
-    def priors(self) -> tuple[NormalPrior, ...]:
-        """Searched parameters whose values are not all alike beforehand."""
-        found = (section.normal() for section in self.ranges().values())
-        return tuple(prior for prior in found if prior is not None)
-
-    def completed(self) -> Self:
-        """With the defaults of parameters that are not named."""
-        given = {name: value for name in self.written_keys() if (value := self.value(name)) is not None}
-        return self.model_copy(update=SimulationParameters().model_dump() | given)
-
-    def in_force(self) -> dict[str, float]:
-        """What is named, SI: a value, and of a range what was measured (or the default), or what is nearest."""
-        default = SimulationParameters().model_dump() | {prior.name: prior.mean for prior in self.priors()}
-        return self.fixed() | {n: min(max(default[n], axis.lower), axis.upper) for n, axis in self.searched().items()}
-
-
-def _parameters_model() -> type[ParametersBase]:
-    fields: Any = {}
-    for name, info in SimulationParameters.info().items():
-        quantity = parameter_quantity(name)
-        form: Any = Annotated[
-            Annotated[float, quantity, Tag("fixed")] | Annotated[_parameter_range_model(info), Tag("searched")],
-            Discriminator(_parameter_form),
-        ]
-        fields[name] = (form | None, Field(default=None, description=info.meaning or None))
-    model: type[ParametersBase] = create_model(
-        "Parameters", __base__=ParametersBase, __doc__=ParametersBase.__doc__, __cls_kwargs__=MADE, **fields
-    )
-    return model
-
-
 Motion = _motion_model()
 Actions = _actions_model()
-Parameters = _parameters_model()

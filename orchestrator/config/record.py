@@ -9,7 +9,7 @@ from typing import Any
 
 from orchestrator.config.campaign.sections import CalibrationSection, LearningSection
 from orchestrator.config.laboratory.sections import HiddenLiquid
-from orchestrator.config.motion import Parameters
+from orchestrator.config.parameters import Parameters
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.yaml.dump import as_file
 from orchestrator.config.yaml.references import References

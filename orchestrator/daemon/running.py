@@ -12,7 +12,7 @@ from actors.bench.opening import needs_person
 from actors.laboratory import open_laboratory
 from actors.protocols import Laboratory, LaboratoryError, Stoppable
 from actors.warm import WarmSimulators
-from orchestrator.campaign import CampaignResult, read_result, run_campaign
+from orchestrator.campaign import run_campaign
 from orchestrator.daemon.feed import Feed
 from orchestrator.daemon.packing import CAMPAIGN, load_confined
 from orchestrator.daemon.people import Asking, RemoteOperator, RunQuestions
@@ -26,6 +26,7 @@ from orchestrator.monitor.live import RECORDING, LiveView
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.plan import CampaignPlan
 from orchestrator.publish import publish
+from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.runs import create_run
 from orchestrator.states import State
 from sim_engine.extras import installed

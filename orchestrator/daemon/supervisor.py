@@ -17,7 +17,6 @@ from typing import Any
 
 from actors.protocols import LaboratoryError
 from actors.warm import WarmSimulators
-from orchestrator.campaign import CampaignResult
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.daemon.feed import Feed
 from orchestrator.daemon.notify import Counts
@@ -30,6 +29,7 @@ from orchestrator.errors import RunError
 from orchestrator.lanes import LaneError, PourUnknownError
 from orchestrator.monitor.live import LiveView
 from orchestrator.reserve import MB, free_space
+from orchestrator.run_result import CampaignResult
 from orchestrator.unknown import OperatorNeededError
 
 RETRY = 30.0

@@ -157,7 +157,7 @@ def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its
     import rerun.blueprint as rrb
 
     # From the side, a little above: the picture in docs/frames.md.
-    eye = rrb.EyeControls3D(position=(-0.05, -0.36, 0.2), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
+    eye = rrb.EyeControls3D(position=(-0.05, -0.42, 0.22), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
         origin=f"{under}/simulation",
         contents=[f"{under}/simulation/{what}" for what in ("pourer/**", "receiver/**", "liquid")],
@@ -191,7 +191,7 @@ def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/*
 def _shares() -> Any:
     import rerun.blueprint as rrb
 
-    axis = rrb.ScalarAxis(range=(0.0, 100.0))
+    axis = rrb.ScalarAxis(range=(-3.0, 104.0))
     return _recent("/simulation/share", "Simulated: where the liquid is [%]", 12.0, axis_y=axis)
 
 

@@ -218,7 +218,8 @@ class CampaignRecording:
             f"simulation {event.id} ({request.purpose}): {request.action.display('angular_velocity')}, "
             f"{100 * result.spilled:.1f} % spilled, {result.particles} particles"
         )
-        self._say(f"recorded {title}", source=event.stage)
+        shown = f"shown: simulation {event.id} ({request.purpose}), {100 * result.spilled:.1f} % spilled"
+        self._say(shown, source=event.stage)
         self._simulated.film(event.frames, self._scenes[request.scene], title, now=event.time, step=self._step)
 
     def _action(self, pour: Pour) -> str:

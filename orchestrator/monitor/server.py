@@ -68,10 +68,11 @@ def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence
         memory: that the server may keep for those who come late, as '512MiB'.
         shown: recordings that are opened from files.
     """
+    # Whoever comes late to a campaign wants what is going on, then what was; a file is shown from its beginning.
+    order = () if shown else ("--newest-first",)
     return [
         *(rerun_program(), "--serve-web", "--bind", address, "--port", str(port), "--web-viewer-port", str(web_port)),
-        # Not with --newest-first, which sends later arrangements of the views before earlier ones.
-        *("--server-memory-limit", memory, *shown),
+        *("--server-memory-limit", memory, *order, *shown),
     ]
 
 

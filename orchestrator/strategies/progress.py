@@ -21,12 +21,12 @@ class Progress:
 
     @property
     def simulations_left(self) -> int:
-        """That are still to be answered."""
+        """Simulations that are still to be answered."""
         return max(self.of_simulations - self.simulations, 0)
 
     @property
     def pours_left(self) -> int:
-        """That are still to be made."""
+        """Pours that are still to be made."""
         return max(self.of_pours - self.pours, 0)
 
     @property

@@ -46,7 +46,7 @@ class Foreseen(Learnt):
     """Mean and standard deviation of every fraction, of 'spillage' r = spilled / poured, and of the 'loss'."""
 
     band: Band | None = None
-    """In which r of a single pour lies; null where no simulation has an r."""
+    """The band in which r of a single pour lies; null where no simulation has an r."""
 
 
 class RepeatedSimulation:

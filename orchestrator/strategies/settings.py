@@ -145,7 +145,7 @@ class DeploymentSettings(StrategySettings):
 
     @property
     def order(self) -> Order:
-        """In which outcomes are told: 'completion' only where the clock takes part in the decisions."""
+        """The order in which outcomes are told: 'completion' only where the clock takes part in the decisions."""
         return "logical"
 
     @property

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pyarrow as pa
+
+from orchestrator.monitor.server import run_rerun
 
 
 class Contents:
@@ -31,3 +34,27 @@ class Contents:
     def rows(self, entity: str, timeline: str = "wall") -> int:
         """Rows of an entity on a timeline."""
         return len(self.columns[entity].get(timeline, ()))
+
+
+def tabs_as_they_came(path: Path) -> list[str]:
+    """Names of the tabs that the arrangements in an .rrd turn to, in the order in which a viewer takes them."""
+    from rerun.chunk import RrdReader
+
+    reader, turned = RrdReader(str(path)), {}
+    for store in reader.blueprints():
+        names: dict[str, str] = {}
+        active = ""
+        for chunk in reader.stream(store=store):
+            table = chunk.to_record_batch()
+            rows = {
+                name.rpartition(":")[2]: column.to_pylist()
+                for name, column in zip(table.schema.names, table.columns, strict=True)
+            }
+            names[str(chunk.entity_path).lstrip("/")] = (rows.get("display_name") or [[""]])[0][0]
+            active = (rows.get("active_tab") or [[active]])[0][0] or active
+        turned[store.recording_id] = names[active]
+    said = run_rerun("rrd", "print", str(path)).stdout
+    return [
+        turned[found]
+        for found in re.findall(r'BlueprintActivationCommand\(StoreId\(Blueprint, "[^"]*", "([^"]*)"', said)
+    ]

@@ -17,9 +17,10 @@ from orchestrator.commands.speaking import RefusalError
 from orchestrator.events import LogLine
 from orchestrator.monitor.live import LiveError, LiveView, answers
 from orchestrator.monitor.monitor import RerunMonitor
+from orchestrator.monitor.outlet import SENDING
 from tests.orchestrator import watched
 from tests.orchestrator.late_viewer import seen, viewer
-from tests.orchestrator.recorded import Contents
+from tests.orchestrator.recorded import Contents, tabs_as_they_came
 from tests.patience import PATIENCE
 
 EXPECTED = (
@@ -62,6 +63,26 @@ def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
     assert (monitor.failed, monitor.dropped) == (0, 0)
     # what is on disk is complete, whoever looked
     assert Contents(monitor.path).rows("/learning/narrow_cup/loss/measured") == 3
+
+
+def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_now(tmp_path: Path) -> None:
+    plan = watched.campaign()
+    with LiveView() as live:
+        monitor = live.watcher_for(plan, tmp_path)
+        told = list(watched.events(plan))[:-1]
+        for part in (told[:8], told[8:]):
+            for event in part:
+                monitor(event)
+            time.sleep(4.0 * SENDING)
+        assert monitor.close(PATIENCE)
+        with viewer(live.stream, tmp_path / "seen.rrd"):
+            contents = seen(
+                tmp_path / "seen.rrd",
+                lambda c: c.rows("/learning/narrow_cup/loss/measured") == 3 and c.rows("/log/campaign") > 0,
+            )
+    steps = contents.columns["/status"]["step"]
+    assert steps.index(max(steps)) < steps.index(min(steps)), "what is going on comes before what was"  # type: ignore[type-var]
+    assert tabs_as_they_came(tmp_path / "seen.rrd")[-2:] == ["Calibrating", "Deploying"]
 
 
 def test_two_campaigns_are_served_side_by_side(tmp_path: Path) -> None:

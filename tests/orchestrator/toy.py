@@ -19,7 +19,7 @@ import numpy as np
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
 from actors.protocols import PourProgress, ProgressCallback
 from actors.spec import LaboratorySpec
-from orchestrator.campaign import CampaignResult, run_campaign
+from orchestrator.campaign import run_campaign
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import CampaignPlan, OutputPlan
 from orchestrator.requests import (
@@ -36,6 +36,7 @@ from orchestrator.requests import (
     Suggested,
 )
 from orchestrator.results import Results, learnt_by
+from orchestrator.run_result import CampaignResult
 from orchestrator.stages import StageDefinition
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.progress import Progress

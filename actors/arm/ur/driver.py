@@ -79,11 +79,7 @@ class UrArm:
     # ---- nothing moves
 
     def connect(self) -> UrFacts:
-        """Find the robot, by a new worker. Nothing moves, and nothing may until `release`.
-
-        Raises:
-            ArmLostError: it can't be reached; ArmRefusedError: it is another robot than the settings say.
-        """
+        """See `Arm.connect`: by a new worker."""
         if not self._spec.address:
             raise ArmRefusedError("the arm has no address; give the controller's, or have a virtual one started")
         with self._at_work("connecting"):
@@ -91,7 +87,7 @@ class UrArm:
             return self._session.open()
 
     def facts(self) -> UrFacts:
-        """The robot as it is now; not during a motion."""
+        """See `Arm.facts`."""
         with self._at_work("asking for facts"):
             return self._session.find_out()
 
@@ -121,10 +117,7 @@ class UrArm:
         return Whereabouts(Pose(x, y, z, rx, ry, rz), joints, self._spec.home)
 
     def release(self) -> None:
-        """An operator consents to the next cycle: way there, pour, way back; or to one recovery, un-tilting or jog.
-
-        Consent ends with that, with any stop, refusal or loss, and with `lock` and `hands_in`.
-        """
+        """See `Arm.release`."""
         self._released_at = time.monotonic()
         self._stopped = False
 
@@ -133,17 +126,13 @@ class UrArm:
         self._released_at = None
 
     def hands_in(self) -> None:
-        """Before hands are invited into the cell: no program runs on the controller, and none will without `release`.
-
-        Raises:
-            ArmError: that can't be verified. Keep hands out.
-        """
+        """See `Arm.hands_in`: no program runs on the controller."""
         self.lock()
         with self._at_work("being made safe"):
             self._session.ask("hands_in")
 
     def state(self) -> ArmState:
-        """Where the arm is; answered at once, also during a motion."""
+        """See `Arm.state`."""
         leg, progress = self._leg, self._session.progress
         if leg is None:
             joints = () if progress is None else progress.joints
@@ -162,23 +151,12 @@ class UrArm:
     # ---- motions
 
     def move_to_start(self, path: PourPath) -> None:
-        """From home to where the pour begins, the pourer upright.
-
-        Raises:
-            ArmRefusedError: before anything moved; ArmStoppedError: on the way; ArmLostError.
-        """
+        """See `Arm.move_to_start`."""
         with self._at_work("moving"):
             self._go(Leg.of("approach", path.approach, self._spec))
 
     def execute(self, path: PourPath) -> ExecutedPath:
-        """Tilt, hold, return.
-
-        Returns:
-            What the arm's encoders say it did, sampled `spec.rate` times per second of the clock.
-
-        Raises:
-            ArmRefusedError: before anything moved; ArmStoppedError: on the way, tilted perhaps; ArmLostError.
-        """
+        """See `Arm.execute`; what the encoders say, sampled `spec.rate` times per second of the clock."""
         with self._at_work("pouring"):
             self._last_pour = path
             executed = self._go(Leg.of_pour(path))
@@ -186,11 +164,7 @@ class UrArm:
             return executed
 
     def retreat(self, path: PourPath) -> None:
-        """Home from the pour's end, or from wherever an upright pourer was stopped. Ends the operator's consent.
-
-        Raises:
-            ArmRefusedError: before anything moved; ArmStoppedError: on the way; ArmLostError.
-        """
+        """See `Arm.retreat`."""
         with self._at_work("retreating"):
             self._consent()
             way = way_home(path, np.array(self._joints()), self._spec)
@@ -198,14 +172,7 @@ class UrArm:
             self.lock()
 
     def untilt(self, path: PourPath | None = None) -> None:
-        """Bring a stopped pourer upright, slowly, the way it came. Ends the operator's consent.
-
-        Args:
-            path: the pour that was stopped; the last one by default.
-
-        Raises:
-            ArmRefusedError: before anything moved; ArmStoppedError: on the way; ArmLostError.
-        """
+        """See `Arm.untilt`."""
         with self._at_work("un-tilting"):
             self._consent()
             poured = path or self._last_pour
@@ -218,30 +185,14 @@ class UrArm:
             self.lock()
 
     def jog(self, axis: str, amount: float, speed: float) -> None:
-        """One small step, for setting up. Ends the operator's consent.
-
-        Args:
-            axis: 'joint 1' … 'joint 6', or of the tool in the base's axes: 'x', 'y', 'z', 'rx', 'ry', 'rz'.
-            amount: [rad], at most 10°; [m], at most 50 mm.
-            speed: [rad/s], [m/s].
-
-        Raises:
-            ArmRefusedError: before anything moved; ArmStoppedError: on the way; ArmLostError.
-        """
+        """See `Arm.jog`: at most 10°, or 50 mm."""
         with self._at_work("jogging"):
             self._consent()
             self._go(Leg.of("jog", jog_path(self._spec, self._joints(), axis, amount, speed), self._spec))
             self.lock()
 
     def recover(self) -> str:
-        """After a stop that an operator has looked into: unlock, switch on, connect anew. Needs and ends consent.
-
-        Returns:
-            What was done, for people.
-
-        Raises:
-            ArmRefusedError: something has to be done by hand first; ArmLostError.
-        """
+        """See `Arm.recover`: unlock, switch on, connect anew."""
         self._consent()
         self.lock()
         self.connect()
@@ -255,16 +206,8 @@ class UrArm:
     # ---- stopping
 
     def stop(self) -> float:
-        """Stop, now, whatever is going on, and see the arm stand. Nothing moves until `release`.
-
-        Three means, one after the other: an order that the running program looks for in every cycle; the dashboard,
-        over a connection of its own; an end of the heartbeat.
-
-        Returns:
-            Time from the call to standstill [s]; 0 if nothing was moving.
-
-        Raises:
-            ArmLostError: the arm could not be seen to stand.
+        """See `Arm.stop`. Three means, one after the other: an order that the running program looks for in every cycle;
+        the dashboard, over a connection of its own; an end of the heartbeat.
         """
         asked = time.monotonic()
         self._stopped = True
@@ -291,7 +234,7 @@ class UrArm:
             stop_program(self._spec.address, 0.5)
 
     def close(self) -> None:
-        """Stop, and let the robot go."""
+        """See `Arm.close`."""
         if self._stops.under_way:
             with contextlib.suppress(ArmError):
                 self.stop()

@@ -14,7 +14,7 @@ TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
 """How far the controller's TCP may be from the file's [m], [rad]."""
 
 PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
-"""Likewise of the payload [kg] and its centre [m]."""
+"""How far its payload [kg] and its payload's centre [m] may be."""
 
 MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
 """How far up may be from where the file says [rad]: the tool's accelerometer is not a level. [m/s²]"""

@@ -36,7 +36,7 @@ class Leg:
         """A way of one phase.
 
         Raises:
-            ArmRefusedError: it is no path.
+            ArmRefusedError: it is not a path.
         """
         path = checked(path)
         return cls(path, ((name, 0.0, path.duration),), leans(path.joints, spec))
@@ -46,7 +46,7 @@ class Leg:
         """A pour's tilt, hold and return.
 
         Raises:
-            ArmRefusedError: it is no path.
+            ArmRefusedError: it is not a path.
         """
         if path.tilts.shape != path.pour.times.shape or not path.phases:
             raise ArmRefusedError("a pour's path has a tilt for each of its times, and phases")

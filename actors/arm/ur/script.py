@@ -96,7 +96,7 @@ def path_program(path: JointPath, settings: Settings, number: int, *, cb3: bool)
         cb3: the controller is of the older generation, which can't be asked for its cycle.
 
     Raises:
-        ArmRefusedError: there are too many points, or it is no path.
+        ArmRefusedError: there are too many points, or it is not a path.
     """
     points = thinned(checked(path))
     if len(points.times) > MOST_POINTS:

@@ -36,7 +36,7 @@ UPLOAD_TIME, STANDING_TIME = 5.0, 3.0
 """Longest wait for a program to say that it is ready, and for the arm to stand [s of the clock]."""
 
 OVERTIME = 10.0
-"""By which a path may take longer than planned [s of controller time]."""
+"""How much longer than planned a path may take [s of controller time]."""
 
 BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 OWNER_SILENCE = 3.0

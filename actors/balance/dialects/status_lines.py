@@ -38,7 +38,7 @@ def decode(line: bytes) -> Reply:
         line: without its CR LF.
 
     Raises:
-        LineError: it is no such line.
+        LineError: it is not such a line.
     """
     text = text_of(line)
     if text is None:

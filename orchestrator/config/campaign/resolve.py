@@ -11,7 +11,7 @@ from orchestrator.config.campaign.resolve_deployment import resolve_deployment
 from orchestrator.config.campaign.scenes import SceneBuilder
 from orchestrator.config.campaign.searched import check_ranges
 from orchestrator.config.campaign.sections import CampaignFile
-from orchestrator.config.motion import ParametersBase
+from orchestrator.config.parameters import ParametersBase
 from orchestrator.config.yaml.files import resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.source import Place, Report

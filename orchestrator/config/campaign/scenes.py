@@ -9,7 +9,8 @@ from typing import Any
 from actors.optimizer.core.problem import Linear
 from orchestrator.config.campaign.constraints import parse_constraint
 from orchestrator.config.campaign.sections import CampaignFile
-from orchestrator.config.motion import EXAMPLES, ActionsBase, MotionBase
+from orchestrator.config.motion import ActionsBase, MotionBase
+from orchestrator.config.ranges import EXAMPLES
 from orchestrator.config.yaml.errors import dotted
 from orchestrator.config.yaml.quantities import QuantityError
 from orchestrator.config.yaml.references import References

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from orchestrator.config.campaign.sections import CampaignFile
-from orchestrator.config.motion import EXAMPLES, ParameterRangeSection, ParametersBase
+from orchestrator.config.parameters import ParameterRangeSection, ParametersBase
+from orchestrator.config.ranges import EXAMPLES
 from orchestrator.config.yaml.source import Place, Report
 from orchestrator.strategies.doors import calibrations
 

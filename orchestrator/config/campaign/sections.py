@@ -10,7 +10,7 @@ from pydantic import Field, create_model
 from orchestrator.config.laboratory.sections import LaboratoryFile
 from orchestrator.config.motion import Actions as ActionsModel
 from orchestrator.config.motion import Motion as MotionModel
-from orchestrator.config.motion import Parameters as ParametersModel
+from orchestrator.config.parameters import Parameters as ParametersModel
 from orchestrator.config.vessel import LiquidFile, VesselFile
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import (

@@ -129,10 +129,10 @@ class LimitsSection(Section):
     required: ClassVar[dict[str, str]] = {"box": "{low: {x: …, y: …, z: …}, high: {x: …, y: …, z: …}}"}
 
     box: BoxSection | None = None
-    """That tool and pourer stay in."""
+    """The box that tool and pourer stay in."""
 
     planes: tuple[PlaneSection, ...] = ()
-    """That tool and pourer stay on one side of."""
+    """Planes that tool and pourer stay on one side of."""
 
     joint_speed: Speed = _LIMITS.joint_speed
     """Largest speed of any joint; the robot's own limits hold besides."""
@@ -199,16 +199,16 @@ class UrArmSection(ArmSettings):
     """Speed of the fastest joint between home and pour."""
 
     approach_acceleration: Acceleration = _ARM.approach_acceleration
-    """Likewise."""
+    """Acceleration of the fastest joint there."""
 
     untilt_speed: Speed = _ARM.untilt_speed
-    """At which a stopped, tilted pourer is brought upright."""
+    """The speed at which a stopped, tilted pourer is brought upright."""
 
     announcement: Annotated[float, Quantity("s", "3 s", 0.0, 60.0)] = _ARM.announcement
     """From the operator's consent to the first movement."""
 
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = _ARM.rate
-    """At which the joints are read back."""
+    """The rate at which the joints are read back."""
 
     def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> UrArmSpec | None:
         """See `ArmSettings.resolve`."""

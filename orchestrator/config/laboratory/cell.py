@@ -39,7 +39,7 @@ class CellSection(Section):
     """Where the middle of the receiver's underside stands, in the room's frame."""
 
     direction: Angle | None = None
-    """That the liquid is poured in, seen from above: 0 along the room's x, 90 deg along its y."""
+    """The direction that the liquid is poured in, seen from above: 0 along the room's x, 90 deg along its y."""
 
     table: Length = 0.0
     """Height of the surface that nothing may go below, in the room's frame."""

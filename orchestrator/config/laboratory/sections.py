@@ -16,7 +16,7 @@ from orchestrator.config.laboratory.balance import any_balance, resolve_balance
 from orchestrator.config.laboratory.cell import CellSection
 from orchestrator.config.laboratory.cluster import RaySection, resolve_ray
 from orchestrator.config.laboratory.operator import OperatorSection, resolve_operator
-from orchestrator.config.motion import parameter_quantity
+from orchestrator.config.parameters import parameter_quantity
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import MADE, Count, Name, Section, Switch, tagged

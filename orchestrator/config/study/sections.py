@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from orchestrator.config.laboratory.sections import HiddenLiquid, LaboratoryFile
 from orchestrator.config.load import load_campaign
-from orchestrator.config.motion import Parameters, ParametersBase
+from orchestrator.config.parameters import Parameters, ParametersBase
 from orchestrator.config.pose import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.study.arms import CalibrationsSection, DeploymentsSection
 from orchestrator.config.study.resolve import bench_of, calibration_arms, deployment_arms, levels_of, written_levels

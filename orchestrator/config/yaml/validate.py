@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from orchestrator.config.motion import EXAMPLES
+from orchestrator.config.ranges import EXAMPLES
 from orchestrator.config.yaml.errors import did_you_mean
 from orchestrator.config.yaml.quantities import FROM_FILE
 from orchestrator.config.yaml.sections import Section

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
 from typing import Any, Generic, TypeVar, cast
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
@@ -15,7 +13,6 @@ from orchestrator.requests import (
     Failed,
     Outcome,
     Pour,
-    Poured,
     Prediction,
     Request,
     Simulate,
@@ -28,15 +25,14 @@ from orchestrator.strategies.deployment.compromise import Compromise
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.deployment.pours import Foretold, PourTrial, former_pours, trust
+from orchestrator.strategies.deployment.pours import Foretold, PourTrial, expecting, former_pours, trust
 from orchestrator.strategies.deployment.settings import SearchSettings
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
-from orchestrator.strategies.display import displayed_action, displayed_map
+from orchestrator.strategies.display import displayed_map
 from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.settings import DeploymentSettings
-from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial, Trials
 from sim_engine.action import Action, described
 from sim_engine.liquid import SimulationParameters
@@ -126,7 +122,10 @@ class Deployment(ABC, Generic[S]):
                 self._trials.settle(request, self._compromise.note(request, vector))
         elif request == self._pouring:
             self._pouring = None
-            self._weigh(self._pours[-1], outcome)
+            trial = self._pours[-1]
+            trial.take(outcome, self._scene, self._costing, penalised=self._settings.on_failed_pour == "penalise")
+            if trial.status == "weighed" and trial.cost is not None:
+                self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
         else:
             raise ValueError(f"this pour was not asked for: {request}")
 
@@ -138,26 +137,6 @@ class Deployment(ABC, Generic[S]):
     @abstractmethod
     def _next(self, free_simulations: int) -> None:
         """Put the next question, or finish. Called where `_may_think` and no pour is queued."""
-
-    def _weigh(self, trial: PourTrial, outcome: Outcome) -> None:
-        match outcome:
-            case Poured(measurement) if not is_sound(measurement.fractions):
-                trial.status, trial.reason = "failed", "weighing: the balance gave no numbers"
-            case Poured(measurement):
-                trial.vector = self._costing.poured(measurement, self._scene.action(trial.values))
-                trial.cost, trial.status = self._costing.total(trial.vector), "weighed"
-                trial.measurement = measurement
-                self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
-                return
-            case Failed("invalid_action", reason):
-                trial.status, trial.reason = "refused", reason
-            case Failed(kind, reason):
-                trial.status, trial.reason = "failed", f"{kind}: {reason}"
-                trial.mishap = kind == "pour_failed"
-            case _:
-                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
-        if trial.status == "failed" and self._settings.on_failed_pour == "penalise":
-            trial.cost, trial.vector = self._costing.worst, self._costing.worst_vector
 
     # -- pieces for subclasses -------------------------------------------------------------------------------------
 
@@ -182,15 +161,7 @@ class Deployment(ABC, Generic[S]):
         action = self._scene.action(values)
         self._queued_pour = Pour(self._scene.name, action, trial.number, self._seeds.next(), prediction)
         text = f"pour {trial.number}/{self._plan.pours}  {described(values)}"
-        if prediction is None:
-            self.decisions.append(Decision(text))
-        else:
-            expected = {"mean": prediction.mean, "sd": prediction.deviation}
-            text += f"  predicted {max(prediction.mean, 0.0):.4g} ± {prediction.deviation:.2g}"
-            if prediction.scatter is not None:
-                expected["scatter"] = prediction.scatter
-                text += f", a pour scatters by {prediction.scatter:.2g}"
-            self.decisions.append(Decision(text, expected))
+        self.decisions.append(Decision(text) if prediction is None else expecting(text, prediction))
 
     def _pour_first(self, suggestion: Suggestion) -> None:
         """Queue a pour of the first suggested point, with the surrogate's prediction where there is one."""
@@ -264,20 +235,10 @@ class Deployment(ABC, Generic[S]):
         if not self._compromise.wanted or self._compromise.front is not None:
             self._finished = True
             return
-        simulated, poured = self._compromise.of(self._trials.counting(everything=True)), self._poured
-        candidates = self._compromise.candidates([*simulated, *poured])
-        answers: dict[int, Suggestion] = {}
-
-        def answered(j: int, suggestion: Suggestion) -> None:
-            answers[j] = suggestion
-            if len(answers) == len(self._compromise.names):
-                self._compromise.settle(candidates, [answers[k] for k in sorted(answers)], self._plan.actions)
-                self._finished = True
-
-        for j in range(len(self._compromise.names)):
-            problem = self._front_problem(_objective(simulated, j), _objective(poured, j))
-            problem = replace(problem, count=0, predict_at=tuple(candidates))
-            self._questions.put(problem, "front", partial(answered, j))
+        simulated = self._compromise.of(self._trials.counting(everything=True))
+        self._compromise.look_for_front(
+            simulated, self._poured, self._plan.actions, self._front_problem, self._questions, self._finish
+        )
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
         """How one objective is regressed: of the simulations, unless a strategy pours."""
@@ -285,15 +246,13 @@ class Deployment(ABC, Generic[S]):
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         text = f"{what}  {described(values)}"
-        if suggestion.means and self._compromise.exploring:
-            self.decisions.append(Decision(f"{text}  (a compromise under random weights)"))
-        elif suggestion.means:
-            mean, deviation = suggestion.means[index], suggestion.deviations[index]
-            self.decisions.append(
-                Decision(f"{text}  predicted {max(mean, 0.0):.4g} ± {deviation:.2g}", {"mean": mean, "sd": deviation})
-            )
+        if not suggestion.means:
+            found = Decision(f"{text}  (no surrogate yet)")
+        elif self._compromise.exploring:
+            found = Decision(f"{text}  (a compromise under random weights)")
         else:
-            self.decisions.append(Decision(f"{text}  (no surrogate yet)"))
+            found = expecting(text, Prediction(suggestion.means[index], suggestion.deviations[index]))
+        self.decisions.append(found)
 
     def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
         """A question about the loss.
@@ -371,20 +330,8 @@ class Deployment(ABC, Generic[S]):
 
     def _recommended(self, final: Suggestion) -> Recommended | None:
         """What the last answer recommends, and what to expect of it."""
-        if final.best_point is None or final.best_mean is None or final.best_deviation is None:
-            return None
-        values = self._plan.actions.decode(final.best_point)
-        spillage = self._spillage(final.best_point)
-        return Recommended(
-            action=displayed_action(values),
-            action_si=values,
-            predicted_loss=final.best_mean,
-            predicted_deviation=final.best_deviation,
-            predicted_scatter=self._scatter(final, final.best_noise),
-            predicted_spillage=None if spillage is None else spillage.mean,
-            predicted_spillage_deviation=None if spillage is None else spillage.deviation,
-            hyperparameters=final.hyperparameters,
-        )
+        spillage = None if final.best_point is None else self._spillage(final.best_point)
+        return Recommended.of(final, self._plan.actions, self._scatter(final, final.best_noise), spillage)
 
     def _spillage(self, point: Point) -> Spread | None:
         """r = spilled / poured over the simulations of an action, where they are kept."""
@@ -397,8 +344,3 @@ class Deployment(ABC, Generic[S]):
     def _window_found(self) -> WindowFound | None:
         """How far the recommended action may be missed."""
         return None
-
-
-def _objective(observed: Sequence[tuple[Point, Vector]], index: int) -> Data:
-    """One objective alone."""
-    return Data(tuple(point for point, _ in observed), tuple(vector[index] for _, vector in observed))

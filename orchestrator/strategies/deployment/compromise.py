@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from actors.optimizer.core.problem import Data, Point, Suggestion
+from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
 from orchestrator.requests import Simulate
+from orchestrator.strategies.asking import Questions
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.front import random_weights, scalarised, undominated
 from orchestrator.strategies.deployment.learnt import FrontAction
@@ -81,12 +84,40 @@ class Compromise:
         known = [vector for _, vector in among]
         return Data(points, tuple(scalarised(vectors, self._weights, self._costing.limits, known)))
 
-    def candidates(self, observed: Observed) -> list[Point]:
+    def look_for_front(
+        self,
+        simulated: Observed,
+        poured: Observed,
+        actions: Space,
+        problem: Callable[[Data, Data], SuggestProblem],
+        questions: Questions,
+        then: Callable[[], None],
+    ) -> None:
+        """Put a question for each objective, about the tried actions; their answers make the front.
+
+        Args:
+            problem: how one objective is regressed, given what was simulated and what was poured of it.
+            then: called once the front is known.
+        """
+        candidates = self._candidates([*simulated, *poured])
+        answers: dict[int, Suggestion] = {}
+
+        def answered(j: int, suggestion: Suggestion) -> None:
+            answers[j] = suggestion
+            if len(answers) == len(self.names):
+                self._settle(candidates, [answers[k] for k in sorted(answers)], actions)
+                then()
+
+        for j in range(len(self.names)):
+            question = replace(problem(_one(simulated, j), _one(poured, j)), count=0, predict_at=tuple(candidates))
+            questions.put(question, "front", partial(answered, j))
+
+    def _candidates(self, observed: Observed) -> list[Point]:
         """Tried actions that may be on the front: those that delivered enough."""
         limits = np.array(self._costing.limits) + 1e-9
         return list(dict.fromkeys(point for point, vector in observed if np.all(np.array(vector) <= limits)))
 
-    def settle(self, candidates: Sequence[Point], answers: Sequence[Suggestion], actions: Space) -> None:
+    def _settle(self, candidates: Sequence[Point], answers: Sequence[Suggestion], actions: Space) -> None:
         """The front among the candidates, by each objective's posterior mean."""
         if any(len(answer.predictions) != len(candidates) for answer in answers):
             self.front = []  # too little was observed for a surrogate
@@ -105,3 +136,8 @@ class Compromise:
                     deviations=dict(zip(self.names, deviations, strict=True)),
                 )
             )
+
+
+def _one(observed: Observed, index: int) -> Data:
+    """One objective alone."""
+    return Data(tuple(point for point, _ in observed), tuple(vector[index] for _, vector in observed))

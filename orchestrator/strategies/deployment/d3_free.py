@@ -18,7 +18,7 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
 MOST_SIMULATIONS = 200
-"""That one question carries: more would keep the arm waiting."""
+"""Simulations that one question carries: more would keep the arm waiting."""
 
 FRESH_FITS = 40
 """Observations up to which hyperparameters are looked for afresh: it is quick, and the last ones may be a bad start."""

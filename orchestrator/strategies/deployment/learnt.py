@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from actors.optimizer.core.problem import Suggestion
 from orchestrator.strategies.deployment.adaptive import Believed, BenchFound
 from orchestrator.strategies.deployment.pours import Foretold, PourRow
 from orchestrator.strategies.deployment.trust import Compared
 from orchestrator.strategies.deployment.window import WindowFound
-from orchestrator.strategies.display import DisplayedMap
+from orchestrator.strategies.display import DisplayedMap, displayed_action
 from orchestrator.strategies.learnt import Learnt, Part
+from sim_engine.space import Space
+from sim_engine.spread import Spread
 
 
 class Recommended(Part):
@@ -39,6 +42,32 @@ class Recommended(Part):
 
     hyperparameters: dict[str, float] | None = None
     """Those of the surrogate."""
+
+    @classmethod
+    def of(
+        cls, final: Suggestion, actions: Space, scatter: float | None, spillage: Spread | None
+    ) -> Recommended | None:
+        """What the last answer recommends; None if it does not.
+
+        Args:
+            final: the answer.
+            actions: space that was searched.
+            scatter: of a single pour.
+            spillage: r of its simulations, where they are kept.
+        """
+        if final.best_point is None or final.best_mean is None or final.best_deviation is None:
+            return None
+        values = actions.decode(final.best_point)
+        return cls(
+            action=displayed_action(values),
+            action_si=values,
+            predicted_loss=final.best_mean,
+            predicted_deviation=final.best_deviation,
+            predicted_scatter=scatter,
+            predicted_spillage=None if spillage is None else spillage.mean,
+            predicted_spillage_deviation=None if spillage is None else spillage.deviation,
+            hyperparameters=final.hyperparameters,
+        )
 
 
 class RiskFound(Part):

@@ -106,7 +106,7 @@ class Time(Objective):
         return duration(action) / self.scale
 
     def worst(self, scene: Scene, actions: Space) -> float:
-        """That of the slowest corner of the action space."""
+        """The duration of the slowest corner of the action space."""
         corners = itertools.product((0.0, 1.0), repeat=actions.dimension)
         return max(duration(scene.action(actions.decode(corner))) for corner in corners) / self.scale
 

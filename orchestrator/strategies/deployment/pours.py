@@ -9,11 +9,12 @@ from typing import Literal
 
 from actors.optimizer.core.problem import Point
 from orchestrator.plan import ExistingPours
-from orchestrator.requests import Prediction
+from orchestrator.requests import Decision, Failed, Outcome, Poured, Prediction
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.display import displayed_action
 from orchestrator.strategies.learnt import Part
+from orchestrator.strategies.sound import is_sound
 from sim_engine.liquid import Liquid
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
@@ -109,6 +110,35 @@ class PourTrial:
     measurement: PourMeasurement | None = None
     vector: Vector | None = None
 
+    def take(self, outcome: Outcome, scene: Scene, costing: Costing, *, penalised: bool) -> None:
+        """What came of it.
+
+        Args:
+            outcome: the answer to its request.
+            scene: it was made in.
+            costing: says what it cost.
+            penalised: a failed one enters the data with the worst cost, else not at all.
+
+        Raises:
+            ValueError: no pour is answered so.
+        """
+        match outcome:
+            case Poured(measurement) if not is_sound(measurement.fractions):
+                self.status, self.reason = "failed", "weighing: the balance gave no numbers"
+            case Poured(measurement):
+                self.vector = costing.poured(measurement, scene.action(self.values))
+                self.cost, self.status = costing.total(self.vector), "weighed"
+                self.measurement = measurement
+            case Failed("invalid_action", reason):
+                self.status, self.reason = "refused", reason
+            case Failed(kind, reason):
+                self.status, self.reason = "failed", f"{kind}: {reason}"
+                self.mishap = kind == "pour_failed"
+            case _:
+                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+        if self.status == "failed" and penalised:
+            self.cost, self.vector = costing.worst, costing.worst_vector
+
     def row(self, objectives: tuple[str, ...], liquid: Liquid) -> PourRow:
         """As results have it; `objectives` are their names, where there are any, `liquid` is what was poured."""
         weighed, predicted = self.measurement, self.predicted
@@ -129,6 +159,16 @@ class PourTrial:
             delivered_g=None if weighed is None else weighed.delivered * 1e3,
             delivered_ml=None if weighed is None else liquid.millilitres(weighed.delivered),
         )
+
+
+def expecting(text: str, prediction: Prediction) -> Decision:
+    """A decision with what is expected of it, in words and numbers."""
+    expected = {"mean": prediction.mean, "sd": prediction.deviation}
+    text += f"  predicted {max(prediction.mean, 0.0):.4g} ± {prediction.deviation:.2g}"
+    if prediction.scatter is not None:
+        expected["scatter"] = prediction.scatter
+        text += f", a pour scatters by {prediction.scatter:.2g}"
+    return Decision(text, expected)
 
 
 def former_pours(

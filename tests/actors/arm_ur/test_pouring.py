@@ -83,25 +83,6 @@ def test_a_payload_that_the_controller_refuses_keeps_the_arm_still(make_rig: Mak
     assert rig.moved(began) == 0.0
 
 
-@pytest.mark.realtime
-def test_state_is_answered_at_once_during_a_pour(rig: Rig) -> None:
-    pouring = rig.pouring()
-    rig.await_phase("tilt")
-    seen, longest = [], 0.0
-    while pouring.is_alive():
-        asked = time.monotonic()
-        seen.append(rig.arm.state())
-        longest = max(longest, time.monotonic() - asked)
-        time.sleep(0.01)
-    pouring.result()
-    assert longest < 0.2
-    fractions = [state.fraction for state in seen if state.moving]
-    assert fractions == sorted(fractions)
-    assert {state.phase for state in seen} >= {"tilt", "return"}
-    assert max(state.tilt for state in seen) > 0.5
-    assert not rig.arm.state().moving
-
-
 # ---- consent
 
 
@@ -115,15 +96,6 @@ def test_nothing_moves_before_an_operator_has_released_the_arm(resting: Rig) -> 
     with pytest.raises(ArmNotReleasedError):
         resting.arm.recover()
     assert resting.fault("state")["messages"] == []  # not even a program was started
-
-
-@pytest.mark.realtime
-def test_consent_is_for_one_cycle(rig: Rig) -> None:
-    rig.to_start()
-    rig.arm.execute(rig.path)
-    rig.arm.retreat(rig.path)
-    with pytest.raises(ArmNotReleasedError):
-        rig.arm.move_to_start(rig.path)
 
 
 @pytest.mark.realtime

@@ -81,14 +81,6 @@ def test_a_stop_while_tilting_takes_effect_at_once_and_can_be_untilted(make_rig:
     rig.arm.stop()  # not before the slow part: un-tilting 25 deg takes three seconds
 
 
-@pytest.mark.realtime
-def test_a_stop_of_an_arm_that_stands_locks_it(resting: Rig) -> None:
-    resting.arm.release()
-    assert resting.arm.stop() == 0.0
-    with pytest.raises(ArmNotReleasedError):
-        resting.arm.move_to_start(resting.path)
-
-
 @pytest.mark.slow  # what follows protective stops is the same, and is tried in every phase below
 @pytest.mark.parametrize("phase", ["tilt", "hold", "return"])
 def test_after_a_stop_in_any_phase_the_pourer_is_brought_upright_slowly(make_rig: Make, phase: str) -> None:

@@ -6,15 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.balance.placement import (
-    Placement,
-    Weighed,
-    WeighingError,
-    measurement,
-    needed,
-    weighing_uncertainty,
-    weighings,
-)
+from actors.balance.masses import Weighed, WeighingError, measurement, weighing_uncertainty
+from actors.balance.placement import Placement, needed, weighings
 
 GRAM = 1e-3
 EMPTY_POURER, EMPTY_RECEIVER, TRAY = 0.0873, 0.1421, 0.4096

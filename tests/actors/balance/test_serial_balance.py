@@ -35,14 +35,6 @@ def test_a_step_that_is_not_one_of_the_last_digit_is_taken_from_the_settings(dri
     assert balance.weigh().step == 5e-4
 
 
-def test_less_than_nothing_is_weighed_too(driver, each_dialect):
-    far, balance = driver(each_dialect)
-    far.put(0.2)
-    balance.tare()
-    far.put(0.0)
-    assert balance.weigh().mass == pytest.approx(-0.2, abs=1e-9)
-
-
 def test_zero_takes_drift_away_where_there_is_a_command_for_it(driver, each_dialect):
     far, balance = driver(each_dialect)
     far.put(0.05)

@@ -18,21 +18,6 @@ from .conftest import spec_for
 
 
 @pytest.mark.realtime
-def test_an_interrupt_ends_a_wait_and_resume_lets_it_last_again(driver, each_dialect):
-    far, balance = driver(each_dialect, settling=SettlingRule(deadline=200.0))
-    balance.connect()
-    far.faults(restless=True)
-    threading.Timer(0.2, balance.interrupt).start()
-    started = time.monotonic()
-    with pytest.raises(BalanceError, match="interrupted"):
-        balance.weigh()
-    assert time.monotonic() - started < 1.0
-    balance.resume()
-    far.faults(restless=False)
-    assert balance.weigh().mass == 0.0
-
-
-@pytest.mark.realtime
 def test_an_interrupt_ends_the_wait_for_an_answer_too(driver):
     far, balance = driver("kcp", answer_time=10.0)
     balance.connect()

@@ -56,14 +56,6 @@ def test_a_display_in_motion_is_not_called_stable():
     assert weight.mass == pytest.approx(0.1, abs=2e-4)
 
 
-def test_tare_counts_what_is_on_the_tray_as_nothing():
-    device = balance(noise=0.0)
-    on_tray(device, 0.35)
-    device.tare()
-    on_tray(device, 0.35 + 0.0042)
-    assert device.weigh().mass == pytest.approx(0.0042, abs=1.5e-4)
-
-
 def test_zero_drifts_with_time_and_a_new_tare_takes_it_away():
     device = balance(noise=0.0, drift=1e-5)
     device.tare()

@@ -8,7 +8,8 @@ import pytest
 
 from actors.balance.actor import DeviceBalance
 from actors.balance.errors import ReferenceLostError
-from actors.balance.placement import Placement, WeighingError
+from actors.balance.masses import WeighingError
+from actors.balance.placement import Placement
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.spec import BalanceSpec
 from actors.balance.weighing import Weighings

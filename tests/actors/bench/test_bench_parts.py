@@ -9,9 +9,9 @@ import pytest
 
 from actors.arm.joint_path import ExecutedPath, pack, unpack
 from actors.balance.placement import Placement, weighings
+from actors.bench.executed import LONGEST_REST, executed_pour
 from actors.bench.questions import NobodyAnsweredError, Questions
 from actors.bench.things import POURER, RECEIVER, TRAY, Things
-from actors.bench.virtual_bench import LONGEST_REST, executed_pour
 from actors.bench.virtual_operator import Hands, PlayedOperator
 from actors.operator import OperatorSpec, Question
 from actors.protocols import Notice

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from actors.arm.numbers import NumbersSpec
-from actors.bench.virtual_bench import slipped
+from actors.bench.executed import slipped
 from actors.protocols import UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.sampled_motion import SampledMotion

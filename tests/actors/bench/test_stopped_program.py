@@ -23,7 +23,8 @@ def look(progress):
         print("tilts", flush=True)
 
 async def play():
-    async with InProcessLaboratory(here["wired_spec"](pace={PACE}, hurried=True), here["Trickle"]) as laboratory:
+    spec = here["wired_spec"](pace={PACE}, hurried=True)
+    async with InProcessLaboratory(spec, here["Trickle"], need_bench=True) as laboratory:
         slowly = here["ACTION"].with_values(angular_velocity=0.4, return_velocity=0.4)
         for seed in (5, 6):
             action = slowly if seed == 5 else here["ACTION"]

@@ -102,9 +102,7 @@ def test_each_thing_that_is_wrong_is_one_error(tmp_path: Path, deployment: dict[
 
 
 def test_a_posterior_that_nobody_makes_is_refused_before_anything_starts(tmp_path: Path) -> None:
-    options = campaigns.RunOptions(
-        resume=False, run_id=None, answer=None, in_process=True, laboratory=None, seed=None, as_json=False, armed=False
-    )
+    options = campaigns.RunOptions(in_process=True)
     path = written(tmp_path, {"risk": RISK}, outputs={"directory": str(tmp_path / "runs")})
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     del content["calibration"]

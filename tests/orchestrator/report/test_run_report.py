@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from actors.optimizer.actor import Proposer
 from actors.protocols import LaboratoryError
-from orchestrator.campaign import CampaignResult, run_campaign
+from orchestrator.campaign import run_campaign
 from orchestrator.cli import app
 from orchestrator.commands.interrupted import report_of_what_stands
 from orchestrator.config.load import load_campaign
@@ -27,6 +27,7 @@ from orchestrator.publish import Published, publish, summary_of
 from orchestrator.report import style
 from orchestrator.report.record import read_record
 from orchestrator.report.run_page import run_page
+from orchestrator.run_result import CampaignResult
 from orchestrator.runs import create_run
 from tests.end_to_end.small import CAMPAIGN, write_campaign
 from tests.orchestrator.toy import ToyBench, ToyLaboratory

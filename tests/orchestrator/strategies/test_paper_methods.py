@@ -112,19 +112,7 @@ def test_noise_makes_no_draws_of_theta_for_a_deployment_under_risk(folder: Path)
     text = DEPLOYED.replace("strategy: D3", keys).replace("pours: 15", "pours: 1")
     path = write(folder, "campaign.yaml", text.replace("simulations: 20", "simulations: 20\n  averaging: noise"))
     with pytest.raises(RefusalError, match="draws of θ, which no surrogate makes that takes actions for noise"):
-        run(
-            path,
-            RunOptions(
-                resume=False,
-                run_id=None,
-                answer=None,
-                in_process=True,
-                laboratory=None,
-                seed=None,
-                as_json=False,
-                armed=False,
-            ),
-        )
+        run(path, RunOptions(in_process=True))
 
 
 # -- studies -----------------------------------------------------------------------------------------------------------

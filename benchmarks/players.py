@@ -1,0 +1,103 @@
+"""What benchmarks that play strategies on numbers share: a scene, answers to a strategy, means with intervals."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from optimiser_problems import Floats
+
+from actors.optimizer.core.propose import propose
+from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
+from orchestrator.strategies.protocol import Strategy
+from sim_engine.action import DEG
+from sim_engine.liquid import Liquid
+from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.space import Axis, Space
+from sim_engine.task import Scene
+from sim_engine.vessel.spec import cylinder
+
+AXES = (
+    Axis("angular_velocity", 15 * DEG, 120 * DEG),
+    Axis("x_offset", 0.08, 0.15),
+    Axis("height", 0.03, 0.1),
+    Axis("max_angle", 70 * DEG, 125 * DEG),
+)
+SCENE = Scene(
+    "cup",
+    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
+    cylinder("cup", inner_radius=0.03, inner_height=0.08),
+    Liquid(mass=0.2),
+    fixed={"height": 0.03},
+)
+
+
+def play(strategy: Strategy, answer: Callable[[Request], Outcome], *, pours_last: bool = True) -> None:
+    """From the first question to the last answer; the optimiser answers its own.
+
+    Args:
+        strategy: to be played.
+        answer: what comes of a simulation or a pour.
+        pours_last: a pour takes longest; else all is answered in the order of asking.
+    """
+    waiting: list[Request] = []
+    while not strategy.finished:
+        busy = sum(isinstance(one, Simulate) for one in waiting), sum(isinstance(one, Pour) for one in waiting)
+        waiting += strategy.ask(Slots(1 - busy[0], 1 - busy[1]))
+        if pours_last:
+            waiting.sort(key=lambda one: isinstance(one, Pour))
+        request = waiting.pop(0)
+        outcome = Suggested(propose(request.problem)) if isinstance(request, Suggest) else answer(request)
+        strategy.tell(request, outcome)
+
+
+def simulated(spilled: float, seed: int, cpu_s: float = 1.0) -> PourOutcome:
+    """A simulated pour that spills so much of the load (within 0 … 1), and leaves nothing behind."""
+    spilled = min(max(spilled, 0.0), 1.0)
+    return PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, cpu_s, seed)
+
+
+def unit(space: Space, action: Any) -> Floats:
+    """The point of the unit cube that an action is."""
+    return space.encode({name: getattr(action, name) for name in space.names})
+
+
+@dataclass
+class Numbers:
+    """A world of numbers that answers simulations and pours, at points of the unit cube.
+
+    Attributes:
+        true: what a pour loses.
+        observed: the same as weighed, of the pour with that number.
+        simulated: what the simulator says in the mean.
+        scatter: its scatter from seed to seed.
+        poured: what the pours have lost, without scatter.
+    """
+
+    space: Space
+    true: Callable[[Floats], float]
+    observed: Callable[[Floats, int], float]
+    simulated: Callable[[Floats], float]
+    scatter: float
+    poured: list[float] = field(default_factory=list)
+
+    def answer(self, request: Request) -> Outcome:
+        """What comes of a simulation or a pour."""
+        assert isinstance(request, Simulate | Pour)
+        at = unit(self.space, request.action)
+        if isinstance(request, Pour):
+            spilled = self.observed(at, len(self.poured))
+            self.poured.append(self.true(at))
+            return Poured(PourMeasurement(0.2, 0.2 * spilled, 0.0))
+        chance = self.scatter * float(np.random.default_rng(request.seed).standard_normal())
+        return Simulated(simulated(self.simulated(at) + chance, request.seed))
+
+
+def interval(values: list[float]) -> tuple[float, float, float]:
+    """Mean, and its 95 % bootstrap interval."""
+    draws = random.Random(0)
+    means = sorted(float(np.mean(draws.choices(values, k=len(values)))) for _ in range(2000))
+    return float(np.mean(values)), means[50], means[1949]
