@@ -2,7 +2,7 @@
 
 Step: move the pourer, predict, sweep against the walls, refresh neighbour lists if needed, look up wall distances, warm
 start, iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion,
-lower rims; every few steps classify.
+lower rims, classify.
 
 Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 """
@@ -45,8 +45,6 @@ CONTACT = 0.2
 WARM = 0.3
 """Share of the last step's multipliers that a step starts with. From one half on, deep liquid swings up: multipliers
 then answer to what was, not to what is (docs/how-it-works.md has the analysis)."""
-LOOK = 4
-"""Every so many steps, and at last, one looks where everybody is. Nothing acts differently on who is in a cup."""
 TREACLE = 0.7
 """Before the start velocities shrink to this part in every step: a lattice settles without splashing."""
 
@@ -250,14 +248,8 @@ class Stepper:
                 f.fault[s] = 2
 
     @ti.func
-    def classify(self, s, cavities: ti.template(), steps):
-        """Where every moving particle is now. Half a spacing above its opening plane still belongs to the receiver.
-
-        Args:
-            s: scene.
-            cavities: nodes of the grids that count as inside.
-            steps: since the last look.
-        """
+    def classify(self, s, cavities: ti.template()):
+        """Where every moving particle is now. Half a spacing above its opening plane still belongs to the receiver."""
         f = self.state
         lift = ti.Vector([0.0, 0.0, 0.5 * f.spacing[s]])
         compressed = ti.cast(0.0, ti.f32)
@@ -281,7 +273,7 @@ class Stepper:
                     inside += 1
                     compressed += ti.max(f.density[i] - 1.0, 0.0)
         if inside > 0:
-            f.compression[s] += steps * compressed / inside
+            f.compression[s] += compressed / inside
 
     @ti.func
     def let_fall(self, s, dt):
@@ -295,7 +287,7 @@ class Stepper:
                 f.x[i] = x
 
     @ti.func
-    def step(self, s, grids: ti.template(), planes: ti.template(), poses: ti.template()):
+    def step(self, s, grids: ti.template(), planes: ti.template(), cavities: ti.template(), poses: ti.template()):
         """One time step of one scene."""
         f = self.state
         fastest = self.top_speed(s)
@@ -332,6 +324,7 @@ class Stepper:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] + f.drift[s]
         lower_rims(f, s, dt)
+        self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1
 
@@ -366,11 +359,7 @@ class Stepper:
         f = self.state
         for s in range(s0, s1):
             while f.time[s] < until[s] and f.fault[s] == 0:
-                steps = 0
-                while steps < LOOK and f.time[s] < until[s] and f.fault[s] == 0:
-                    self.step(s, grids, planes, poses)
-                    steps += 1
-                self.classify(s, cavities, steps)
+                self.step(s, grids, planes, cavities, poses)
 
     @ti.kernel
     def census(self, s0: ti.i32, s1: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=2)):
