@@ -209,3 +209,11 @@ def forget_logs(private: PrivateRay) -> int:
             path.unlink(missing_ok=True)
             removed += 1
     return removed
+
+
+def dead_processes() -> list[str]:
+    """Ray's own processes that have died; empty as long as all is well, and where there is no Ray."""
+    from ray._private import worker
+
+    node = worker._global_node
+    return [] if node is None else [str(name) for name, _ in node.dead_processes()]

@@ -19,7 +19,7 @@ from types import FrameType
 
 from actors.cluster.last_word import dismiss, speaker
 from actors.protocols import LaboratoryError
-from actors.ray_private import PrivateRay, close_private, forget_logs, open_private, start_private
+from actors.ray_private import PrivateRay, close_private, dead_processes, forget_logs, open_private, start_private
 from actors.ray_settings import ray_settings
 from actors.spec import LaboratorySpec
 
@@ -101,6 +101,12 @@ def forget_ray_logs() -> None:
     cluster = _cluster
     if cluster is not None and cluster.private is not None:
         forget_logs(cluster.private)
+
+
+def ray_lost() -> str:
+    """Which of a private Ray's own processes has died; empty while all of them live."""
+    cluster = _cluster
+    return ", ".join(dead_processes()) if cluster is not None and cluster.private is not None else ""
 
 
 def keep_signals() -> None:

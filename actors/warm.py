@@ -103,6 +103,15 @@ class WarmSimulators:
             raise LaboratoryError("the optimiser is not up yet")
         return DeviceOptimizer(self._proposer)
 
+    @property
+    def lost(self) -> str:
+        """Why they can't be used any more: which process of Ray's own has died; empty while all is well."""
+        if self._pool is None or self._spec.in_process:
+            return ""
+        from actors.ray_runtime import ray_lost
+
+        return ray_lost()
+
     async def tidy(self) -> None:
         """Forget what laboratories that are closed have left behind."""
         if self._pool is not None and not self._spec.in_process:
@@ -113,13 +122,15 @@ class WarmSimulators:
     async def close(self) -> None:
         """End them. May be called twice."""
         async with self._opening:
+            lost = self.lost
             pool, self._pool, self._fair = self._pool, None, None
             if pool is None:
                 return
             proposer, self._proposer = self._proposer, None
-            if proposer is not None:
-                await proposer.close()
-            await pool.close()
+            if not lost:  # else nobody would answer
+                if proposer is not None:
+                    await proposer.close()
+                await pool.close()
             if not self._spec.in_process:
                 from actors.ray_runtime import stop_ray
 

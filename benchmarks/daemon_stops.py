@@ -1,11 +1,11 @@
-"""How soon the daemon's four ways to stop take effect, with an idle machine and with a saturated one; how warm it is.
+"""How soon the daemon's four ways to stop take effect, and how warm it is: with an idle and with a saturated machine.
 
-A daemon of its own, on a bench of numbers at twice real time. Each time a campaign is stopped while its arm tilts:
-'pause' and 'stop' are measured until the daemon has taken note (they wait for the pour by intention), 'abort' and the
-emergency stop until the arm has confirmed that it stands. Saturated: a busy process for each core beside all
-that, and 200 readers of all events. Run from the project's root:
+A daemon of its own, on a bench of numbers at twice real time and on one over wires. Each time a campaign is stopped
+while its arm tilts: 'pause' and 'stop' are measured until the daemon has taken note (they wait for the pour by
+intention), 'abort' and the emergency stop until the arm has confirmed that it stands. Idle: nothing else. Readers: 200
+of all events. Saturated: the readers, and a busy process for each core. Run from the project's root:
 
-    python -m benchmarks.daemon_stops [--times N] > stops.json
+    python benchmarks/daemon_stops.py --times 10    # into docs/daemon.json and docs/daemon.md
 """
 
 from __future__ import annotations
@@ -19,16 +19,27 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from daemon_page import keep
+from daemon_process import await_, end_in_order, serving, started
+from ruamel.yaml import YAML
+
 from orchestrator.config.load import load_campaign
 from orchestrator.daemon.client import Client
-from orchestrator.daemon.packing import pack
+from orchestrator.daemon.packing import Files, pack
 
+ROOT = Path(__file__).parents[1]
 READERS = 200
-PATIENCE = 120.0
+MOVING = ("tilt", "hold")
+LOADS = {
+    "idle": {"readers": 0, "busy": 0},
+    "readers": {"readers": READERS, "busy": 0},
+    "saturated": {"readers": READERS, "busy": os.cpu_count() or 1},
+}
+GRADES = ("pause", "stop", "abort", "emergency stop")
 
 CAMPAIGN = """\
 name: stops
@@ -63,117 +74,122 @@ asyncio.run(main(sys.argv[1], sys.argv[2], int(sys.argv[3])))
 """
 
 
-@contextlib.contextmanager
-def daemon(folder: Path) -> Iterator[Client]:
-    """A daemon with its state there."""
-    with (folder / "log").open("w") as log:
-        command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "serve"]
-        options = ["--state", str(folder / "state"), "--port", "0", "--simulators", "1"]
-        process = subprocess.Popen([*command, *options], stdout=log, stderr=log, start_new_session=True)
-        try:
-            await_((folder / "state/url").exists)
-            with Client(state=folder / "state") as client:
-                await_(lambda: client.get("/status")["ready"])
-                yield client
-        finally:
-            process.terminate()
-            try:
-                process.wait(60.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-def await_(happened: Any) -> Any:
-    """Until it is true."""
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end:
-        with contextlib.suppress(Exception):
-            if found := happened():
-                return found
-        time.sleep(0.03)
-    raise TimeoutError("it never came to that")
+def campaigns(folder: Path) -> dict[str, tuple[str, Files]]:
+    """What is stopped: on a bench of numbers, and over wires in real time."""
+    yaml = YAML()
+    table = yaml.load(CAMPAIGN)
+    yaml.dump(table, folder / "numbers.yaml")
+    laboratory = yaml.load(ROOT / "configs/laboratories/virtual.yaml")
+    laboratory["simulators"] = 1
+    laboratory["operator"]["time"] = "1 s"
+    laboratory["bench"]["liquid"]["particles"] = 300
+    laboratory["bench"]["time_scale"] = 1
+    table["laboratory"] = laboratory
+    table["motion"]["return_velocity"] = "100 deg/s"
+    table["deployment"]["motion"]["height"] = "80 mm"
+    table["deployment"]["actions"] = {"angular_velocity": ["15 deg/s", "30 deg/s"], "x_offset": ["70 mm", "100 mm"]}
+    yaml.dump(table, folder / "wires.yaml")
+    return {name: pack(load_campaign(folder / f"{name}.yaml")) for name in ("numbers", "wires")}
 
 
 @contextlib.contextmanager
-def saturated(client: Client, folder: Path) -> Iterator[None]:
-    """Every core has more to do than it can, and many watch."""
-    token = next(line.split()[2] for line in (folder / "state/tokens").read_text().splitlines() if "viewer" in line)
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
-    busy.append(subprocess.Popen([sys.executable, "-c", READER, client.url, token, str(READERS)]))
+def beside(client: Client, token: str, *, readers: int, busy: int) -> Iterator[None]:
+    """Others at work meanwhile: readers of all events, and processes that take a core each."""
+    others = [started([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+    if readers:
+        others.append(
+            started([sys.executable, "-c", READER, client.url, token, str(readers)], stderr=subprocess.DEVNULL)
+        )
     try:
-        await_(lambda: _readers(client) >= READERS)
+        await_(lambda: _readers(client) >= readers)
         yield
     finally:
-        for one in busy:
+        for one in others:
             one.kill()
             one.wait()
 
 
 def _readers(client: Client) -> float:
-    text = client._http.get("/api/v1/metrics").text
+    text = client.fetch("/metrics").decode()
     return next(float(line.split()[1]) for line in text.splitlines() if line.startswith("decant_readers "))
 
 
-def once(client: Client, text: str, grade: str) -> float:
+def once(client: Client, sent: tuple[str, Files], grade: str) -> float:
     """Stop a campaign whose arm tilts; how long that takes [s]."""
-    key = client.post("/campaigns", {"text": text})["id"]
-    await_(
-        lambda: client.get("/rigs")[0]["campaign"] == key and client.get("/rigs")[0]["checkpoint"] in ("tilt", "hold")
-    )
+    key = client.post("/campaigns", {"text": sent[0], "files": sent[1]})["id"]
+    await_(lambda: _at_bench(client) == key and client.get("/rigs")[0]["checkpoint"] in MOVING)
     begin = time.perf_counter()
     client.post("/emergency-stop" if grade == "emergency stop" else f"/campaigns/{key}/{grade}")
     seconds = time.perf_counter() - begin
     if grade == "emergency stop":
         client.post("/emergency-stop/clear")
     else:
-        with contextlib.suppress(Exception):
-            client.post(f"/campaigns/{key}/abort")
-            client.post(f"/campaigns/{key}/abort")
-    await_(lambda: client.get("/rigs")[0]["campaign"] is None)
+        for _ in range(2):
+            with contextlib.suppress(Exception):  # it rests already
+                client.post(f"/campaigns/{key}/abort")
+    await_(lambda: _at_bench(client) is None)
     client.post(f"/campaigns/{key}/stop")
     return seconds
 
 
-def warm(client: Client, text: str) -> float:
+def _at_bench(client: Client) -> Any:
+    return client.get("/rigs")[0]["campaign"]
+
+
+def warm(client: Client, sent: tuple[str, Files]) -> float:
     """From the submission of a plan to the beginning of its first simulation [s]."""
     begin = time.time()
     last = client.get("/status")["last_event"]
-    key = client.post("/campaigns", {"text": text, "verb": "plan"})["id"]
-    for told in client.events(last):
-        simulates = told.type == "RequestStarted" and told.data["request"]["type"] == "Simulate"
-        if simulates and told.data["campaign"] == key:
+    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "verb": "plan"})["id"]
+    for told in client.events(last, key):
+        if told.type == "RequestStarted" and told.data["request"]["type"] == "Simulate":
             client.post(f"/campaigns/{key}/stop")
             await_(lambda: client.get(f"/campaigns/{key}")["state"] in ("stopped", "finished"))
             return float(told.data["time"]) - begin
-        if told.type == "CampaignRests" and told.data["campaign"] == key:
+        if told.type == "CampaignRests":
             raise AssertionError(f"it came to nothing: {told.data['reason']}")
     raise AssertionError("unreachable")
 
 
+def measured(folder: Path, times: int, chosen: Sequence[str]) -> dict[str, Any]:
+    """Everything [ms], with the machine's load before [processes that want a core]."""
+    found: dict[str, Any] = {
+        "cores": os.cpu_count(),
+        "times": times,
+        "load before": round(os.getloadavg()[0], 2),
+        "stops": [],
+    }
+    sent = campaigns(folder)
+    with serving(folder, "--simulators", "1") as client:
+        token = next(line.split()[2] for line in (folder / "state/tokens").read_text().splitlines() if "viewer" in line)
+        found["first simulation of a plan"] = [round(1e3 * warm(client, sent["numbers"])) for _ in range(3)]
+        print("first simulation [ms]", found["first simulation of a plan"], file=sys.stderr, flush=True)
+        for load in chosen:
+            with beside(client, token, **LOADS[load]):
+                for bench, text in sent.items():
+                    for grade in GRADES if bench == "numbers" else GRADES[2:]:
+                        taken = [1e3 * once(client, text, grade) for _ in range(times)]
+                        row: dict[str, Any] = {"bench": bench, "grade": grade, "load": load}
+                        row |= {"median": round(statistics.median(taken), 1), "worst": round(max(taken), 1)}
+                        found["stops"].append(row)
+                        print(*row.values(), file=sys.stderr, flush=True)
+    return found
+
+
 def main() -> None:
-    """Measure, and print JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--times", type=int, default=6)
-    times = parser.parse_args().times
-    found: dict[str, Any] = {"cores": os.cpu_count(), "times": times, "load before": os.getloadavg()[0]}
+    """Measure, and write the figures and their table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--times", type=int, default=10)
+    parser.add_argument("--loads", nargs="+", choices=list(LOADS), default=list(LOADS))
+    parser.add_argument("--to", type=Path, help="in place of the page")
+    arguments = parser.parse_args()
+    end_in_order()
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "stops.yaml").write_text(CAMPAIGN, encoding="utf-8")
-        text, _ = pack(load_campaign(folder / "stops.yaml"))
-        with daemon(folder) as client:
-            found["first simulation of a plan"] = [round(warm(client, text), 3) for _ in range(3)]
-            print("first simulation", found["first simulation of a plan"], file=sys.stderr, flush=True)
-            for load in ("idle", "saturated"):
-                with saturated(client, folder) if load == "saturated" else contextlib.nullcontext():
-                    for grade in ("emergency stop", "abort", "stop", "pause"):
-                        taken = [once(client, text, grade) for _ in range(times)]
-                        found[f"{grade}, {load}"] = {
-                            "median": round(1e3 * statistics.median(taken), 1),
-                            "worst": round(1e3 * max(taken), 1),
-                        }
-                        print(load, grade, found[f"{grade}, {load}"], file=sys.stderr, flush=True)
-    print(json.dumps(found, indent=1))
+        found = measured(Path(name), arguments.times, arguments.loads)
+    if arguments.to is None:
+        keep("stops", found)
+    else:
+        arguments.to.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -61,7 +61,10 @@ PATIENCE = 3600.0
 
 @dataclass(frozen=True)
 class PeerRun:
-    """One standard pour by the peer; attributes as in `standard_pour.Measured`."""
+    """One standard pour by the peer; attributes as in `standard_pour.Measured`.
+
+    `course`: times [s] and the fraction left in the pourer, of the whole pour; where a viscosity was asked for.
+    """
 
     cpu_s: float
     steps: int
@@ -69,6 +72,7 @@ class PeerRun:
     left: tuple[float, ...]
     density: float
     delivered: float
+    course: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
 
 def check_particles(particles: int) -> None:
@@ -146,13 +150,15 @@ def _use_libraries_of_the_system(folder: Path) -> None:
             bundled.symlink_to(own)
 
 
-def pour(python: Path, particles: int, seed: int) -> PeerRun:
+def pour(python: Path, particles: int, seed: int, viscosity: float = 0.0, end: float = END) -> PeerRun:
     """The standard pour by the peer, in a process of its own.
 
     Args:
         python: of its environment.
         particles: N, a multiple of four.
         seed: of the initial positions.
+        viscosity: kinematic, implicit (Weiler et al. 2018), in the liquid and on walls [m²/s]; 0: water's, explicit.
+        end: of the pour [s].
 
     Raises:
         SystemExit: the run failed, with the end of what it said.
@@ -160,7 +166,8 @@ def pour(python: Path, particles: int, seed: int) -> PeerRun:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         job, result = folder / "job.json", folder / "result.npz"
-        job.write_text(json.dumps(_job(folder, particles, seed)), encoding="utf-8")
+        wanted = _job(folder, particles, seed) | {"viscosity": viscosity, "end_time": end}
+        job.write_text(json.dumps(wanted), encoding="utf-8")
         command = [str(python), str(CHILD), str(job), str(result)]
         try:
             done = subprocess.run(
@@ -183,6 +190,10 @@ def pour(python: Path, particles: int, seed: int) -> PeerRun:
     slack = 0.5 * particle_spacing(particles)
     judged = (times > min(TIMES) - 0.1) & (times < max(TIMES) + 0.1)
     curve = [left_in_pourer(x, t, slack) for t, x in zip(times[judged], frames[judged], strict=True)]
+    course: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    if viscosity > 0.0:
+        left = tuple(left_in_pourer(x, min(t, END), slack) for t, x in zip(times, frames, strict=True))
+        course = (tuple(times.tolist()), left)
     at_rest = int(np.argmin(np.abs(times - REST)))
     return PeerRun(
         cpu_s=float(arrays["cpu_s"]),
@@ -191,6 +202,7 @@ def pour(python: Path, particles: int, seed: int) -> PeerRun:
         left=tuple(float(left) for left in np.interp(TIMES, times[judged], curve)),
         density=density_inside(frames[at_rest], float(times[at_rest]), particles),
         delivered=delivered(frames[-1], slack),
+        course=course,
     )
 
 

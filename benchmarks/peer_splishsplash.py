@@ -6,6 +6,8 @@ Runs in the peer's own environment (`peer.py` makes it and writes the job), so i
 Settings: support 2d, CFL factor 1 (0.4 d per step), steps up to 4 ms, density error 0.1 %, viscosity 1e-6 m²/s, no
 surface tension; what has spilled is frozen, since its speed would otherwise rule the time step.
 
+A job may name another viscosity, which is then implicit and acts on walls as well.
+
 Source: Bender & Koschier 2015 (DFSPH); Bender et al. 2019 (volume maps).
 """
 
@@ -24,6 +26,8 @@ import pysplishsplash as sph
 DFSPH, VOLUME_MAPS = 4, 2
 FIRST_STEP, LONGEST_STEP = 5e-4, 4e-3
 MAP_RESOLUTION = [40, 40, 40]
+WEILER = 6
+"""Implicit viscosity of Weiler et al. 2018, for jobs that name a kinematic viscosity [m²/s]."""
 FIXED = sph.ParticleState(2)
 """The binding names only two of the states; this one stays where it is."""
 
@@ -71,7 +75,7 @@ def scene(job: dict[str, Any]) -> dict[str, Any]:
             {
                 "id": "Fluid",
                 "density0": 1000,
-                "viscosityMethod": 1,
+                "viscosityMethod": WEILER if job.get("viscosity") else 1,
                 "surfaceTensionMethod": 0,
                 "Standard viscosity": {"viscosity": 1e-6, "viscosityBoundary": 0.0},
             }
@@ -100,6 +104,12 @@ class Run:
         self.liquid = self.simulation.getFluidModel(0)
         if self.liquid.numActiveParticles() != job["particles"]:
             raise SystemExit(f"{self.liquid.numActiveParticles()} particles instead of {job['particles']}")
+        if job.get("viscosity"):
+            friction = self.liquid.getViscosityBase()
+            for name in (friction.VISCOSITY_COEFFICIENT, friction.VISCOSITY_COEFFICIENT_BOUNDARY):
+                friction.setValueFloat(name, job["viscosity"])
+                if abs(friction.getValueFloat(name) / job["viscosity"] - 1.0) > 1e-3:
+                    raise SystemExit("the peer did not take the viscosity")
         for i, x in enumerate(np.load(job["positions"]).astype(float).tolist()):
             self.liquid.setPosition(i, x)
             self.liquid.setPosition0(i, x)

@@ -6,8 +6,8 @@ the API, paused and resumed, aborted while the arm tilts and resumed with its qu
 Every minute all processes that it has started are looked at, and everything that it keeps. It waits between campaigns
 so that it takes no more of a core than it may. Run from the project's root:
 
-    python -m benchmarks.soak --minutes 60 --into soak     # writes soak/samples.jsonl and soak/campaigns.jsonl
-    python -m benchmarks.soak --draw soak                  # docs/images/daemon/soak.png, docs/daemon-soak.json
+    python benchmarks/soak.py --minutes 60 --into soak     # writes soak/samples.jsonl and soak/campaigns.jsonl
+    python benchmarks/soak.py --draw soak                  # docs/images/daemon/soak.png, its table in docs/daemon.md
 """
 
 from __future__ import annotations
@@ -22,11 +22,14 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
+from daemon_page import keep
 from daemon_process import end_in_order, serving
 from ruamel.yaml import YAML
 
@@ -34,6 +37,7 @@ from orchestrator.config.load import load_campaign
 from orchestrator.daemon.client import Client, DaemonError
 from orchestrator.daemon.packing import Files, pack
 from orchestrator.journal import JOURNAL_NAME
+from orchestrator.report import style
 
 ROOT = Path(__file__).parents[1]
 
@@ -306,6 +310,76 @@ def _append(path: Path, row: dict[str, Any]) -> None:
         file.write(json.dumps(row) + "\n")
 
 
+# ---- what came of it
+
+FIGURE = ROOT / "docs" / "images" / "daemon" / "soak.png"
+
+
+def draw(folder: Path) -> dict[str, Any]:
+    """Draw a soak; what its table says."""
+    samples = [json.loads(line) for line in (folder / "samples.jsonl").read_text().splitlines()]
+    campaigns = [json.loads(line) for line in (folder / "campaigns.jsonl").read_text().splitlines()]
+    rest, busy = ([s for s in samples if s["at rest"] is which] for which in (True, False))
+    size = {name: partial(_kept, name) for name in ("daemon", "events", "ray")}
+    figure, panels = style.new_figure(2, 2, size=(9.2, 6.0), sharex=True)
+    memory, handles, threads, disk = panels.flat
+    for rows, marker, alpha in ((rest, "o-", 1.0), (busy, ".", 0.45)):
+        minutes = [s["minute"] for s in rows]
+        for axes, curves in (
+            (memory, {"all processes": "pss", "the daemon": "daemon pss"}),
+            (handles, {"all processes": "handles", "the daemon": "daemon handles"}),
+            (threads, {"threads": "threads", "processes": "processes"}),
+        ):
+            for (name, key), colour in zip(curves.items(), (style.MEASURED, style.PREDICTED), strict=True):
+                label = name if rows is rest else None
+                axes.plot(minutes, [s[key] for s in rows], marker, color=colour, ms=3, lw=1.2, alpha=alpha, label=label)
+    minutes = [s["minute"] for s in rest]
+    names = {"daemon": "queue, questions, deeds", "events": "events", "ray": "Ray's logs"}
+    for (key, name), colour in zip(names.items(), (style.MEASURED, style.PREDICTED, style.GOOD), strict=True):
+        disk.plot(minutes, [size[key](s) for s in rest], "o-", color=colour, ms=3, lw=1.2, label=name)
+    begin = campaigns[0]["began"]
+    ran = [c for c in campaigns if c["kind"] == "plain"]
+    when = [(c["began"] - begin) / 60.0 for c in ran]
+    disk.plot(when, [c["journal"] / 1e6 for c in ran], "x", color=style.BEST, ms=5, label="journal of one campaign")
+    titles = {memory: "Memory [MB]", handles: "Open handles", threads: "Threads and processes", disk: "On disk [MB]"}
+    for axes, title in titles.items():
+        style.dress(axes, title=title, x="minutes" if axes in (threads, disk) else "")
+        axes.set_ylim(0.0, None)
+        axes.legend(fontsize=8, framealpha=0.85, edgecolor="none")
+    style.save(figure, FIGURE)
+    shown: dict[str, Callable[[dict[str, Any]], float]] = {
+        "memory of all processes [MB]": lambda s: float(s["pss"]),
+        "memory of the daemon itself [MB]": lambda s: float(s["daemon pss"]),
+        "open handles": lambda s: float(s["handles"]),
+        "threads": lambda s: float(s["threads"]),
+        "processes": lambda s: float(s["processes"]),
+        "queue, questions, deeds with their WAL [MB]": size["daemon"],
+        "events with their WAL [MB]": size["events"],
+        "Ray's folder [MB]": size["ray"],
+    }
+    states = collections.Counter(f"{c['kind']}: {c['state']}" for c in campaigns)
+    last = rest[-1]["minute"]
+    return {
+        "minutes": round(last, 1),
+        "campaigns": len(campaigns),
+        "states": dict(states),
+        "cpu share": round(max(s["cpu"] for s in samples) / (60.0 * last), 3),
+        "journal of one campaign [kB]": sorted({round(c["journal"] / 1e3) for c in ran}),
+        "at rest": [{"what": name, **_course(rest, value)} for name, value in shown.items()],
+    }
+
+
+def _kept(name: str, sample: dict[str, Any]) -> float:
+    return float(sum(v for k, v in sample["size of"].items() if k.startswith(name)))
+
+
+def _course(rows: list[dict[str, Any]], value: Callable[[dict[str, Any]], float]) -> dict[str, float]:
+    """At a third of the time, at the end, and how it went on average in the time between [1/h]."""
+    late = [row for row in rows if row["minute"] >= rows[-1]["minute"] / 3.0]
+    slope = float(np.polyfit([row["minute"] / 60.0 for row in late], [value(row) for row in late], 1)[0])
+    return {"third": round(value(late[0]), 2), "end": round(value(late[-1]), 2), "an hour": round(slope, 2)}
+
+
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -313,7 +387,11 @@ def main() -> None:
     parser.add_argument("--into", type=Path, default=Path("soak"))
     parser.add_argument("--share", type=float, default=0.3, help="of a core, on average")
     parser.add_argument("--every", type=float, default=60.0, help="seconds between two samples")
+    parser.add_argument("--draw", type=Path, help="draw what was found there")
     arguments = parser.parse_args()
+    if arguments.draw is not None:
+        keep("soak", draw(arguments.draw))
+        return
     end_in_order()
     os.environ.pop("DECANT_STATE", None)
     soak(arguments.into.resolve(), arguments.minutes, arguments.share, arguments.every)

@@ -56,7 +56,7 @@ deployment:
   motion: {max_angle: 115 deg, height: 60 mm}
   actions: {angular_velocity: [60 deg/s, 180 deg/s], x_offset: [60 mm, 100 mm]}
   prior_simulations: 6
-  pours: 8
+  pours: 6
   per_pour: 2
 outputs: {rrd: false}
 """
@@ -191,7 +191,7 @@ def main() -> None:
 def draw(browser: Browser, lab: Lab) -> None:
     """From the first question to the emergency stop."""
     lab.start()
-    lab.submit("narrow-glass")
+    first = lab.submit("narrow-glass")
     for name in ("wide-glass", "tall-glass"):
         lab.submit(name)
     pours = 0
@@ -213,7 +213,21 @@ def draw(browser: Browser, lab: Lab) -> None:
     lab.end(signal.SIGKILL)  # in the middle of the pour
     lab.start("two.yaml")
     lab.answer_until(lambda question: question["kind"] == "unknown")
-    picture(browser, lab, "unknown-tablet", "tablet")
+    with seen(browser, lab, "tablet") as page:
+        page.wait_for_timeout(600)
+        page.screenshot(path=FOLDER / "unknown-tablet.png")
+        page.get_by_label("Spilled").fill("3,2")
+        page.get_by_label("Left in the pourer").fill("0,4")
+        page.get_by_role("button", name="It was weighed").click()
+        page.locator("#pours").get_by_text("3.20 %").first.wait_for(timeout=1e3 * PATIENCE)
+        page.get_by_role("heading", name="Last pours").scroll_into_view_if_needed()
+        page.wait_for_timeout(600)
+        page.screenshot(path=FOLDER / "answered-tablet.png")
+    lab.answer_until(lambda question: lab.call(f"campaigns/{first}")["state"] == "finished")
+    with seen(browser, lab, "tablet") as page:
+        page.locator("#ended").scroll_into_view_if_needed()
+        page.wait_for_timeout(600)
+        page.screenshot(path=FOLDER / "ended-tablet.png")
     lab.answer_until(lambda question: question["wants"] == "yes or no")
     number = lab.call("questions")[0]["id"]
     lab.call(f"questions/{number}/answer", {"answer": "yes"}, "POST")

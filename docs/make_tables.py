@@ -43,6 +43,7 @@ from orchestrator.strategies.deployment.window import WindowSettings
 from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import KNOWN, ROOM
 from sim_engine.validation import sensitivity
 
 FOLDER = Path(__file__).parent
@@ -292,6 +293,33 @@ def _arms(model: type[Section]) -> dict[str, type[Section]]:
     return {section.variant: section for section in found}
 
 
+def liquids() -> str:
+    """The table of known liquids at 20 °C, solutions at some shares."""
+    rows = []
+    for known in KNOWN:
+        shares = (0.0,) if known.share is None else tuple(s for s in SHOWN_SHARES if s <= known.share[1])
+        for share in shares:
+            name = known.name if known.share is None else f"{known.name} {share:g} %"
+            found = known.at(ROOM, share)
+            rows.append(
+                (
+                    f"`{name}`",
+                    f"{found.density:.0f}",
+                    f"{1e3 * found.dynamic_viscosity:.3g}",
+                    f"{1e6 * found.dynamic_viscosity / found.density:.3g}",
+                    f"{1e3 * found.surface_tension:.1f}",
+                    f"{known.temperatures[0]:g} … {known.temperatures[1]:g}",
+                    f"{100 * known.uncertainty:.0f} %",
+                )
+            )
+    head = ("name", "density kg/m³", "viscosity mPa s", "mm²/s", "tension mN/m", "known at °C", "viscosity ±")
+    sources = "".join(f"- {known.name}: {known.source}.\n" for known in KNOWN)
+    return f"{_table(head, rows)}\n\n{sources.rstrip()}"
+
+
+SHOWN_SHARES = (20.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "catalogue-runs": partial(catalogued, "run"),
     "catalogue-pours": partial(catalogued, "pour"),
@@ -300,6 +328,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "effects": effects,
     "seeds": seeds,
     "columns": columns,
+    "liquids": liquids,
     "states": states,
     **{name: partial(section, model) for name, model in SECTIONS.items()},
     "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from orchestrator.codec import to_json
 from orchestrator.plan import CampaignPlan
+from sim_engine.liquid import Liquid
 from sim_engine.marks import BY_CONTENT, FREE, marks_of
 from sim_engine.task import Scene
 
@@ -44,7 +45,12 @@ def deciding(value: Any) -> Any:
         CodecError: it holds something that JSON can't.
     """
     if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
-        fields = {name: (getattr(value, name), mark) for name, mark in marks_of(type(value)).items() if mark != FREE}
+        free = value.free_fields() if isinstance(value, Liquid) else frozenset()
+        fields = {
+            name: (getattr(value, name), mark)
+            for name, mark in marks_of(type(value)).items()
+            if mark != FREE and name not in free
+        }
         return {
             name: hashlib.sha256(found.read_bytes()).hexdigest() if mark == BY_CONTENT else deciding(found)
             for name, (found, mark) in fields.items()

@@ -7,15 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from orchestrator.errors import RunError
 from orchestrator.plan import CampaignPlan
 from orchestrator.stages import StageDefinition, calibration_stages, deployment_stages, prediction_stages, stages_of
 
+if TYPE_CHECKING:
+    from sim_engine.liquid import SimulationParameters
+    from sim_engine.vessel.spec import VesselSpec
+
 Verb = Literal["run", "calibrate", "plan"]
 
 PREDICTION_SEEDS = 5
+
+PLANNED = "-plan"
+"""Behind the name of a campaign that is planned alone."""
 
 
 class JobError(RunError):
@@ -57,17 +64,54 @@ def job(plan: CampaignPlan, verb: Verb = "run") -> Job:
             # The deployment stays out: its vessels need not be there yet.
             return Job(replace(plan, deployment=None), calibration_stages(plan.calibration))
         case "plan":
-            from orchestrator.strategies.deployment.d1 import D1Settings
+            plan = planned(plan)
+            assert plan.deployment is not None
+            stages = deployment_stages(plan, plan.deployment)
+            return Job(plan, [*stages, *prediction_stages(plan, plan.deployment, PREDICTION_SEEDS)])
 
-            if plan.deployment is None:
-                raise JobError(
-                    f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, "
-                    "motion, loss)"
-                )
-            if plan.deployment.settings.needs_posterior:
-                raise JobError(f"{plan.source}: deployment.risk.theta: 'posterior' needs a calibration in the same run")
-            settings = D1Settings.like(plan.deployment.settings, pours=0)
-            deployment = replace(plan.deployment, settings=settings, confirm=0)
-            planned = replace(plan, name=f"{plan.name}-plan", calibration=None, deployment=deployment)
-            stages = deployment_stages(planned, deployment)
-            return Job(planned, [*stages, *prediction_stages(planned, deployment, PREDICTION_SEEDS)])
+
+def planned(
+    plan: CampaignPlan,
+    theta: SimulationParameters | None = None,
+    receiver: VesselSpec | None = None,
+    iterations: int | None = None,
+    thetas: tuple[SimulationParameters, ...] = (),
+) -> CampaignPlan:
+    """A campaign turned into D1 without pours, and its record.
+
+    Args:
+        plan: of the campaign.
+        theta: to plan with; the campaign's unless given.
+        receiver: in place of the campaign's.
+        iterations: as the campaign says unless given.
+        thetas: draws of a posterior, where its risk is to bear them.
+
+    Raises:
+        JobError: it has nothing to plan with.
+    """
+    from orchestrator.config.record import record_of
+    from orchestrator.strategies.deployment.d1 import D1Settings
+
+    deployment = plan.deployment
+    if deployment is None:
+        raise JobError(
+            f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)"
+        )
+    if deployment.settings.needs_posterior and not thetas:
+        raise JobError(
+            f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration by "
+            "C4, or a calibration in the same run"
+        )
+    scenes = deployment.scenes
+    if receiver is not None:
+        scenes = (replace(scenes[0], name=f"plan:{receiver.name}", receiver=receiver),)
+    changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
+    settings = D1Settings.like(deployment.settings, **changes)
+    found = replace(
+        plan,
+        name=f"{plan.name.removesuffix(PLANNED)}{PLANNED}",
+        parameters=plan.parameters if theta is None else theta,
+        calibration=None,
+        deployment=replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0),
+    )
+    return replace(found, resolved=record_of(plan.resolved, found))

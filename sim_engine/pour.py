@@ -221,13 +221,14 @@ class PourSimulator:
         from sim_engine.fluid.state import SUPPORT
 
         scene, parameters, error = task.scene, task.parameters, task.placement
+        liquid = scene.liquid
         pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
-        d = spacing(scene.liquid.volume, parameters.particles)
+        d = spacing(liquid.volume, parameters.particles)
         drift = liquid_velocity(motion, pourer, start) if start > 0.0 else np.zeros(3)
         return SceneSetup(
             positions=self._laid(task, motion, start),
             spacing=d,
-            density=scene.liquid.density,
+            density=liquid.density,
             parameters=parameters,
             pourer=self._walls(scene.pourer, SUPPORT * d),
             receiver=self._walls(scene.receiver, SUPPORT * d),
@@ -237,6 +238,8 @@ class PourSimulator:
             settling=SETTLING,
             start=start,
             drift=(float(drift[0]), float(drift[1]), float(drift[2])),
+            viscosity=liquid.kinematic_viscosity * parameters.viscosity_factor if liquid.is_thick else 0.0,
+            tension=liquid.surface_tension if liquid.is_thick else None,
         )
 
     def _walls(self, spec: VesselSpec, support: float) -> SolidWalls:

@@ -40,7 +40,11 @@ stands up to twice that length above it before it leaves, and one that does cree
 
 VISCOUS_REYNOLDS = 100.0
 """Film at the lip: a boundary layer of 5√(νl/U) fills the film within the l ≈ 3e in which it gathers its speed at about
-Re = 75. Above, so short a time is not enough for the liquid's viscosity to be felt."""
+Re = 75. Above, so short a time is not enough for the liquid's viscosity to be felt. Of liquids as thin as water only:
+of others it is simulated, …"""
+
+CREEPING = 2.0
+"""… up to this viscosity [Pa s], the largest that was held against theory (`decant physics film`)."""
 
 PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer none has neighbours all around it, and the stream is a string."""
@@ -151,13 +155,16 @@ def _wetting(course: FlowCourse, liquid: Liquid) -> NotCovered:
 
 
 def _viscous(course: FlowCourse, liquid: Liquid) -> NotCovered:
+    if liquid.is_thick:
+        stiff = f"{liquid.dynamic_viscosity:.3g} Pa*s; the simulator was held against theory up to {CREEPING:g} Pa*s"
+        return NotCovered("viscous", 1.0 if liquid.dynamic_viscosity > CREEPING else 0.0, f"the viscosity is {stiff}")
     share = course.share(reynolds(liquid, course.velocity, course.film) < VISCOUS_REYNOLDS)
     return NotCovered(
         "viscous",
         share,
         f"{_percent(share)} of what is poured leaves the lip at a Reynolds number below {VISCOUS_REYNOLDS:g}: the "
-        f"liquid's viscosity ({1e3 * liquid.dynamic_viscosity:.3g} mPa*s) holds it back. The simulator's parameter of "
-        "that name only evens out velocities; calibrate on pours of this very liquid",
+        f"liquid's viscosity ({1e3 * liquid.dynamic_viscosity:.3g} mPa*s) holds it back. Of a liquid this thin it is "
+        "not simulated; calibrate on pours of this very liquid",
     )
 
 

@@ -103,16 +103,14 @@ def _check_posterior(plan: CampaignPlan) -> None:
 
 def calibrate(path: Path, options: RunOptions) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
-    from orchestrator.stages import calibration_stages
+    from orchestrator.jobs import JobError, job
 
-    plan = read_campaign(path, options.laboratory, options.seed)
-    if plan.calibration is None:
-        raise RefusalError(f"{path}: has no 'calibration' section; there is nothing to calibrate", BAD_INPUT)
-    # The deployment stays out: its vessels need not be there yet.
-    stages = calibration_stages(plan.calibration)
-    plan = dataclasses.replace(plan, deployment=None)
-    check_campaign_can_run(plan)
-    finished = _run(plan, "calibrate", path, options, stages)
+    try:
+        work = job(read_campaign(path, options.laboratory, options.seed), "calibrate")
+    except JobError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    check_campaign_can_run(work.plan)
+    finished = _run(work.plan, "calibrate", path, options, list(work.stages))
     if options.as_json:
         print_json(calibration_json(finished))
 
@@ -241,43 +239,19 @@ def planning_plan(
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
     from orchestrator.config.load import load_parameters, load_posterior, load_vessel
-    from orchestrator.config.record import record_of
     from orchestrator.config.yaml.errors import ConfigError
+    from orchestrator.jobs import JobError, planned
     from orchestrator.stages import POSTERIOR_DRAWS
-    from orchestrator.strategies.deployment.d1 import D1Settings
 
-    deployment, theta = plan.deployment, plan.parameters
-    posterior = deployment is not None and deployment.settings.needs_posterior
+    theta = None if isinstance(parameters, Path) else parameters
     thetas: tuple[SimulationParameters, ...] = ()
-    if posterior and not isinstance(parameters, Path):
-        raise RefusalError(
-            f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration "
-            "by C4",
-            BAD_INPUT,
-        )
-    with Refused(ConfigError):
+    with Refused(ConfigError, JobError):
         if isinstance(parameters, Path):
             theta = load_parameters(parameters, plan.parameters)
-            if posterior:
+            if plan.deployment is not None and plan.deployment.settings.needs_posterior:
                 thetas = load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters)
-        elif parameters is not None:
-            theta = parameters
         vessel = load_vessel(receiver) if isinstance(receiver, Path) else receiver
-    if deployment is None:
-        raise RefusalError(
-            f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)",
-            BAD_INPUT,
-        )
-    scenes = deployment.scenes
-    if vessel is not None:
-        scenes = (dataclasses.replace(scenes[0], name=f"plan:{vessel.name}", receiver=vessel),)
-    changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
-    settings = D1Settings.like(deployment.settings, **changes)
-    deployment = dataclasses.replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0)
-    planned = dataclasses.replace(
-        plan, name=f"{plan.name}-plan", parameters=theta, calibration=None, deployment=deployment
-    )
-    return dataclasses.replace(planned, resolved=record_of(plan.resolved, planned))
+        return planned(plan, theta, vessel, iterations, thetas)
 
 
 def _run(

@@ -82,6 +82,9 @@ def submit(
     priority: int,
     laboratory: Path | None,
     seed: int | None,
+    parameters: Path | None = None,
+    receiver: Path | None = None,
+    iterations: int | None = None,
     at: At,
     as_json: bool,
 ) -> None:
@@ -94,6 +97,18 @@ def submit(
     from orchestrator.daemon.packing import pack
 
     plan = read_campaign(path, laboratory, seed)
+    if (parameters, receiver, iterations) != (None, None, None):
+        from orchestrator.commands.campaigns import planning_plan
+
+        if wanted != "plan":
+            raise RefusalError("--parameters, --receiver and --iterations go with --verb plan", BAD_INPUT)
+        plan = planning_plan(plan, parameters, receiver, iterations)
+        if plan.deployment is not None and plan.deployment.thetas:
+            raise RefusalError(
+                f"{path}: deployment.risk.theta: 'posterior': draws of θ don't travel to a daemon; 'decant plan' bears "
+                "them here",
+                BAD_INPUT,
+            )
     try:
         text, files = pack(plan)
     except OSError as error:

@@ -8,7 +8,17 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.commands.options import Campaign, Json, OtherLaboratory, Seed, call, examples, given
+from orchestrator.commands.options import (
+    Campaign,
+    Json,
+    OtherLaboratory,
+    Parameters,
+    Receiver,
+    Seed,
+    call,
+    examples,
+    given,
+)
 
 Key = Annotated[
     str,
@@ -51,6 +61,12 @@ def submit(
     priority: Annotated[int, typer.Option(help="Higher ones come first.")] = 0,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
+    parameters: Parameters = None,
+    receiver: Receiver = None,
+    iterations: Annotated[
+        int | None,
+        typer.Option(min=1, help="With --verb plan: simulations in place of the campaign's.", show_default=False),
+    ] = None,
     url: Url = None,
     state: State = None,
     as_json: Json = False,
@@ -185,7 +201,11 @@ _VERBS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
     "serve": (serve, ("decant serve", "decant serve lab.yaml --port 0", "decant serve --state /tmp/try --in-process")),
     "submit": (
         submit,
-        ("decant submit configs/campaigns/quickstart.yaml", "decant submit my.yaml --rig left --priority 5"),
+        (
+            "decant submit configs/campaigns/quickstart.yaml",
+            "decant submit my.yaml --rig left --priority 5",
+            "decant submit my.yaml --verb plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
+        ),
     ),
     "list": (list_campaigns, ("decant list", "decant list --json")),
     "show": (show, ("decant show quickstart-3f2a1c",)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, create_model
@@ -12,6 +13,7 @@ from orchestrator.config.yaml.quantities import Quantity, parse_quantity
 from orchestrator.config.yaml.sections import MADE, FilePath, Name, Number, Section, Text
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import Liquid
+from sim_engine.liquids import KNOWN, ROOM, Properties, look_up
 from sim_engine.vessel.spec import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -87,10 +89,13 @@ VesselFile: Any = _vessel_file()
 
 
 class LiquidFile(Section):
-    """What is poured."""
+    """What is poured: by its name, if it is in the [table](liquids.md#the-table), or by its properties."""
 
     name: Text = "water"
-    """For people."""
+    """For people; and in the table: 'ethanol', 'glycerol 80 %', 'sugar syrup 60 %', 'rapeseed oil' …"""
+
+    temperature: Annotated[float, Quantity("degC", "20 degC", lower=0.0, upper=100.0)] | None = None
+    """Temperature at which the table is read; 20 °C unless given."""
 
     mass: Annotated[float, Quantity("kg", "200 g", lower=1e-4, upper=20.0)] | None = None
     """Mass that is loaded into the pourer; or give `volume`."""
@@ -98,16 +103,19 @@ class LiquidFile(Section):
     volume: Annotated[float, Quantity("m^3", "200 mL", lower=1e-7, upper=0.02)] | None = None
     """Volume that is loaded, from which the mass follows; or give `mass`, which a balance tells better."""
 
-    density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] = 998.0
-    """Density; water's at 20 °C unless given."""
+    density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] | None = None
+    """Density; the table's unless given, else 998 kg/m³."""
 
-    surface_tension: Annotated[float, Quantity("N/m", "72.8 mN/m", lower=1e-3, upper=1.0)] = 0.0728
-    """Surface tension against air; with it and the viscosity Decant warns of what it can't simulate. Water's unless
-    given; the simulator's own knob is the parameter `cohesion`."""
+    surface_tension: Annotated[float, Quantity("N/m", "72.8 mN/m", lower=1e-3, upper=1.0)] | None = None
+    """Surface tension against air; the table's unless given, else 72.8 mN/m. Liquids above 5 mm²/s are simulated with
+    it; for thinner ones the simulator's own knob is the parameter `cohesion`."""
 
-    dynamic_viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] = 1.0e-3
-    """Dynamic viscosity, for the same warnings. Water's unless given; the simulator's own knob is the parameter
-    `viscosity`."""
+    viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] | None = None
+    """Dynamic viscosity; the table's unless given, else 1 mPa*s. Above 5 mm²/s (viscosity over density) it is
+    simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is the parameter `viscosity`."""
+
+    contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = 0.0
+    """Contact angle of a liquid above 5 mm²/s on the vessels' walls; 0: it wets them wholly."""
 
 
 def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselSpec | None:
@@ -195,14 +203,43 @@ def resolve_liquid(section: LiquidFile, place: Place, report: Report) -> Liquid 
             text = "key 'mass' is missing; add for example 'mass: 200 g', or 'volume: 200 mL'"
             report.add(place, text, key=True)
         return None
+    known = _known(section, place, report)
+    if known is None:
+        return None
+    density = _first(section.density, known.density)
     mass = section.mass
     if mass is None:
         assert section.volume is not None
-        mass = section.volume * section.density
+        mass = section.volume * density
     return Liquid(
         name=section.name,
         mass=mass,
-        density=section.density,
-        surface_tension=section.surface_tension,
-        dynamic_viscosity=section.dynamic_viscosity,
+        density=density,
+        surface_tension=_first(section.surface_tension, known.surface_tension),
+        dynamic_viscosity=_first(section.viscosity, known.dynamic_viscosity),
+        contact_angle=section.contact_angle,
     )
+
+
+def _first(given: float | None, known: float) -> float:
+    return known if given is None else given
+
+
+PLAIN_WATER = Properties(density=998.0, dynamic_viscosity=1.0e-3, surface_tension=0.0728)
+"""What a liquid is like that nothing is said of."""
+
+
+def _known(section: LiquidFile, place: Place, report: Report) -> Properties | None:
+    """Properties by the table; plain water's for a name that it does not have."""
+    if section.name == "water" and section.temperature is None:
+        return PLAIN_WATER
+    try:
+        found = look_up(section.name, ROOM if section.temperature is None else section.temperature)
+    except ValueError as problem:
+        report.add(place.at("name" if "%" in str(problem) else "temperature"), str(problem))
+        return None
+    if found is None and section.temperature is not None:
+        names = ", ".join(f"'{one.name}{' 60 %' if one.share else ''}'" for one in KNOWN)
+        report.add(place.at("temperature"), f"says nothing of a liquid that is not in the table; it has {names}")
+        return None
+    return found or PLAIN_WATER

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import ssl
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,7 +57,7 @@ class Client:
         token = token or os.environ.get("DECANT_TOKEN") or _token(state)
         self._http = httpx.Client(
             base_url=self.url, headers={"Authorization": f"Bearer {token}"}, timeout=TIMEOUT, trust_env=False,
-            verify=self.url.startswith("https") and (os.environ.get("DECANT_CA") or True),
+            verify=_trusted(self.url),
         )  # fmt: skip
 
     def __enter__(self) -> Client:
@@ -86,6 +87,11 @@ class Client:
         return answer
 
     def _unreachable(self, error: httpx.HTTPError) -> DaemonError:
+        if "CERTIFICATE_VERIFY_FAILED" in str(error):
+            return DaemonError(
+                f"the certificate of {self.url} is not believed ({error}); name the authority that signed "
+                "it, or itself where it signed itself, in $DECANT_CA"
+            )
         return DaemonError(
             f"no daemon answers at {self.url} ({error}); start one with 'decant serve', or say where it is: --url, "
             "--state"
@@ -157,6 +163,17 @@ def _check(answer: httpx.Response) -> None:
         detail = "; ".join(f"{'.'.join(map(str, one['loc'][1:]))}: {one['msg']}" for one in detail)
     code = 2 if answer.status_code in (400, 404, 413, 422) else 1
     raise DaemonError(str(detail), code)
+
+
+def _trusted(url: str) -> ssl.SSLContext | bool:
+    """Whose certificates are believed: those of the authorities that this machine knows, or of $DECANT_CA."""
+    path = os.environ.get("DECANT_CA")
+    if not url.startswith("https") or not path:
+        return True
+    try:
+        return ssl.create_default_context(cafile=path)
+    except OSError as error:  # one that is not a certificate is an SSLError, which is an OSError
+        raise DaemonError(f"$DECANT_CA: {path}: can't be used as a certificate (PEM): {error}", 2) from None
 
 
 def _told(state: Path) -> str | None:

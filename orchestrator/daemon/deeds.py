@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import shutil
+from collections.abc import Callable, Iterator
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Path, Request
@@ -23,8 +25,9 @@ from orchestrator.daemon.shapes import (
     SubmissionIn,
     WhatMovesOut,
 )
+from orchestrator.daemon.store import Item
 from orchestrator.daemon.submitting import Submission, SubmissionError, prepare
-from orchestrator.daemon.supervisor import RefusedError
+from orchestrator.daemon.supervisor import RefusedError, Supervisor
 
 router = APIRouter()
 
@@ -34,93 +37,88 @@ async def submit(request: Request, daemon: Daemon, person: Operator, body: Submi
     """Queue a campaign. It is checked as `decant run` checks one, and kept as it is now."""
     if bool(body.text) == bool(body.path) or (body.path and body.files):
         raise HTTPException(422, "give either 'text' (with 'files') or 'path'")
-    try:
+    with _refusing():
         daemon.refuse_new_work()
+    try:
         submission = Submission(**body.model_dump())
         item = await asyncio.to_thread(prepare, daemon.settings, submission, daemon.new_key(), person.name)
     except SubmissionError as error:
         raise HTTPException(422, str(error)) from None
-    except RefusedError as error:
-        raise HTTPException(409, str(error)) from None
-    try:
-        return campaign_out(request, daemon, daemon.submit(item))
-    except RefusedError as error:
-        await asyncio.to_thread(shutil.rmtree, daemon.settings.snapshots / item.id, ignore_errors=True)
-        raise HTTPException(409, str(error)) from None
+    with _refusing():
+        try:
+            return campaign_out(request, daemon, daemon.submit(item))
+        except RefusedError:
+            await asyncio.to_thread(shutil.rmtree, daemon.settings.snapshots / item.id, ignore_errors=True)
+            raise
 
 
 @router.post("/campaigns/{key}/pause", operation_id="pause")
 async def pause(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
     """Come to rest at the next checkpoint: a pour that has begun is finished and weighed."""
-    found_item(daemon, key)
-    try:
-        return campaign_out(request, daemon, daemon.pause(key, person.name))
-    except RefusedError as error:
-        raise HTTPException(409, str(error)) from None
+    return _done(request, daemon, key, lambda: daemon.pause(key, person.name))
 
 
 @router.post("/campaigns/{key}/stop", operation_id="stop")
 async def stop(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
     """As pause; then what came of it so far is published, and it does not go on by itself."""
-    found_item(daemon, key)
-    try:
-        return campaign_out(request, daemon, daemon.stop(key, person.name))
-    except RefusedError as error:
-        raise HTTPException(409, str(error)) from None
+    return _done(request, daemon, key, lambda: daemon.stop(key, person.name))
 
 
 @router.post("/campaigns/{key}/abort", operation_id="abort")
 async def abort(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
     """Stop the motion. What is tilted is brought upright once somebody agrees; again: it is left as it is."""
     found_item(daemon, key)
-    try:
+    with _refusing():
         return campaign_out(request, daemon, await daemon.abort(key, person.name))
-    except RefusedError as error:
-        raise HTTPException(409, str(error)) from None
 
 
 @router.post("/campaigns/{key}/resume", operation_id="resume")
 async def resume(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
     """Go on with a campaign that rests. About a pour whose outcome nobody knows somebody is asked first."""
-    found_item(daemon, key)
-    try:
-        return campaign_out(request, daemon, daemon.resume(key, person.name))
-    except RefusedError as error:
-        raise HTTPException(409, str(error)) from None
+    return _done(request, daemon, key, lambda: daemon.resume(key, person.name))
 
 
 @router.post("/campaigns/{key}/move", operation_id="move")
 async def move(request: Request, daemon: Daemon, person: Operator, key: str, body: MoveIn) -> CampaignOut:
     """Another place in the queue."""
-    found_item(daemon, key)
     if body.before:
         found_item(daemon, body.before)
+    return _done(
+        request, daemon, key, lambda: daemon.move(key, person.name, before=body.before, priority=body.priority)
+    )
+
+
+def _done(request: Request, daemon: Supervisor, key: str, deed: Callable[[], Item]) -> CampaignOut:
+    """Something done to a campaign, which may be refused."""
+    found_item(daemon, key)
+    with _refusing():
+        return campaign_out(request, daemon, deed())
+
+
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """What can't be done now is 409, with the reason."""
     try:
-        item = daemon.move(key, person.name, before=body.before, priority=body.priority)
-    except RefusedError as error:
+        yield
+    except (RefusedError, NotArmedError) as error:
         raise HTTPException(409, str(error)) from None
-    return campaign_out(request, daemon, item)
 
 
 @router.get("/campaigns/{key}/arming", operation_id="arming")
 async def arming(daemon: Daemon, person: Operator, key: str) -> WhatMovesOut:
     """What hardware would do in this campaign, for somebody to read before arming it."""
     item = found_item(daemon, key)
-    try:
+    with _refusing():
         return await asyncio.to_thread(what_moves, daemon, item)
-    except NotArmedError as error:
-        raise HTTPException(409, str(error)) from None
 
 
 @router.post("/campaigns/{key}/arm", operation_id="arm")
 async def arm_it(request: Request, daemon: Daemon, person: Operator, key: str, body: ArmIn) -> CampaignOut:
     """Let hardware move in the coming part of this campaign's run."""
     item = found_item(daemon, key)
-    try:
-        armed = await asyncio.to_thread(what_moves, daemon, item)
-        return campaign_out(request, daemon, arm(daemon, item, armed, body.laboratory, person.name))
-    except NotArmedError as error:
-        raise HTTPException(409, str(error)) from None
+    with _refusing():
+        moves = await asyncio.to_thread(what_moves, daemon, item)
+        return campaign_out(request, daemon, arm(daemon, item, moves, body.laboratory, person.name))
 
 
 @router.post("/questions/{number}/answer", operation_id="answer")

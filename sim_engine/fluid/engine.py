@@ -44,6 +44,7 @@ class FluidEngine:
         self._grids = self._planes = np.zeros(1, np.float32)
         self._cavities = np.zeros(1, np.uint8)
         self._poses = np.zeros((1, 7), np.float32)
+        self._thick: list[bool] = []
 
     def room_for(self, counts: Sequence[int]) -> int:
         """How many of these scenes, given by their numbers of particles, fit into one load: the first so many.
@@ -90,13 +91,14 @@ class FluidEngine:
             f.poses_begin[s], f.table_step[s], f.table_length[s] = row, POSE_STEP, len(setup.poses)
             f.time[s], f.start[s], f.compression[s] = setup.start - setup.settling, setup.start, 0.0
             f.drift[s] = list(setup.drift)
-            f.steps[s], f.rebuilds[s], f.iterations[s], f.fault[s] = 0, 0, 0, 0
+            f.steps[s], f.rebuilds[s], f.iterations[s], f.passes[s], f.fault[s] = 0, 0, 0, 0, 0
             self._put(begin, np.ascontiguousarray(setup.positions, dtype=np.float32))
             begin += count
             row += len(setup.poses)
         self._grids, self._planes, self._cavities = values.array(), planes.array(), insides.array()
         self._poses = np.concatenate([s.poses for s in setups]).astype(np.float32)
         self.scenes = len(setups)
+        self._thick = [setup.viscosity > 0.0 for setup in setups]
         self.stepper.begin(0, self.scenes, self._poses)
 
     @ti.kernel
@@ -151,7 +153,13 @@ class FluidEngine:
         """
         end = self.scenes if end is None else end
         until = np.ascontiguousarray(until, np.float64)
-        self.stepper.advance(first, end, until, self._grids, self._planes, self._cavities, self._poses)
+        while first < end:  # neighbours of one kind at once
+            thick = self._thick[first]
+            last = first + 1
+            while last < end and self._thick[last] == thick:
+                last += 1
+            self.stepper.advance(first, last, until, self._grids, self._planes, self._cavities, self._poses, thick)
+            first = last
 
     def census(self, scene: int = 0) -> NDArray[np.int32]:
         """Particles in each `ParticleState`, shape (5,)."""

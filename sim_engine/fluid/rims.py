@@ -11,6 +11,8 @@ u being the particle's speed relative to the vessel. Liquid at rest meets a lip 
 hydrostatics says; one that flows faster than √(g d) meets the lip as it is, and leaves where the lip is. To shorten the
 wall along itself, whatever the flow, made jets leave behind the true lip.
 
+A film of a thick liquid that runs down at the mean speed u is √(3νu/g) thick (Nusselt 1916), where that is more.
+
 The lowering follows the speed within √(d/g), in which liquid passes a spacing, and no faster than `SLOWLY` allows.
 
 Source: ours; critical flow over a crest: Henderson 1966, Open Channel Flow, section 2.4.
@@ -19,7 +21,7 @@ Source: ours; critical flow over a crest: Henderson 1966, Open Channel Flow, sec
 import taichi as ti
 
 from sim_engine.fluid.state import VESSELS
-from sim_engine.fluid.vectors import square, turned
+from sim_engine.fluid.vectors import length, square, turned
 from sim_engine.fluid.walls import to_vessel
 
 NEAR = 4.0
@@ -30,7 +32,7 @@ SLOWLY = 0.05
 
 
 @ti.func
-def lower_rims(f: ti.template(), s, dt):
+def lower_rims(f: ti.template(), s, dt, thick: ti.template()):
     """Change by how much each vessel's rim is lower for each particle, over dt."""
     d = f.spacing[s]
     gravity = ti.max(f.gravity[s], 1e-3)
@@ -41,7 +43,10 @@ def lower_rims(f: ti.template(), s, dt):
                 y = to_vessel(f, s, b, f.x[i], False)
                 carried = turned(f.turn[s, b], y) + f.origin[s, b] - turned(f.turn0[s, b], y) - f.origin0[s, b]
                 u = f.v[i] - carried / dt
-                aim = f.lip_drop[s] * ti.max(d - square(u) / gravity, 0.0)
+                film = square(u) / gravity
+                if ti.static(thick):
+                    film = ti.max(film, ti.sqrt(3.0 * f.kinematic[s] * length(u) / gravity))
+                aim = f.lip_drop[s] * ti.max(d - film, 0.0)
                 change = share * (aim - f.sag[i][b])
                 f.sag[i][b] = f.sag[i][b] + ti.min(ti.max(change, -SLOWLY * d), SLOWLY * d)
             else:

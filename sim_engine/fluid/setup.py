@@ -53,6 +53,9 @@ class SceneSetup:
         drift: velocity that all liquid is given at `start`, (3,) [m/s].
         gravity: downwards [m/s²].
         longest_step: [s]; gravity, spacing and speeds may shorten it further. None: the solver's own.
+        viscosity: kinematic, of a liquid whose viscosity is simulated in SI [m²/s]; 0: θ's rate alone, walls slip.
+        no_slip: whether such a liquid sticks to walls.
+        tension: surface tension in place of θ's cohesion [N/m].
     """
 
     positions: NDArray[np.float32]
@@ -69,3 +72,6 @@ class SceneSetup:
     drift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gravity: float = GRAVITY
     longest_step: float | None = None
+    viscosity: float = 0.0
+    no_slip: bool = True
+    tension: float | None = None

@@ -85,6 +85,8 @@ class FluidState:
         self.viscosity = ti.field(ti.f32, shape=scenes)
         self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over that at which a pair parts
         self.friction = ti.field(ti.f32, shape=scenes)
+        self.kinematic = ti.field(ti.f32, shape=scenes)  # viscosity in SI [m²/s]; 0: `viscosity` alone
+        self.no_slip = ti.field(ti.f32, shape=scenes)  # 1: such a liquid sticks to walls, 0: it slips
         self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
         self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles at rest by so many spacings
@@ -107,6 +109,7 @@ class FluidState:
         self.pull_waited = ti.field(ti.f32, shape=scenes)  # … and cohesion [s]
         self.steps = ti.field(ti.i32, shape=scenes)
         self.iterations = ti.field(ti.i32, shape=scenes)
+        self.passes = ti.field(ti.i32, shape=scenes)  # of conjugate gradients
         self.rebuilds = ti.field(ti.i32, shape=scenes)
         self.moving = ti.field(ti.i32, shape=scenes)
         self.stale = ti.field(ti.i32, shape=scenes)  # 1: neighbour lists must be rebuilt
@@ -128,11 +131,13 @@ class FluidState:
         from sim_engine.fluid.viscosity import eddy_rate, relax_interval
 
         theta, density, d = setup.parameters, setup.density, setup.spacing
-        self.cohesion[s] = cohesion_acceleration(theta.cohesion, density, d)
-        self.pull_waited[s], self.pull_wait[s] = 0.0, pull_interval(theta.cohesion, density, d)
+        tension = theta.cohesion if setup.tension is None else setup.tension
+        self.cohesion[s] = cohesion_acceleration(tension, density, d)
+        self.pull_waited[s], self.pull_wait[s] = 0.0, pull_interval(tension, density, d)
         self.viscosity[s] = theta.viscosity
         self.eddies[s] = eddy_rate(theta.eddies)
         self.waited[s], self.wait[s] = 0.0, relax_interval(theta.viscosity)
         self.friction[s] = theta.friction
+        self.kinematic[s], self.no_slip[s] = setup.viscosity, 1.0 if setup.no_slip else 0.0
         self.lip_drop[s] = theta.lip_drop
         self.wall_shift[s] = (theta.wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT

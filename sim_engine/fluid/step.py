@@ -11,6 +11,7 @@ import taichi as ti
 
 from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
 from sim_engine.fluid.neighbours import rebuild
+from sim_engine.fluid.newtonian import STIFFEST, flow
 from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
@@ -96,7 +97,7 @@ class Stepper:
         return ti.sqrt(fastest)
 
     @ti.func
-    def predict(self, s, dt, grids: ti.template()):
+    def predict(self, s, dt, grids: ti.template(), thick: ti.template()):
         """Ballistic prediction, stopped by walls; asks for new lists if someone has moved too far."""
         f = self.state
         clear = CONTACT * f.spacing[s]
@@ -105,7 +106,8 @@ class Stepper:
             x0 = f.x[i]
             f.x0[i] = x0
             v = f.v[i]
-            v[2] -= f.gravity[s] * dt
+            if ti.static(not thick):
+                v[2] -= f.gravity[s] * dt
             x = x0 + dt * v
             # φ is that of the end of the last step: solid farther off than the way can't be met.
             reach = STRETCH * dt * length(v) + 2.0 * clear
@@ -287,12 +289,22 @@ class Stepper:
                 f.x[i] = x
 
     @ti.func
-    def step(self, s, grids: ti.template(), planes: ti.template(), cavities: ti.template(), poses: ti.template()):
+    def step(
+        self,
+        s,
+        grids: ti.template(),
+        planes: ti.template(),
+        cavities: ti.template(),
+        poses: ti.template(),
+        thick: ti.template(),
+    ):
         """One time step of one scene."""
         f = self.state
         fastest = self.top_speed(s)
         longest = ti.min(f.longest_step[s], PACE * ti.sqrt(f.spacing[s] / ti.max(f.gravity[s], 1e-3)))
         dt = ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), longest)
+        if ti.static(thick):
+            dt = ti.max(ti.min(dt, STIFFEST * f.spacing[s] ** 2 / f.kinematic[s]), SHORTEST_STEP)
         ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)
         f.dt[s] = dt
         f.origin0[s, 0] = f.origin[s, 0]
@@ -302,16 +314,19 @@ class Stepper:
         # No point within SWING_ARM of the pourer's origin is carried farther than this in the step.
         turned = f.turn[s, 0] - f.turn0[s, 0]
         f.swing[s, 0] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * SWING_ARM
-        self.predict(s, dt, grids)
+        if ti.static(thick):
+            flow(f, s, dt)
+        self.predict(s, dt, grids, thick)
         if f.stale[s] == 1:
             rebuild(f, s, SKIN)
         self.look_at_walls(s, planes)
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
-        f.waited[s] += dt
-        if f.waited[s] >= f.wait[s]:
-            relax(f, s, f.waited[s])
-            f.waited[s] = 0.0
+        if ti.static(not thick):
+            f.waited[s] += dt
+            if f.waited[s] >= f.wait[s]:
+                relax(f, s, f.waited[s])
+                f.waited[s] = 0.0
         # Too late is unstable: before it could be, not after.
         f.pull_waited[s] += dt
         if f.cohesion[s] > 0.0 and f.pull_waited[s] + dt > f.pull_wait[s]:
@@ -323,7 +338,7 @@ class Stepper:
         elif f.time[s] - dt < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] + f.drift[s]
-        lower_rims(f, s, dt)
+        lower_rims(f, s, dt, thick)
         self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1
@@ -351,15 +366,17 @@ class Stepper:
         planes: ti.types.ndarray(dtype=ti.f32, ndim=1),
         cavities: ti.types.ndarray(dtype=ti.u8, ndim=1),
         poses: ti.types.ndarray(dtype=ti.f32, ndim=2),
+        thick: ti.template(),
     ):
         """Run each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s] or a fault stops it.
 
-        Scenes are independent: on a GPU each has a thread, on a CPU they follow each other.
+        Scenes are independent: on a GPU each has a thread, on a CPU they follow each other. All of them are `thick`,
+        liquids of a viscosity in SI, or none is: two kernels, so that the one knows nothing of the other.
         """
         f = self.state
         for s in range(s0, s1):
             while f.time[s] < until[s] and f.fault[s] == 0:
-                self.step(s, grids, planes, cavities, poses)
+                self.step(s, grids, planes, cavities, poses, thick)
 
     @ti.kernel
     def census(self, s0: ti.i32, s1: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=2)):

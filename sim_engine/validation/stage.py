@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,6 +86,8 @@ def run(
     spill_level: float = -1e2,
     gravity: float = GRAVITY,
     longest_step: float | None = None,
+    viscosity: float = 0.0,
+    no_slip: bool = True,
 ) -> Iterator[int]:
     """Load a scene and run it to each of some times.
 
@@ -100,6 +102,8 @@ def run(
         spill_level: below it and outside the vessel a particle leaves the solver [m].
         gravity: downwards [m/s²].
         longest_step: in place of the solver's own [s].
+        viscosity: kinematic [m²/s]; 0: θ's rate alone.
+        no_slip: whether a liquid of such a viscosity sticks to the vessel.
 
     Yields:
         The index of each time when it has been reached: then the engine may be looked at.
@@ -128,6 +132,8 @@ def run(
         settling=settling,
         gravity=gravity,
         longest_step=longest_step,
+        viscosity=viscosity,
+        no_slip=no_slip,
     )
     fluid.load([setup])
     for k, time in enumerate(times):
@@ -135,3 +141,18 @@ def run(
         if fluid.fault() is not None:
             raise ArithmeticError(f"at {fluid.time():.3f} s: {fluid.fault()}")
         yield k
+
+
+def stir(add: Callable[[Floats], Floats]) -> None:
+    """Add to the velocities of the liquid that is loaded.
+
+    Args:
+        add: velocities (N, 3) [m/s] to add at positions (N, 3) [m].
+    """
+    from sim_engine.fluid.engine import engine
+
+    f = engine().state
+    n = int(f.particles[0])
+    v = f.v.to_numpy()
+    v[:n] += add(f.x.to_numpy()[:n].astype(float)).astype(np.float32)
+    f.v.from_numpy(v)

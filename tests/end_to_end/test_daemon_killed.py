@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -16,10 +17,12 @@ from typing import Any
 import pytest
 
 from orchestrator.codec import decode_outcome
+from orchestrator.daemon.auth import Role, token_of
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Poured
 from tests.end_to_end.command import ROOT, pour_under_way, started_after_they_were_finished
 from tests.end_to_end.small import CAMPAIGN, write_campaign
+from tests.orchestrator.daemon.browsing import browser
 from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
@@ -32,11 +35,16 @@ class Laboratory:
 
     def __init__(self, folder: Path, *options: str) -> None:
         self.folder, self.state, self.options = folder, folder / "state", options
+        self.settings: list[str] = []
+        self.in_process = True
+        self.environment: dict[str, str] = {}
         self.process: subprocess.Popen[str] | None = None
         self.log = (folder / "log").open("w+", encoding="utf-8")
 
     def start(self) -> None:
-        self.process = self._decant("serve", "--port", "0", "--in-process", *self.options, stdout=self.log)
+        port = [] if "--port" in self.options or self.settings else ["--port", "0"]
+        where = ["--in-process"] if self.in_process else ["--simulators", "1"]
+        self.process = self._decant("serve", *self.settings, *port, *where, *self.options, stdout=self.log)
         self.until(lambda: (self.state / "url").exists() and self.decant("list", check=False).returncode == 0)
 
     def kill(self) -> None:
@@ -54,7 +62,7 @@ class Laboratory:
         return subprocess.Popen(
             [sys.executable, "-c", "from orchestrator.cli import main; main()", *arguments, "--state", str(self.state)],
             cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            env={**os.environ, "PYTHONPATH": str(ROOT), **self.environment},
             stdin=subprocess.DEVNULL,
             stdout=stdout,
             stderr=subprocess.STDOUT if stdout is self.log else subprocess.PIPE,
@@ -96,7 +104,14 @@ class Laboratory:
 @pytest.fixture
 def laboratory(tmp_path: Path) -> Iterator[Laboratory]:
     write_campaign(tmp_path, SLOW_POURS)
-    found = Laboratory(tmp_path)
+    with opened(tmp_path) as found:
+        yield found
+
+
+@contextlib.contextmanager
+def opened(folder: Path, *options: str) -> Iterator[Laboratory]:
+    """A laboratory whose daemon does not outlive its test."""
+    found = Laboratory(folder, *options)
     try:
         yield found
     finally:
@@ -144,6 +159,47 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
     assert (poured.measurement.spilled, poured.measurement.retained) == pytest.approx((3.2e-3, 0.4e-3))
     answers = [e.body["answer"] for e in entries if e.kind == Kind.OPERATOR_ANSWERED]
     assert answers == ["weighed 3.2 0.4"]
+
+
+def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_sees_the_campaign_end(
+    tmp_path: Path,
+) -> None:
+    """`decant serve`, `decant submit`, kill -9 during a pour, `decant serve`: all the rest is done on the page."""
+    write_campaign(tmp_path, SLOW_POURS)
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    with browser() as chromium, opened(tmp_path, "--port", str(port)) as laboratory:
+        laboratory.start()
+        page = chromium.new_page(viewport={"width": 1024, "height": 768})
+        page.set_default_timeout(1e3 * PATIENCE)
+        page.goto(f"http://127.0.0.1:{port}/#token={token_of(laboratory.state / 'tokens', Role.OPERATOR)}")
+        key = laboratory.decant("submit", "small.yaml").stdout.strip()
+        laboratory.until(lambda: pour_under_way(laboratory.entries()))
+        page.locator(".step").wait_for()
+        laboratory.kill()
+        page.get_by_text("To stop the arm, use its own emergency stop").wait_for()
+        (unknown,) = {e.body["id"] for e in laboratory.entries() if e.kind == Kind.POUR_STARTED} - {
+            e.body["id"] for e in laboratory.entries() if e.kind == Kind.POUR_FINISHED
+        }
+
+        laboratory.start()
+        card = page.locator(".question")
+        card.get_by_role("heading", name="had begun when the run was interrupted").wait_for()
+        assert card.get_by_text("made of numbers").is_visible()
+        assert page.get_by_text("To stop the arm, use its own emergency stop").is_hidden()
+        card.get_by_label("Spilled").fill("3,2")
+        card.get_by_label("Left in the pourer").fill("0.4")
+        card.get_by_role("button", name="It was weighed").click()
+        card.wait_for(state="detached")
+        page.locator("#ended").get_by_text("finished").wait_for()
+        assert laboratory.told("show", key)["state"] == "finished"
+        assert laboratory.end() == 0
+
+        entries = laboratory.entries()
+        assert started_after_they_were_finished(entries) == []
+        assert [e.body["attempt"] for e in entries if e.kind == Kind.POUR_STARTED and e.body["id"] == unknown] == [1]
+        (said,) = [e.body["answer"] for e in entries if e.kind == Kind.OPERATOR_ANSWERED]
+        assert said == "weighed 3.2 0.4"
 
 
 def test_told_to_end_it_finishes_the_pour_and_goes_on_by_itself_when_it_is_started_again(

@@ -165,7 +165,6 @@ def test_a_pour_that_pours_nothing_is_warned_of_nothing() -> None:
     [
         ("dribbling", "weber", DRIBBLING_WEBER, "surface_tension"),
         ("wetting", "bond", WETTING_BOND, "surface_tension"),
-        ("viscous", "reynolds", VISCOUS_REYNOLDS, "dynamic_viscosity"),
     ],
 )
 def test_one_is_warned_below_the_limit_and_not_above(kind: str, name: str, limit: float, scaled: str) -> None:
@@ -190,10 +189,26 @@ def test_a_trickle_from_a_cup_that_is_hardly_tilted_dribbles_and_a_quick_pour_do
     assert kinds(planned(action=STANDARD.with_values(angular_velocity=90 * DEG))) == set()
 
 
-def test_glycerol_is_viscous_and_oil_says_so_with_its_viscosity() -> None:
-    assert kinds(of_liquid(density=1260.0, dynamic_viscosity=1.41, surface_tension=0.063)) == {"viscous"}
-    (told,) = of_liquid(density=915.0, dynamic_viscosity=0.084, surface_tension=0.032).not_covered
-    assert "(84 mPa*s)" in told.text
+def test_thick_liquids_are_simulated_and_told_only_beyond_what_was_checked() -> None:
+    assert kinds(of_liquid(density=1260.0, dynamic_viscosity=1.41, surface_tension=0.063)) == set()
+    (told,) = of_liquid(density=1400.0, dynamic_viscosity=9.0, surface_tension=0.08).not_covered
+    assert told.kind == "viscous"
+    assert told.share == 1.0
+    assert "9 Pa*s" in told.text
+
+
+def test_a_thin_liquid_from_a_small_cup_is_slowed_by_a_viscosity_that_is_not_simulated() -> None:
+    small = Scene(
+        "small",
+        cylinder("cup", inner_radius=0.01, inner_height=0.025),
+        cylinder("glass", inner_radius=0.02, inner_height=0.03),
+        Liquid(mass=0.003, dynamic_viscosity=4.5e-3, surface_tension=1e-3),
+    )
+    found = planned(small, STANDARD.with_values(x_offset=0.05, height=0.05))
+    assert found.lip is not None
+    assert found.lip.reynolds.smallest < VISCOUS_REYNOLDS
+    (told,) = (one for one in found.not_covered if one.kind == "viscous")
+    assert "(4.5 mPa*s)" in told.text
 
 
 def test_a_stream_of_too_few_particles_is_told_with_the_number_that_would_do() -> None:

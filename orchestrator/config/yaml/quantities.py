@@ -32,6 +32,7 @@ second = [time] = s = sec
 gram = [mass] = g
 radian = [angle] = rad
 byte = [information] = B
+celsius = [celsius] = degC
 degree = 0.017453292519943295 * radian = deg = °
 revolution = 6.283185307179586 * radian = rev = turn
 minute = 60 * second = min
@@ -50,7 +51,7 @@ percent = 0.01 = %
 
 FAMILIAR_UNITS = ("mm", "cm", "m", "in", "deg", "rad", "deg/s", "rad/s", "rpm", "deg/s^2", "rad/s^2", "s", "min", "ms",
                   "mL", "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s", "cP", "1/s", "Hz",
-                  "MB")  # fmt: skip
+                  "degC", "MB")  # fmt: skip
 
 KINDS = {
     "m": "a length",
@@ -65,6 +66,7 @@ KINDS = {
     "Pa*s": "a dynamic viscosity",
     "1/s": "a rate",
     "MB": "an amount of memory",
+    "degC": "a temperature in degrees Celsius",
     "1": "a plain number",
     "m/s": "a velocity",
     "m^3": "a volume",

@@ -1,7 +1,7 @@
 // The operator's page: what is going on, what is asked, and how to stop.
 
 import { Refused, call, knownToken, listen, saveReport, useToken } from "./talk.js";
-import { button, clock, draw, el, endedList, modeBadge, poursTable, questionCard, queueList, rigCard } from "./show.js";
+import { button, clock, draw, el, endedList, formerRuns, modeBadge, poursTable, questionCard, queueList, rigCard } from "./show.js";
 
 const $ = (id) => document.getElementById(id);
 const RUNNING = ["preparing", "running", "pausing", "waiting for operator", "stopping"];
@@ -170,9 +170,26 @@ const acts = {
   hold: (hold) => doing(hold ? "hold the queue" : "let the queue go on",
     () => call(`queue/${hold ? "pause" : "resume"}`, undefined, { method: "POST" })),
   report: (id) => doing("report", () => saveReport(id)),
+  formerReport: (run) => doing(`report of ${run.run}`, () => saveReport(run.run, "runs")),
+  note: async (run) => {
+    const text = prompt(`What is to be remembered of ${run.run}?`)?.trim();
+    if (!text) return;
+    await doing(`note on ${run.run}`, () => call(`runs/${encodeURIComponent(run.run)}/notes`, { text }));
+    await find();
+  },
   stopAll: () => doing("EMERGENCY STOP", () => call("emergency-stop", { reason: "from the page" })),
   clear: () => doing("clear the emergency stop", () => call("emergency-stop/clear", undefined, { method: "POST" })),
 };
+
+/** Former runs that have all the words. */
+async function find() {
+  const query = new URLSearchParams([["limit", 8], ...$("words").value.split(/\s+/).filter(Boolean).map((word) => ["words", word])]);
+  await doing("look for runs", async () => {
+    const runs = await call(`runs?${query}`, undefined, { timeout: 60000 });
+    draw(body("former"), runs, (found) => formerRuns(found, acts));
+    body("former").hidden = false;
+  });
+}
 
 // ---- coming and going
 
@@ -208,6 +225,7 @@ $("login").addEventListener("submit", (event) => {
   $("token").value = "";
   enter();
 });
+$("search").addEventListener("submit", (event) => { event.preventDefault(); find(); });
 $("stop-all").addEventListener("click", acts.stopAll);
 
 function come() { if (knownToken()) enter(); else leave(); }

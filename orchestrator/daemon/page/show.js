@@ -163,3 +163,18 @@ export function endedList(items, acts) {
       button(`resume ${item.id}`, "Go on", () => acts.resume(item), "plain") : null,
     item.report ? button(`report ${item.id}`, "Save report", () => acts.report(item.id), "plain") : null)));
 }
+
+/** Runs that were found, the newest first: what was poured, how well, what people said of it. */
+export function formerRuns(runs, acts) {
+  if (!runs.length) return el("p", { class: "quiet" }, "No run has all of this.");
+  const best = (run) => Object.entries(run.recommended).map(([into, found]) =>
+    `${into} ${found.best_loss === null ? "—" : percent(found.best_loss)}`).join(", ") || "—";
+  return el("ul", {}, runs.map((run) => el("li", {},
+    el("span", {}, el("b", {}, run.run), " ", modeBadge(run.mode), ` ${day(run.begun)}, ${stateText(run.state)}, ${run.pours} pours`,
+      ` of ${run.liquid.join(", ")}, best: ${best(run)}`, run.tags.map((tag) => [" ", el("b", { class: "badge" }, tag)]),
+      run.notes.map((note) => el("p", { class: "quiet" }, note))),
+    button(`note ${run.run}`, "Note", () => acts.note(run), "plain"),
+    button(`former ${run.run}`, "Save report", () => acts.formerReport(run), "plain"))));
+}
+
+const day = (seconds) => new Date(1000 * seconds).toLocaleDateString([], { year: "numeric", month: "short", day: "numeric" });

@@ -39,8 +39,8 @@ export async function call(path, body, { method, timeout = 15000 } = {}) {
 }
 
 /** A run's report, saved as a file: it is a page of its own, which this one's rules would not let work. */
-export async function saveReport(campaign) {
-  const response = await fetch(`${BASE}campaigns/${encodeURIComponent(campaign)}/report`,
+export async function saveReport(campaign, kind = "campaigns") {
+  const response = await fetch(`${BASE}${kind}/${encodeURIComponent(campaign)}/report`,
     { headers: { Authorization: `Bearer ${token}` } });
   if (!response.ok) throw new Refused(response.status, "there is no report yet");
   const link = document.createElement("a");

@@ -78,11 +78,13 @@ def test_all_errors_of_a_file_and_of_what_it_names_come_at_once(
         ("surface_tension: 72", "72 has no unit; write '72 mN/m' if that is what is meant"),
         ("surface_tension: 72 N/m", "72 N/m is outside 1 … 1000 mN/m"),
         (
-            "dynamic_viscosity: 1 mN/m",
+            "viscosity: 1 mN/m",
             "'1 mN/m' is a surface tension; should be a dynamic viscosity, for example '1 mPa*s'",
         ),
-        ("dynamic_viscosity: 0 mPa*s", "0 mPa*s is outside 0.01 … 1e+06 mPa*s"),
-        ("viscosity: 1 mPa*s", "liquid.viscosity: unknown key; did you mean 'dynamic_viscosity'?"),
+        ("viscosity: 0 mPa*s", "0 mPa*s is outside 0.01 … 1e+06 mPa*s"),
+        ("dynamic_viscosity: 1 mPa*s", "liquid.dynamic_viscosity: unknown key; did you mean 'viscosity'?"),
+        ("temperature: 25", "25 has no unit; write '25 degC' if that is what is meant"),
+        ("temperature: 98 degC", "water is known from 0 to 95 °C, not at 98 °C"),
     ],
 )
 def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, message: str, tmp_path: Path) -> None:
@@ -96,7 +98,7 @@ def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, mes
 def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_after_its_density_was(
     tmp_path: Path,
 ) -> None:
-    """Tension and viscosity decide which warnings are given, and no request."""
+    """Of a liquid as thin as water tension and viscosity decide which warnings are given, and no request."""
     text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
 
     def printed(addition: str) -> object:
@@ -104,8 +106,11 @@ def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_a
         path.write_text(text.replace("mass: 200 g", f"mass: 200 g{addition}"), encoding="utf-8")
         return fingerprint(load_campaign(path))
 
-    assert printed("") == printed(", surface_tension: 40 mN/m, dynamic_viscosity: 2 mPa*s")
+    assert printed("") == printed(", surface_tension: 40 mN/m, viscosity: 2 mPa*s")
     assert printed("") != printed(", density: 900 kg/m^3")
+    thick = ", viscosity: 50 mPa*s"
+    assert printed(thick) != printed(thick + ", surface_tension: 40 mN/m")
+    assert printed(thick) != printed(", viscosity: 60 mPa*s")
 
 
 def test_error_shows_the_line_and_a_caret_under_the_culprit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +157,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
             balance: {{resolution: 0.01 g, noise: 0.2 g, drift: 0.5 g/min, settling_time: 2.5 s}}
             time_scale: 12
             operator_time: 1 min
-        liquid: {{name: oil, mass: 0.15 kg, density: 0.92 g/cm^3, surface_tension: 32 mN/m, dynamic_viscosity: 84 cP}}
+        liquid: {{name: oil, mass: 0.15 kg, density: 0.92 g/cm^3, surface_tension: 32 mN/m, viscosity: 84 cP}}
         pourer: {vessels}/beaker.yaml
         motion:
           pivot: {{x: 30 mm, z: 70 mm}}

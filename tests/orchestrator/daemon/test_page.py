@@ -13,6 +13,7 @@ from actors.operator import Question
 from actors.spec import LaboratorySpec
 from orchestrator.daemon.auth import Role
 from orchestrator.daemon.settings import Rig
+from orchestrator.state_directory import VARIABLE
 from tests.orchestrator.daemon.browsing import OnPort, browser, on_port
 from tests.orchestrator.daemon.served import HeldBench, HeldLaboratory
 from tests.orchestrator.toy import ToyOptimizer, ToySimulators
@@ -357,11 +358,42 @@ def test_a_screen_reader_finds_its_way(page: Any, tmp_path: Path) -> None:
         page.get_by_role("button", name="Done").wait_for()
         for role in ("banner", "main"):
             assert page.get_by_role(role).count() == 1
-        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Stop"):
+        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Former runs", "Stop"):
             assert page.get_by_role("region", name=name, exact=True).count() == 1
         assert page.get_by_role("article", name="Fill the pourer").count() == 1
         assert page.evaluate("document.documentElement.lang") == "en"
         assert page.evaluate("document.activeElement.tagName") == "H2"  # the question, where nobody stood elsewhere
+
+
+def test_former_runs_are_found_and_what_is_noted_of_them_is_found_again(
+    page: Any, tmp_path: Path, former: None
+) -> None:
+    page.set_viewport_size({"width": 390, "height": 844})
+    with on_port(tmp_path, HeldLaboratory) as lab:
+        key = lab.do(lab.served.submit())
+        run = lab.do(lab.served.until(key, "finished"))["run"]
+        page.goto(lab.address(Role.OPERATOR))
+        page.get_by_label("Vessel, liquid, tag, any words").fill("narrow water")
+        page.get_by_role("button", name="Find").click()
+        found = page.locator("#former li")
+        found.get_by_text(run).wait_for()
+        assert page.evaluate(LEGIBLE) == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        page.once("dialog", lambda asked: asked.accept("the tray was <b>wet</b>"))
+        found.get_by_role("button", name="Note").click()
+        found.get_by_text("the tray was <b>wet</b>").wait_for()
+        with page.expect_download() as saved:
+            found.get_by_role("button", name="Save report").click()
+        assert saved.value.suggested_filename == f"{run}.html"
+        page.get_by_label("Vessel, liquid, tag, any words").fill("narrow glycerol")
+        page.keyboard.press("Enter")
+        page.get_by_text("No run has all of this.").wait_for()
+
+
+@pytest.fixture
+def former(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The daemon's runs are in the catalogue of its own state directory, as `decant serve` has it."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "state"))
 
 
 def queued(lab: OnPort) -> list[str]:

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
+from typing import Any
 
+import pytest
+from typer.testing import CliRunner
+
+from orchestrator.cli import app
 from orchestrator.config.load import load_laboratory
-from orchestrator.daemon.settings import Rig
+from orchestrator.daemon.running import job_of
+from orchestrator.daemon.settings import DESK, Rig
+from tests.end_to_end.small import NARROW
 from tests.orchestrator.daemon.served import HeldLaboratory, campaign_in, held, run, serving
 
 
@@ -118,5 +126,39 @@ def test_a_campaign_for_no_rig_there_is_is_refused_with_those_there_are(tmp_path
             told = await served.post("/campaigns", {"text": text, "files": files, "rig": "lefft"}, status=422)
             assert told["detail"] == "there is no rig 'lefft'; there are virtual"
             assert not list((tmp_path / "state/campaigns").iterdir())
+
+    run(work())
+
+
+def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_plan_makes_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theta, bowl = tmp_path / "theta.json", tmp_path / "bowl.yaml"
+    theta.write_text('{"friction": 0.21}', encoding="utf-8")
+    bowl.write_text(NARROW.replace("narrow", "bowl"), encoding="utf-8")
+    sent: dict[str, Any] = {}
+
+    class Told:
+        def post(self, path: str, body: Any) -> dict[str, Any]:
+            sent.update(body)
+            return {"id": "x", "rig": "desk", "needs_arming": False}
+
+    monkeypatch.setattr("orchestrator.commands.daemon.talking", lambda at: contextlib.nullcontext(Told()))
+    arguments = ["submit", str(campaign_in(tmp_path)), "--parameters", str(theta), "--receiver", str(bowl)]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 2
+    assert "--verb plan" in refused.stderr
+    assert not sent
+    assert CliRunner().invoke(app, [*arguments, "--verb", "plan"]).exit_code == 0
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            key = (await served.post("/campaigns", sent))["id"]
+            found = await served.until(key, "finished")
+            plan = job_of(served.daemon.settings, served.daemon.item(key), Rig(DESK)).plan
+            assert plan.parameters.friction == 0.21
+            assert found["name"] == plan.name == "cup-plan"
+            assert [scene.receiver.name for scene in plan.deployment.scenes] == ["bowl"]  # type: ignore[union-attr]
+            assert len(found["summary"]["receivers"]) == 1
 
     run(work())

@@ -60,7 +60,7 @@ def test_a_warning_names_the_worst_action_and_how_many_were_tried() -> None:
 
 
 def test_a_viscous_liquid_is_told_by_its_viscosity_alone() -> None:
-    (warnings,) = campaign_warnings(deploying(QUICK, dynamic_viscosity=1.4)).values()
+    (warnings,) = campaign_warnings(deploying(QUICK, dynamic_viscosity=3.0)).values()
     assert [one.worst.kind for one in warnings] == ["viscous"]
 
 

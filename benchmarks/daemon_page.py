@@ -1,0 +1,113 @@
+"""Writes what was measured of the daemon into docs/daemon.md: `python benchmarks/daemon_page.py`.
+
+What was measured stands in docs/daemon.json; `daemon_stops`, `soak` and `idle_time` put it there and call this.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parents[1] / "docs"
+FIGURES, PAGE = DOCS / "daemon.json", DOCS / "daemon.md"
+MARKED = re.compile(r"(<!-- measured: ([\w-]+) -->\n).*?(<!-- end of what was measured -->)", re.DOTALL)
+
+UNTIL = {
+    "pause": "the daemon has taken note; the pour goes on by intention",
+    "stop": "likewise",
+    "abort": "the arm has confirmed that it stands",
+    "emergency stop": "likewise",
+}
+BENCHES = {"numbers": "", "wires": " over wires"}
+
+
+def keep(name: str, found: Mapping[str, Any]) -> None:
+    """Write down what was measured, and bring the page up to date."""
+    figures = measured()
+    figures[name] = dict(found)
+    FIGURES.write_text(json.dumps(figures, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    main()
+
+
+def measured() -> dict[str, Any]:
+    """All that was."""
+    found: dict[str, Any] = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.is_file() else {}
+    return found
+
+
+def render(page: str, figures: Mapping[str, Any]) -> str:
+    """A page with its tables as they should be; those that nobody has measured stay as they are."""
+
+    def table(match: re.Match[str]) -> str:
+        found = figures.get(match[2])
+        return match[0] if found is None else f"{match[1]}{TABLES[match[2]](found)}{match[3]}"
+
+    return MARKED.sub(table, page)
+
+
+def stops(found: Mapping[str, Any]) -> str:
+    """Median and worst of each grade, by load [ms]."""
+    loads = {"idle": "idle", "readers": "200 readers of events", "saturated": "saturated"}
+    rows = []
+    for bench, words in BENCHES.items():
+        for grade, until in UNTIL.items():
+            cells = {
+                one["load"]: f"{one['median']:.0f} / {one['worst']:.0f}"
+                for one in found["stops"]
+                if (one["bench"], one["grade"]) == (bench, grade)
+            }
+            if cells:
+                rows.append((grade + words, until, *(cells.get(load, "") for load in loads)))
+    first = ", ".join(f"{ms}" for ms in found["first simulation of a plan"])
+    return (
+        f"Median / worst of {found['times']} [ms], on {found['cores']} cores with a load of {found['load before']} "
+        f"beforehand; the first simulation of a submitted plan began after {first} ms.\n\n"
+        + _table(("", "until", *loads.values()), rows)
+    )
+
+
+def soak(found: Mapping[str, Any]) -> str:
+    """What there was at a third of the time, at the end, and how it went."""
+    rows = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
+    journals = found["journal of one campaign [kB]"]
+    return (
+        f"{found['minutes']:.0f} minutes, {found['campaigns']} campaigns, {100 * found['cpu share']:.0f} % of a core "
+        f"on average; the journal of a plain campaign took {journals[0]} to {journals[-1]} kB. Looked at between "
+        "campaigns:\n\n" + _table(("", "after a third", "at the end", "an hour"), rows)
+    )
+
+
+def idle_time(found: Mapping[str, Any]) -> str:
+    """Wall time with and without simulations ahead."""
+    rows = []
+    times = "once" if found["times"] == 1 else f"the median of {found['times']}"
+    for run in found["runs"]:
+        without = run["ahead"] == "no"
+        seconds = f"{run['wall']:.0f} s", f"{run['arm']:.0f} s", f"{run['wall'] - run['arm']:.0f} s"
+        made = "without" if without else f"{run['made ahead']:.0f} of them"
+        rows.append((run["campaign"], made, *seconds, "yes" if run["same decisions"] else "NO"))
+    return (
+        f"On {found['cores']} cores with a load of {found['load before']} beforehand, in turn, "
+        f"{times}:\n\n"
+        + _table(("campaign", "simulations ahead", "wall", "the arm's own", "the rest", "same decisions"), rows)
+    )
+
+
+TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {"stops": stops, "soak": soak, "idle-time": idle_time}
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
+
+
+def main() -> None:
+    """Bring the page up to date."""
+    PAGE.write_text(render(PAGE.read_text(encoding="utf-8"), measured()), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

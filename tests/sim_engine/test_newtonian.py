@@ -1,0 +1,74 @@
+"""Liquids with a viscosity in SI: what walls do to them, and what becomes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from sim_engine.action import DEG, Action
+from sim_engine.liquid import THIN, Liquid, SimulationParameters
+from sim_engine.pour import PourSimulator
+from sim_engine.task import PourTask, Scene
+from sim_engine.validation import films
+from sim_engine.vessel.spec import cylinder
+
+PLAIN = SimulationParameters(cohesion=0.0, viscosity=0.0)
+SCENE = Scene(
+    "scene",
+    cylinder("cup", inner_radius=0.04, inner_height=0.1),
+    cylinder("glass", inner_radius=0.045, inner_height=0.09),
+    Liquid(mass=0.1),
+)
+STANDARD = Action(angular_velocity=60 * DEG, max_angle=110 * DEG, x_offset=0.1, height=0.12)
+
+
+def poured(viscosity: float, factor: float = 1.0) -> PourTask:
+    """A pour of 400 particles of a liquid as dense as water."""
+    liquid = SCENE.liquid.model_copy(update={"dynamic_viscosity": viscosity})
+    theta = SimulationParameters(particles=400, viscosity_factor=factor)
+    return PourTask(replace(SCENE, liquid=liquid), STANDARD, theta, seed=1)
+
+
+def test_a_puddle_of_syrup_spreads_as_huppert_says(simulator: PourSimulator) -> None:
+    found, _ = films.spreading(1_000, 2e-3, PLAIN)
+    assert found[0].value < 0.12  # of the radius, over a second and a half
+
+
+def test_a_film_on_an_incline_is_slow_at_the_wall_and_as_fast_as_nusselt_s_in_the_mean(
+    simulator: PourSimulator,
+) -> None:
+    (mean,), (profile, _) = films.down_an_incline(4, 1e-3, PLAIN)
+    assert mean.passed, mean
+    assert profile.y[0] < 0.5 < 1.3 < profile.y[-1]
+
+
+def test_the_thicker_the_more_stays_in_the_cup(simulator: PourSimulator) -> None:
+    thin, oil, syrup = simulator.simulate_many([poured(1e-3), poured(0.08), poured(2.0)])
+    left = [run.outcome.retained for run in (thin, oil, syrup)]
+    assert all(run.outcome.invalid is None for run in (thin, oil, syrup))
+    assert left[0] < left[1] < left[2]
+    assert left[2] > 0.1
+
+
+def test_a_batch_of_thin_and_thick_liquids_is_bit_for_bit_what_each_is_alone(simulator: PourSimulator) -> None:
+    tasks = [poured(1e-3), poured(0.5), poured(1e-3)]
+    together = [run.outcome for run in simulator.simulate_many(tasks)]
+    for task, one in zip(tasks, together, strict=True):
+        assert simulator.simulate(task).outcome.curve_poured == one.curve_poured
+
+
+def test_the_factor_is_that_of_the_viscosity_and_none_to_a_liquid_as_thin_as_water(simulator: PourSimulator) -> None:
+    assert (
+        simulator.simulate(poured(0.1, 5.0)).outcome.curve_poured
+        == simulator.simulate(poured(0.5)).outcome.curve_poured
+    )
+    assert (
+        simulator.simulate(poured(1e-3, 5.0)).outcome.curve_poured
+        == simulator.simulate(poured(2e-3)).outcome.curve_poured
+    )
+
+
+@pytest.mark.parametrize(("viscosity", "thick"), [(0.99 * THIN * 998.0, False), (1.01 * THIN * 998.0, True)])
+def test_thick_is_what_is_above_five_times_water(viscosity: float, thick: bool) -> None:
+    assert SCENE.liquid.model_copy(update={"dynamic_viscosity": viscosity}).is_thick is thick
