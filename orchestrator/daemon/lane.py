@@ -130,9 +130,6 @@ class Lane:
             needs_person = getattr(error, "exit_code", 1) == 3
             self._daemon.suspect |= isinstance(error, LaboratoryError | LaneError)
             state, reason = ("paused" if needs_person else "failed"), str(error)
-            if lost := self._common.warm.lost:  # not the campaign's fault: it goes on with new simulators
-                self._daemon.tell_lost(lost)
-                state, wish = "paused", self._kept_wish(item)
         except Exception as error:
             state, reason = "failed", f"{type(error).__name__}: {error}"
             _log.exception("campaign %s failed", item.id)
