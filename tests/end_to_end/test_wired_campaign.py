@@ -37,7 +37,7 @@ def write_wired(folder: Path) -> None:
     campaign["laboratory"] = "lab.yaml"
     campaign["motion"]["return_velocity"] = "100 deg/s"
     calibration, deployment = campaign["calibration"], campaign["deployment"]
-    calibration |= {"pours": {"count": 2}, "simulations": 3, "initial": 2}
+    calibration |= {"simulations": 3, "initial": 2}
     deployment |= {"prior_simulations": 2, "per_pour": 1}
     for stage in (calibration, deployment):
         stage["motion"]["height"] = "80 mm"
@@ -84,7 +84,7 @@ def test_a_campaign_over_wires_is_killed_in_a_pour_resumed_and_comes_to_its_end(
     workplace.finish(*RUN, "--resume")
     entries = workplace.entries()
     pours = [e.body["outcome"]["measurement"] for e in entries if e.kind == Kind.POUR_FINISHED]
-    assert len(pours) == 2 + 2
+    assert len(pours) == 3 + 2
     assert started_after_they_were_finished(entries) == []
     for measured in pours:
         assert measured["loaded"] == pytest.approx(0.1, abs=5e-3)
