@@ -1,105 +1,220 @@
-"""Runs the kill matrix, or as much of it as time allows, and writes docs/reliability.md's table.
+"""Runs the kill matrix, and writes docs/reliability.md's tables and docs/kill-matrix.csv.
 
-python -m tests.reliability.page --jobs 2                    # all cases: minutes on two idle cores
-python -m tests.reliability.page --jobs 2 --minutes 5        # as many as that, drawn by a fixed seed
+python -m tests.reliability.page --jobs 2                      # all cases: within an hour on two idle cores
+python -m tests.reliability.page --only controller balance     # of these targets alone
+python -m tests.reliability.page --write                       # no case: the tables of what was run
+
+Each case's outcome is written into build/kill-matrix.jsonl as soon as it is known; cases that stand there are not run
+again, unless they went wrong, until `--fresh` throws them away.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import importlib
 import json
 import random
 import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tests.reliability.matrix import FAULTS, LOST, Case, Matrix, can_mount
+from tests.reliability.case import FAULTS, NO_MEANING, TARGETS, Case
+from tests.reliability.rig import Rig
+from tests.reliability.strikes import can_mount
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "reliability.md"
-BEGIN, END = "<!-- table: kill matrix -->\n", "<!-- end of table -->"
+PAGE, LIST = ROOT / "docs" / "reliability.md", ROOT / "docs" / "kill-matrix.csv"
+RESULTS = ROOT / "build" / "kill-matrix.jsonl"
+BEGIN, END = "<!-- table: {} -->\n", "<!-- end of table -->"
 SEED = 13
 
+RIGS = {
+    "program": "program:ProgramRig",
+    "daemon": "served:DaemonRig",
+    "simulator": "pooled:SimulatorRig",
+    "optimiser": "pooled:OptimiserRig",
+    "worker": "wired:WorkerRig",
+    "controller": "wired:ControllerRig",
+    "balance": "wired:BalanceRig",
+    "recording": "recorded:RecordingRig",
+    "ray": "own_ray:RayRig",
+}
+"""Where the rig of each target is."""
 
-def work(number: int, jobs: int, minutes: float, file: Path) -> None:
-    """One process' share of the cases, each written down as soon as it has ended."""
-    end = time.monotonic() + 60.0 * minutes
-    with tempfile.TemporaryDirectory() as folder, file.open("a", encoding="utf-8") as out:
-        matrix = Matrix(Path(folder))
+
+def rig_of(target: str, folder: Path) -> Rig:
+    """Ready to play."""
+    module, _, name = RIGS[target].partition(":")
+    rig: Rig = getattr(importlib.import_module(f"tests.reliability.{module}"), name)(folder)
+    return rig
+
+
+def found(results: Path) -> dict[str, dict[str, Any]]:
+    """The last outcome of each case that was run, by name."""
+    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
+    rows = [json.loads(line) for line in lines]
+    return {Case(**row["case"]).name: row for row in rows if "case" in row}
+
+
+def work(target: str, number: int, shares: int, results: Path, limit: int | None = None) -> None:
+    """One process' share of a target's cases, each written down as soon as it has ended."""
+    with tempfile.TemporaryDirectory() as folder, results.open("a", encoding="utf-8") as out:
+        rig = rig_of(target, Path(folder))
         mounting = can_mount(Path(folder))
-        cases = [case for case in matrix.cases() if case.fault != "full disk" or mounting]
+        cases = [case for case in rig.cases() if case.fault != "full disk" or mounting]
         random.Random(SEED).shuffle(cases)
-        out.write(json.dumps({"cases": len(cases)}) + "\n")
-        for case in cases[number::jobs]:
-            if time.monotonic() > end:
-                break
-            out.write(json.dumps(asdict(matrix.play(case))) + "\n")
+        out.write(json.dumps({"target": target, "cases": len(cases), "points": len(rig.points)}) + "\n")
+        done = {name for name, row in found(results).items() if not row["wrong"]}
+        for case in [case for case in cases[number::shares] if case.name not in done][:limit]:
+            outcome = rig.play(case)
+            out.write(json.dumps({**asdict(outcome), "t": time.time(), "code": commit()}) + "\n")
             out.flush()
+            print(case.name, *outcome.wrong, sep=" | ", flush=True)
+        rig.close()
 
 
-def table(rows: Sequence[dict[str, Any]], cases: int) -> str:
-    """Cases by fault and stage: how many, how they ended, what was asked, what was wrong."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
-    for row in rows:
-        stage = "all stages" if row["case"]["fault"] == LOST else row["at"].partition(": ")[0].partition(":")[0]
-        groups[row["case"]["fault"], stage].append(row)
-    wrong = sum(bool(row["wrong"]) for row in rows)
+def commit() -> str:
+    """Of the program that was tried."""
+    floors = ("HEAD:orchestrator", "HEAD:actors", "HEAD:sim_engine")
+    command = ["git", "-C", str(ROOT), "rev-parse", *floors]
+    said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    return " ".join(word[:10] for word in said.split())
+
+
+def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
+    """All cases of some targets, so many processes at a time; whether all of them came to their end."""
+    shares = {"program": jobs}  # of those with many cases; a process of each of the others
+    tasks = [(target, n, shares.get(target, 1)) for target in targets for n in range(shares.get(target, 1))]
+    running: list[subprocess.Popen[bytes]] = []
+    good = True
+    while tasks or running:
+        while tasks and len(running) < jobs:
+            target, number, of = tasks.pop(0)
+            arguments = ["--results", str(results), "--share", target, str(number), str(of)]
+            running.append(subprocess.Popen([sys.executable, "-m", "tests.reliability.page", *arguments], cwd=ROOT))
+        time.sleep(0.2)
+        good &= all(process.returncode in (None, 0) for process in running)
+        running = [process for process in running if process.poll() is None]
+    return good
+
+
+# ---- tables
+
+
+def overview(rows: Sequence[dict[str, Any]]) -> str:
+    """Targets by faults: how many cases, or why there are none."""
+    count = Counter((row["case"]["target"], row["case"]["fault"]) for row in rows)
     lines = [
-        f"{len(rows)} of {cases} cases were run, {wrong} ended otherwise than they should.",
-        "",
-        "| fault | while writing in | cases | the struck process | a person was asked | as undisturbed |",
-        "|---|---|---|---|---|---|",
+        "| struck | " + " | ".join(FAULTS) + " |",
+        "|---|" + "---|" * len(FAULTS),
     ]
-    order = {name: i for i, name in enumerate((*FAULTS, LOST))}
-    for (fault, stage), some in sorted(groups.items(), key=lambda item: (order[item[0][0]], item[0][1])):
-        ended = defaultdict(int)
-        for row in some:
-            ended[row["said"]] += 1
-        said = ", ".join(f"{text} ({count})" for text, count in sorted(ended.items()))
-        good = sum(not row["wrong"] for row in some)
-        lines.append(
-            f"| {fault} | {stage} | {len(some)} | {said} | {sum(r['asked'] for r in some)} | {good} of {len(some)} |"
-        )
+    for target in TARGETS:
+        cells = [str(count[target, fault]) if count[target, fault] else "–" for fault in FAULTS]
+        lines.append(f"| {target} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def write(file: Path) -> int:
-    """The table of what is in a file of results; returns how many cases went wrong."""
-    found = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    rows = [row for row in found if "case" in row]
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    page = before + BEGIN + table(rows, max(row["cases"] for row in found if "cases" in row)) + END
-    PAGE.write_text(page + rest.partition(END)[2], encoding="utf-8")
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """By target and fault: how they ended, what was told and asked, what was wrong."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        groups[row["case"]["target"], row["case"]["fault"]].append(row)
+    wrong = sum(bool(row["wrong"]) for row in rows)
+    cpu = sum(row["cpu_s"] for row in rows)
+    lines = [
+        f"{len(rows)} cases were run, {wrong} ended otherwise than they should. They took {cpu:.0f} seconds of a core: "
+        f"{cpu / 120:.0f} minutes of two.",
+        "",
+        "| struck | fault | cases | the first life of the program | people at the bench were asked about | "
+        "unknown pours, asked about | as undisturbed |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    order = {name: i for i, name in enumerate((*TARGETS, *FAULTS))}
+    for (target, fault), some in sorted(groups.items(), key=lambda item: tuple(order[name] for name in item[0])):
+        ended = counted(row["ended"] for row in some)
+        heard = counted(about for row in some for about in row["heard"]) or "–"
+        good = sum(not row["wrong"] for row in some)
+        asked = sum(row["asked"] for row in some)
+        lines.append(f"| {target} | {fault} | {len(some)} | {ended} | {heard} | {asked} | {good} of {len(some)} |")
+    return "\n".join(lines) + "\n"
+
+
+def counted(words: Any) -> str:
+    """Each with how often it was said."""
+    return ", ".join(f"{text} ({count})" for text, count in sorted(Counter(words).items()))
+
+
+def reasons() -> str:
+    """What isn't tried, and why."""
+    by_reason: dict[str, dict[str, list[str]]] = defaultdict(dict)
+    for (target, fault), why in NO_MEANING.items():
+        by_reason[why].setdefault(target, []).append(fault)
+    lines = []
+    for why, targets in by_reason.items():
+        faults = dict.fromkeys(fault for some in targets.values() for fault in some)
+        lines.append(f"- {', '.join(targets)}; {', '.join(faults)}: {why}\n")
+    return "".join(lines)
+
+
+def write(results: Path) -> int:
+    """The tables of what is in a file of results; returns how many cases went wrong."""
+    rows = list(found(results).values())
+    page = PAGE.read_text(encoding="utf-8")
+    for name, text in (("cases", overview(rows)), ("kill matrix", table(rows)), ("no meaning", reasons())):
+        before, _, rest = page.partition(BEGIN.format(name))
+        page = before + BEGIN.format(name) + text + END + rest.partition(END)[2]
+    PAGE.write_text(page, encoding="utf-8")
+    order = {name: i for i, name in enumerate((*TARGETS, *FAULTS))}
+    rows.sort(key=lambda row: (order[row["case"]["target"]], order[row["case"]["fault"]]))
+    with LIST.open("w", encoding="utf-8", newline="") as file:
+        out = csv.writer(file, lineterminator="\n")
+        out.writerow(
+            ["struck", "fault", "at", "number", "first life", "told", "lives", "asked", "bench asked", "wrong"]
+        )
+        for row in rows:
+            case, told = row["case"], " ".join(row["told"].split())[:100]
+            out.writerow([*case.values(), row["ended"], anonymous(told), row["lives"], row["asked"],
+                          " ".join(row["heard"]), "; ".join(row["wrong"])])  # fmt: skip
     for row in rows:
         if row["wrong"]:
-            print(Case(**row["case"]), row["at"], row["wrong"])
+            print(Case(**row["case"]).name, row["wrong"])
     return sum(bool(row["wrong"]) for row in rows)
+
+
+def anonymous(text: str) -> str:
+    """Without the folders and numbers of processes that nobody will find again."""
+    import re
+
+    return re.sub(r"/tmp/\S+?(?=[:\s,]|$)", "…", text)
 
 
 def main() -> None:
     """Run and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--minutes", type=float, default=600.0)
-    parser.add_argument("--results", type=Path, default=ROOT / "build" / "kill-matrix.jsonl")
-    parser.add_argument("--number", type=int, default=None, help=argparse.SUPPRESS)
+    parser.add_argument("--only", nargs="+", choices=list(RIGS), default=list(RIGS))
+    parser.add_argument("--limit", type=int, default=None, help="as many cases of each share, and no more")
+    parser.add_argument("--fresh", action="store_true")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--share", nargs=3, default=None, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.number is not None:
-        work(options.number, options.jobs, options.minutes, options.results)
+    if options.share is not None:
+        target, number, shares = options.share
+        work(target, int(number), int(shares), options.results, options.limit)
         return
     options.results.parent.mkdir(exist_ok=True)
-    options.results.unlink(missing_ok=True)
-    shared = ["--jobs", str(options.jobs), "--minutes", str(options.minutes), "--results", str(options.results)]
-    program = [sys.executable, "-m", "tests.reliability.page", *shared, "--number"]
-    workers = [subprocess.Popen([*program, str(number)], cwd=ROOT) for number in range(options.jobs)]
-    failed = [worker.wait() for worker in workers]
-    sys.exit(1 if any(failed) or write(options.results) else 0)
+    if options.fresh:
+        options.results.unlink(missing_ok=True)
+    good = options.write or run(options.only, options.jobs, options.results)
+    sys.exit(1 if write(options.results) or not good else 0)
 
 
 if __name__ == "__main__":

@@ -2,43 +2,121 @@
 
 from __future__ import annotations
 
+import os
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 
-from tests.reliability.matrix import FAULTS, LOST, Case, Matrix, can_mount
+from tests.reliability import strikes
+from tests.reliability.case import (
+    BACK,
+    FAULTS,
+    FULL,
+    KILLED,
+    KILLED_AFTER,
+    NO_MEANING,
+    TARGETS,
+    Case,
+    first_and_last,
+    first_in_stages,
+    first_of_kind,
+)
+from tests.reliability.page import RIGS, rig_of
+from tests.reliability.program import ProgramRig
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def matrix(tmp_path_factory: pytest.TempPathFactory) -> Matrix:
-    return Matrix(tmp_path_factory.mktemp("matrix"))
+def rig(tmp_path_factory: pytest.TempPathFactory) -> ProgramRig:
+    return ProgramRig(tmp_path_factory.mktemp("matrix"))
 
 
-def played(matrix: Matrix, cases: list[Case]) -> None:
-    if cases and cases[0].fault == "full disk" and not can_mount(matrix.folder):
-        pytest.skip("only root may mount a small disk")
-    found = [matrix.play(case) for case in cases]
-    assert [one for one in found if one.wrong] == []
-
-
-def test_the_matrix_has_every_fault_at_every_write_of_calibration_and_deployment(matrix: Matrix) -> None:
-    assert len(matrix.cases()) == len(FAULTS) * len(matrix.entries) + matrix.questions > 600
-    written = {entry.partition(":")[0] for entry in matrix.entries}
+def test_the_program_meets_every_fault_at_every_write_of_calibration_and_deployment(rig: ProgramRig) -> None:
+    cases = rig.cases()
+    assert len(cases) == len(set(cases)) == 6 * len(rig.points) > 600
+    written = {at.partition(":")[0] for at, _ in rig.points}
     assert {"campaign", "pours", "calibration", "evaluation", "deployment"} <= written
 
 
-def test_a_pour_that_nobody_knows_of_is_asked_about_and_only_then_repeated(matrix: Matrix) -> None:
-    begun = [i for i, entry in enumerate(matrix.entries, start=1) if entry.endswith("pour.started")]
+def test_a_pour_that_nobody_knows_of_is_asked_about_once_and_not_made_again(rig: ProgramRig) -> None:
+    begun = [point for point in rig.points if point[0].endswith("pour.started")]
     assert len(begun) == 5
-    outcome = matrix.play(Case("killed after", begun[-1]))
-    assert outcome.asked == 1
-    assert outcome.wrong == ()
+    outcome = rig.play(Case("program", KILLED_AFTER, *begun[-1]))
+    assert (outcome.asked, outcome.lives, outcome.wrong) == (1, 2, ())
 
 
-@pytest.mark.parametrize(("fault", "point"), [("killed before", 77), ("full disk", 130), ("clock an hour back", 40)])
-def test_a_sample_of_it(matrix: Matrix, fault: str, point: int) -> None:
-    played(matrix, [Case(fault, point)])
+@pytest.mark.parametrize(
+    ("fault", "at", "number"),
+    [
+        (KILLED, "evaluation: finished", 1),
+        (FULL, "deployment:narrow: told", 3),
+        (BACK, "calibration: asked", 7),
+    ],
+)
+def test_a_sample_of_it(rig: ProgramRig, fault: str, at: str, number: int) -> None:
+    if fault == FULL and not strikes.can_mount(rig.folder):
+        pytest.skip("only root may mount a small disk")
+    assert rig.play(Case("program", fault, at, number)).wrong == ()
+
+
+def test_what_goes_wrong_is_seen(rig: ProgramRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a person who types another weight the campaign ends otherwise, and that is said."""
+    monkeypatch.setattr(rig, "answer", lambda question: "weighed 40 1 100")
+    (wrong,) = rig.play(Case("program", KILLED_AFTER, "pours: pour.started", 2)).wrong
+    assert wrong.startswith("other requests, decisions or results than undisturbed")
+
+
+def test_every_combination_is_tried_or_has_a_reason_why_not() -> None:
+    assert set(RIGS) == set(TARGETS)
+    for (target, fault), reason in NO_MEANING.items():
+        assert target in TARGETS
+        assert fault in FAULTS
+        assert reason
+
+
+def test_what_has_no_clock_reads_none() -> None:
+    """The reason why clocks that jump are not tried on arm, balance, simulators and optimiser."""
+    clock = re.compile(r"\btime\.time\(|datetime|time_ns\(|localtime|gmtime")
+    files = [path for floor in ("actors", "sim_engine") for path in (ROOT / floor).rglob("*.py")]
+    assert len(files) > 100
+    assert [path.name for path in files if clock.search(path.read_text("utf-8"))] == []
+
+
+def test_points_are_chosen_by_kind_and_stage() -> None:
+    points = [("a: x", 1), ("a: y", 1), ("a: x", 2), ("a: x", 3), ("b: x", 1)]
+    assert first_and_last(points) == [("a: x", 1), ("a: y", 1), ("a: x", 3), ("b: x", 1)]
+    assert first_in_stages(points) == [("a: x", 1), ("a: y", 1), ("b: x", 1)]
+    assert first_of_kind(points) == [("a: x", 1), ("a: y", 1)]
+
+
+def test_a_line_that_is_cut_is_cut_at_both_ends_and_a_threads_own_is_not() -> None:
+    ours, theirs = socket.socketpair()
+    listening = socket.create_server(("127.0.0.1", 0))
+    with ours, theirs, listening, socket.create_connection(listening.getsockname()) as far:
+        near, _ = listening.accept()
+        with near:
+            assert strikes.cut([os.getpid()]) >= 2
+            assert far.recv(1) == near.recv(1) == b""
+            ours.send(b"x")
+            assert theirs.recv(1) == b"x"
+            socket.create_connection(listening.getsockname()).close()
+
+
+@pytest.fixture(params=[target for target in TARGETS if target != "program"])
+def other(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ProgramRig]:
+    found = rig_of(request.param, tmp_path)
+    yield found  # type: ignore[misc]
+    found.close()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", [*FAULTS, LOST])
-def test_all_of_it(matrix: Matrix, fault: str) -> None:
-    played(matrix, [case for case in matrix.cases() if case.fault == fault])
+@pytest.mark.ray
+@pytest.mark.realtime
+def test_a_sample_of_what_else_is_struck(other: ProgramRig) -> None:
+    cases = other.cases()
+    found = [other.play(case) for case in cases[:: max(len(cases) // 4, 1)]]
+    assert [one for one in found if one.wrong] == []
