@@ -56,7 +56,7 @@ class Supervisor:
         self.asking = Asking(self.store, self.feed.tell)
         self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
         self._common = Common(settings, self.store, self.feed, self.asking, self.warm, live)
-        self.lanes = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
+        self.lanes: dict[str, Lane] = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
         self.problems: dict[str, str] = {}
         self.words: dict[str, Counts] = {}
         self.stopping = False

@@ -167,7 +167,7 @@ def write(results: Path) -> int:
     """The tables of what is in a file of results; returns how many cases went wrong."""
     rows = list(found(results).values())
     page = PAGE.read_text(encoding="utf-8")
-    for name, text in (("cases", overview(rows)), ("kill matrix", table(rows)), ("no meaning", reasons())):
+    for name, text in (("all cases", overview(rows)), ("kill matrix", table(rows)), ("no meaning", reasons())):
         before, _, rest = page.partition(BEGIN.format(name))
         page = before + BEGIN.format(name) + text + END + rest.partition(END)[2]
     PAGE.write_text(page, encoding="utf-8")
