@@ -180,7 +180,8 @@ def write(results: Path) -> int:
         ("kill matrix", table(rows)),
         ("no meaning", reasons()),
     ):
-        before, _, rest = page.partition(BEGIN.format(name))
+        before, marker, rest = page.partition(BEGIN.format(name))
+        assert marker, f"{PAGE} has no place for the table '{name}'"
         page = before + BEGIN.format(name) + text + END + rest.partition(END)[2]
     PAGE.write_text(page, encoding="utf-8")
     order = {name: i for i, name in enumerate((*TARGETS, *FAULTS))}
