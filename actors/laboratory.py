@@ -322,10 +322,12 @@ class RayLaboratory(_OpenLaboratory):
             self._pool.abandon(LaboratoryError(reason))
 
     async def __aexit__(self, *exc: object) -> None:
-        await self._close_all()
-        if self._cluster is not None:
-            await self._cluster.close()
-        await self._stop_ray()
+        try:
+            await self._close_all()
+            if self._cluster is not None:
+                await self._cluster.close()
+        finally:  # also where the closing was cut short: Ray counts who uses it
+            await self._stop_ray()
 
     async def _stop_ray(self) -> None:
         from actors.ray_runtime import stop_ray

@@ -68,8 +68,7 @@ class PrivateRay:
             "RAY_maximum_gcs_destroyed_actor_cached_count": "50",
             "RAY_maximum_gcs_dead_worker_cached_count": "50",
             "RAY_task_events_report_interval_ms": "0",
-            # Its own processes would log some 2 MB an hour, up to gigabytes.
-            "RAY_BACKEND_LOG_LEVEL": "warning",
+            # Its own processes log some 5 MB an hour, up to gigabytes.
             "RAY_ROTATION_MAX_BYTES": "2000000",
             "RAY_ROTATION_BACKUP_COUNT": "1",
         }

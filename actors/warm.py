@@ -122,15 +122,13 @@ class WarmSimulators:
     async def close(self) -> None:
         """End them. May be called twice."""
         async with self._opening:
-            lost = self.lost
             pool, self._pool, self._fair = self._pool, None, None
             if pool is None:
                 return
             proposer, self._proposer = self._proposer, None
-            if not lost:  # else nobody would answer
-                if proposer is not None:
-                    await proposer.close()
-                await pool.close()
+            if proposer is not None:
+                await proposer.close()
+            await pool.close()
             if not self._spec.in_process:
                 from actors.ray_runtime import stop_ray
 

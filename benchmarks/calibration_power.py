@@ -3,12 +3,14 @@
     python benchmarks/calibration_power.py [CAMPAIGN] [--seeds 11 12] [--simulations 108] [--particles 1000]
                                            [--known wall_distance=1.5 lip_drop=0] [--folds 8]
                                            [--fold-simulations 72] [--workers 1] [--fresh] [--json]
+    python benchmarks/calibration_power.py --as-it-is --seeds 11 12 13 --folds 0
 
 Sets: the campaign's own calibration (C4), again and again with one more parameter to search and the same budget. What
 is not searched has the campaign's fixed value, or Decant's default; the number of particles, where the campaign doesn't
 fix it, that of `--particles`. θ* is then simulated on each recorded pour: mean |measured − simulated| of the normalised
 spillage on training, test and transfer pours. The first row calibrates nothing. With `--known` a last row searches all
-but these, which have the values given: what somebody knows of the walls, say.
+but these, which have the values given: what somebody knows of the walls, say. With `--as-it-is` the only row is what
+the campaign itself searches.
 
 Folds: all pours of the campaign's scene, by angular velocity, are dealt to the folds in turn, so that each has slow and
 fast ones. θ*, of what the campaign searches, comes of all other folds; the fold's pours judge it. Beside it what needs
@@ -219,6 +221,8 @@ def wanted_sets(options: argparse.Namespace) -> list[tuple[tuple[str, ...], dict
     Raises:
         SystemExit: `--known` names no parameter, or gives no number that it may have.
     """
+    if options.as_it_is:
+        return [(tuple(options.searched), {})]
     sets: list[tuple[tuple[str, ...], dict[str, float]]] = [(names, {}) for names in growing_sets()]
     known = known_values(options.known)
     if known:
@@ -320,6 +324,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--known", nargs="*", default=[], metavar="NAME=VALUE", help="for a last row that searches the rest"
     )
+    parser.add_argument("--as-it-is", action="store_true", help="only what the campaign itself searches")
     parser.add_argument("--folds", type=int, default=8, help="0 leaves the cross-validation out")
     parser.add_argument("--fold-simulations", type=int, default=72, help="budget of each fold")
     parser.add_argument("--workers", type=int, default=1, help="calibrations at a time")
@@ -371,6 +376,7 @@ def main() -> None:
     if options.folds and not 2 <= options.folds <= count:
         raise SystemExit(f"--folds {options.folds}: 2 to {count} are possible with {count} recorded pours")
     options.simulations = options.simulations or calibration.simulations
+    options.searched = calibration.parameters.names
     if options.one is not None:
         one = job(calibration, options, options.one)
         print(json.dumps(calibrate(replace(plan, calibration=one.calibration), one.seed, one.label, one.splits)))
@@ -380,6 +386,7 @@ def main() -> None:
     wanted += [f"fold {k} {plan.seed}" for k in range(options.folds)]
     same = [str(options.campaign.resolve()), f"--simulations={options.simulations}", f"--particles={options.particles}"]
     same += ["--known", *options.known] if options.known else []
+    same += ["--as-it-is"] if options.as_it_is else []
     same += [f"--folds={options.folds}", f"--fold-simulations={options.fold_simulations}"]
     machine, kept, begun = describe(), Kept(fresh=options.fresh), time.monotonic()
 

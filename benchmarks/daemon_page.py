@@ -72,11 +72,11 @@ def stops(found: Mapping[str, Any]) -> str:
 def soak(found: Mapping[str, Any]) -> str:
     """What there was at a third of the time, at the end, and how it went."""
     rows = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
-    journals = found["journal of one campaign [kB]"]
+    first, second = found["journal of one campaign [kB]"]
     return (
         f"{found['minutes']:.0f} minutes, {found['campaigns']} campaigns, {100 * found['cpu share']:.0f} % of a core "
-        f"on average; the journal of a plain campaign took {journals[0]} to {journals[-1]} kB. Looked at between "
-        "campaigns:\n\n" + _table(("", "after a third", "at the end", "an hour"), rows)
+        f"on average; the journal of a plain campaign took {first} kB in the first half and {second} kB in the second "
+        "(medians). Looked at between campaigns:\n\n" + _table(("", "after a third", "at the end", "an hour"), rows)
     )
 
 

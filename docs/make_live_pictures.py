@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--recording", type=Path, help="only look at this one")
     parser.add_argument("--to", type=Path, default=FOLDER)
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what was started is ended
     arguments.to.mkdir(parents=True, exist_ok=True)
     recording = arguments.recording
     if recording is None:

@@ -65,7 +65,7 @@ class Liquid(BaseModel):
         density: [kg/m³].
         surface_tension: against air [N/m].
         dynamic_viscosity: [Pa s].
-        contact_angle: of the liquid on the vessels, 0: it wets them wholly [rad].
+        contact_angle: of the liquid on the vessels [rad]; kept, not simulated yet.
 
     A liquid of more than `THIN` is simulated with this viscosity and this tension, and sticks to walls. For one as thin
     as water they decide nothing: θ's `viscosity` and `cohesion` do, and it slips. From all of them and the planned flow
@@ -98,7 +98,8 @@ class Liquid(BaseModel):
 
     def free_fields(self) -> frozenset[str]:
         """Fields that decide no request of this very liquid; of a thin one a simulation does not look at them."""
-        return frozenset() if self.is_thick else frozenset({"surface_tension", "dynamic_viscosity", "contact_angle"})
+        thin = frozenset({"surface_tension", "dynamic_viscosity"})
+        return (frozenset() if self.is_thick else thin) | {"contact_angle"}
 
     def millilitres(self, mass: float) -> float:
         """Volume of some of it, as people read it [mL]; mass in [kg]."""

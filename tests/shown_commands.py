@@ -154,7 +154,7 @@ def _small_quickstart(campaign: Any) -> None:
 
 def _small_recorded(campaign: Any) -> None:
     campaign["simulator"]["parameters"] = {"particles": 200, "cohesion": ["0 N/m", "0.1 N/m"]}
-    campaign["calibration"].update(simulations=5, random_baseline=1)
+    campaign["calibration"].update(simulations=5, initial=3, random_baseline=1)
     campaign["outputs"].update(rrd=False, figures=False)
 
 

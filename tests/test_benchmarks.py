@@ -253,3 +253,21 @@ def test_page_of_the_repository_is_what_its_measurements_say(tmp_path: Path) -> 
         (tmp_path / name).write_text((ROOT / "docs" / name).read_text(encoding="utf-8"), encoding="utf-8")
     written = make_page.write(tmp_path).read_text(encoding="utf-8")
     assert written == (ROOT / "docs" / "performance.md").read_text(encoding="utf-8"), "run: benchmarks/make_page.py"
+
+
+def test_what_was_measured_of_the_daemon_stands_on_its_page() -> None:
+    import daemon_page
+
+    page = daemon_page.PAGE.read_text(encoding="utf-8")
+    assert daemon_page.render(page, daemon_page.measured()) == page, "run: python benchmarks/daemon_page.py"
+    stops = [
+        {"bench": bench, "grade": grade, "load": "idle", "median": 12.3, "worst": 45.6}
+        for bench in daemon_page.BENCHES
+        for grade in daemon_page.UNTIL
+    ]
+    found = {"times": 1, "cores": 2, "load before": 0.1, "first simulation of a plan": [500], "stops": stops}
+    run = {"campaign": "quickstart", "wall": 300.0, "arm": 220.0, "made ahead": 18, "same decisions": False}
+    ahead = {"cores": 2, "load before": 0.1, "times": 1, "runs": [{**run, "ahead": "yes"}, {**run, "ahead": "no"}]}
+    written = daemon_page.render(page, {"stops": found, "idle-time": ahead})
+    assert "| emergency stop over wires | likewise | 12 / 46 |  |  |" in written
+    assert "| quickstart | 18 of them | 300 s | 220 s | 80 s | NO |" in written

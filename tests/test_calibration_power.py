@@ -36,7 +36,7 @@ def calibration(power: ModuleType) -> CalibrationPlan:
 
 @pytest.fixture
 def options() -> argparse.Namespace:
-    return argparse.Namespace(folds=8, fold_simulations=9, simulations=10, particles=700, known=[])
+    return argparse.Namespace(folds=8, fold_simulations=9, simulations=10, particles=700, known=[], as_it_is=False)
 
 
 def test_every_pour_judges_once_and_slow_and_fast_ones_in_each_fold(
@@ -69,9 +69,10 @@ def test_what_judges_a_fold_was_not_calibrated_on(
 
 
 def without_nuisances(fixed: Mapping[str, float]) -> dict[str, float]:
-    """What a calibration takes as known, but for the bench's own errors."""
+    """What a calibration takes as known, but for the bench's own errors and what thin liquids do not feel."""
     info = SimulationParameters.info()
-    return {name: value for name, value in fixed.items() if not info[name].nuisance}
+    known = {name for name in fixed if info[name].nuisance} | {"viscosity_factor"}
+    return {name: value for name, value in fixed.items() if name not in known}
 
 
 def test_each_set_searches_one_step_more_at_the_same_budget(
@@ -155,6 +156,17 @@ def test_what_can_t_be_measured_is_refused(power: ModuleType, monkeypatch: pytes
     quickstart = power.ROOT / "configs" / "campaigns" / "quickstart.yaml"
     assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
     assert refusal("nowhere.yaml") == "nowhere.yaml: no such file"
+
+
+def test_the_campaign_as_it_is_searches_what_it_searches_with_the_seed_that_is_asked_for(
+    power: ModuleType, calibration: CalibrationPlan, options: argparse.Namespace
+) -> None:
+    options.as_it_is, options.searched = True, calibration.parameters.names
+    assert len(power.wanted_sets(options)) == 1
+    one = power.job(calibration, options, "set 0 12")
+    assert one.calibration.parameters == calibration.parameters
+    assert one.calibration.fixed_parameters == calibration.fixed_parameters
+    assert one.seed == 12
 
 
 def test_a_last_row_takes_some_parameters_as_known(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,15 +149,17 @@ def read_photograph(path: Path) -> Floats:
 
     _check_size(path)
     try:
-        with Image.open(path) as picture:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of large pictures: see below
             if picture.width * picture.height > MOST_PIXELS:
                 raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller", BAD_INPUT)
             return np.asarray(picture.convert("L"), dtype=float)
-    except (UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # cut off, damaged
         raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
 
 
 def _check_size(path: Path) -> None:
+    if path.is_dir():
+        raise RefusalError(f"{path}: is a folder; name a file in it", BAD_INPUT)
     if not path.is_file():
         raise RefusalError(f"{path}: there is no such file", BAD_INPUT)
     if (size := path.stat().st_size) > LARGEST_FILE:

@@ -217,6 +217,8 @@ def load_parameters(path: Path, base: SimulationParameters | None = None) -> Sim
     place = Place(document)
     if isinstance(document.data, dict):
         place = next((place.at(key) for key in THETA_KEYS if key in document.data), place)
+    if place.loc:
+        report.problems.extend(document.problems)
     section = validate(_Theta, place, report)
     values: dict[str, float] = (base or SimulationParameters()).model_dump()
     if section is not None:

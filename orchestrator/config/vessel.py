@@ -115,7 +115,7 @@ class LiquidFile(Section):
     simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is the parameter `viscosity`."""
 
     contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = 0.0
-    """Contact angle of a liquid above 5 mm²/s on the vessels' walls; 0: it wets them wholly."""
+    """Contact angle on the vessels' walls; kept with the run, not simulated yet."""
 
 
 def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselSpec | None:

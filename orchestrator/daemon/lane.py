@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from actors.protocols import LaboratoryError
 from orchestrator.config.yaml.errors import ConfigError
@@ -20,13 +20,38 @@ from orchestrator.reserve import MB, free_space
 from orchestrator.run_result import CampaignResult
 from orchestrator.unknown import OperatorNeededError
 
-if TYPE_CHECKING:
-    from orchestrator.daemon.supervisor import Supervisor
-
 RETRY = 30.0
 """Before a lane that was kept from beginning looks again [s]."""
 
 _log = logging.getLogger(__name__)
+
+
+class Whole(Protocol):
+    """What a lane needs of the daemon that it is a part of.
+
+    Attributes:
+        lanes: all of them, by their rigs' names.
+        stopping: nothing is begun any more.
+        suspect: the simulators may be gone.
+    """
+
+    lanes: dict[str, Lane]
+    stopping: bool
+    suspect: bool
+
+    @property
+    def emergency(self) -> dict[str, Any] | None:
+        """The emergency stop that is latched."""
+        ...
+
+    @property
+    def queue_paused(self) -> bool:
+        """Whether nothing is begun from the queue."""
+        ...
+
+    def problem(self, key: str, text: str | None) -> None:
+        """Something is wrong, or (None) is no longer."""
+        ...
 
 
 class Lane:
@@ -38,7 +63,7 @@ class Lane:
         common: what all of them share.
     """
 
-    def __init__(self, daemon: Supervisor, rig: Rig, common: Common) -> None:
+    def __init__(self, daemon: Whole, rig: Rig, common: Common) -> None:
         self._daemon, self.rig, self._common = daemon, rig, common
         self.running: Running | None = None
         self.wake = asyncio.Event()
@@ -130,9 +155,6 @@ class Lane:
             needs_person = getattr(error, "exit_code", 1) == 3
             self._daemon.suspect |= isinstance(error, LaboratoryError | LaneError)
             state, reason = ("paused" if needs_person else "failed"), str(error)
-            if lost := self._common.warm.lost:  # not the campaign's fault: it goes on with new simulators
-                self._daemon.tell_lost(lost)
-                state, wish = "paused", self._kept_wish(item)
         except Exception as error:
             state, reason = "failed", f"{type(error).__name__}: {error}"
             _log.exception("campaign %s failed", item.id)

@@ -326,3 +326,12 @@ class _Receiver:
             except Exception:  # a plug-in of apprise may raise anything
                 _log.debug("word to %s", self, exc_info=True)
         return False
+
+
+def problem_of(url: str) -> str | None:
+    """What is wrong with a receiver, without its secrets; None where apprise knows it."""
+    try:
+        _Receiver(1, url)
+    except NotifyError as error:
+        return str(error).partition(": ")[2]
+    return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -16,7 +17,7 @@ from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import Count, FilePath, Name, PositiveCount, Section, Switch, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
-from orchestrator.daemon.notify import NotifySection
+from orchestrator.daemon.notify import NotifySection, problem_of
 from orchestrator.state_directory import state_directory
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -97,7 +98,7 @@ class DaemonFile(Section):
     roots: list[FilePath] | None = None
     """Folders in which campaigns that are submitted by path may lie, with all they refer to; none unless given."""
 
-    simulators: Count = 0
+    simulators: Annotated[Count, Field(le=10_000)] = 0
     """Simulators in the pool that all campaigns share; 0: one per core."""
 
     in_process: Switch = False
@@ -226,6 +227,21 @@ def _rig(name: str, source: Path, at: Place, report: Report) -> list[Rig]:
     return [Rig(name, source, spec)]
 
 
+def _check_tls(certificate: Path | None, key: Path | None, at: Place, report: Report) -> None:
+    assert certificate is not None
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+    except OSError as error:  # of which those of SSL are
+        said = error.reason or "they can't be read" if isinstance(error, ssl.SSLError) else error.strerror
+        report.add(at, f"{certificate.name} and {key and key.name} are not a certificate and its key in PEM ({said})")
+
+
+def _check_receivers(section: NotifySection, at: Place, report: Report) -> None:
+    for i, receiver in enumerate(section.to or ()):
+        if (problem := problem_of(receiver)) is not None:
+            report.add(at.at("to", i), problem)
+
+
 def _resolve(file: DaemonFile, place: Place, report: Report) -> Settings:
     def path(text: str | None, at: Place) -> Path | None:
         return None if text is None else resolved(at.directory / text)
@@ -253,14 +269,21 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> Settings:
         for key, found in zip(("certificate", "key"), files, strict=True):
             if found is not None and (missing := missing_file(found)) is not None:
                 report.add(listen.at("tls", key), missing)
+        if not any(report.is_broken(listen.at("tls", key)) for key in ("certificate", "key")) and None not in files:
+            _check_tls(*files, listen.at("tls"), report)
     if file.listen.host not in LOOPBACK and tls is None and not file.listen.plain:
         report.add(
             listen.at("host"),
             "other machines reach this address, and tokens would cross the network in plain text; add 'tls', or "
             "'plain: true' where something in front of it encrypts",
         )
+    if file.notify is not None:
+        _check_receivers(file.notify, place.at("notify"), report)
+    state = path(file.state, place)
+    if state is not None and state.exists() and not state.is_dir():
+        report.add(place.at("state"), f"{state} is not a folder")
     return Settings(
-        state=path(file.state, place) or state_directory(),
+        state=state or state_directory(),
         host=file.listen.host,
         port=file.listen.port,
         certificate=files[0],

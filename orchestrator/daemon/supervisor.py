@@ -56,7 +56,7 @@ class Supervisor:
         self.asking = Asking(self.store, self.feed.tell)
         self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
         self._common = Common(settings, self.store, self.feed, self.asking, self.warm, live)
-        self.lanes = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
+        self.lanes: dict[str, Lane] = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
         self.problems: dict[str, str] = {}
         self.words: dict[str, Counts] = {}
         self.stopping = False
@@ -96,26 +96,15 @@ class Supervisor:
             self.feed.tell("SimulatorsReady", {"simulators": self.warm.size})
 
     async def _watch_simulators(self) -> None:
-        """Where Ray dies under what runs, nothing that was asked of it comes to an end: all of it is begun anew."""
+        """Where Ray dies under what runs, nothing that was asked of it comes to an end: people are told."""
         while True:
             await asyncio.sleep(LOOKING)
-            if self.suspect or not (lost := self.warm.lost):
-                continue
-            self.tell_lost(lost)
-            running = [lane for lane in self.lanes.values() if lane.running is not None]
-            for lane in running:
-                assert lane.running is not None
-                lane.running.pause()
-                lane.background(lane.running.give_up())
-            if not running:
-                self.suspect = False
-                await self.warm.close()
-                await self._warm_up()
-
-    def tell_lost(self, lost: str) -> None:
-        """Ray has died: all simulators are to be started anew."""
-        self.suspect = True
-        self._warn(f"Ray has lost its {lost}: what runs comes to rest, and goes on with new simulators")
+            lost = self.warm.lost
+            text = (
+                f"Ray has lost its {lost}: no simulation comes to an end any more. End the daemon and start it again; "
+                "what ran goes on from its journal"
+            )
+            self.problem("ray", text if lost else None)
 
     async def close(self) -> None:
         """Come to rest at the next safe point; cancelled or told again, at once."""

@@ -50,8 +50,6 @@ class _Running:
     tared: float | None = None
     verdict: float | None = None
     """Spilled, as weighed at the end [g]."""
-    begun: bool = False
-    """Whether its film has."""
 
 
 class BalanceStage:
@@ -106,8 +104,6 @@ class BalanceStage:
         """A pour begins."""
         times, band = self._foretold(pour, scene)
         self._running, self._checkpoint = _Running(scene, band, times), ""
-        for ended in ("net", "expected"):  # no line from one pour to the next
-            self._outlet.log(f"{PLACE}/{ended}", self._rr.Clear(recursive=True))
         if band is not None:
             for name, value in zip(("low", "middle", "high"), band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
@@ -150,23 +146,23 @@ class BalanceStage:
         if running is not None and running.band is not None:
             for name, value in zip(("low", "middle", "high"), running.band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
+        for ended in ("net", "expected"):  # no line from one pour to the next
+            self._outlet.log(f"{PLACE}/{ended}", self._rr.Clear(recursive=True))
         return running
 
-    def beside(self, running: _Running | None, time: float, spilled: float | None) -> None:
+    def beside(self, running: _Running | None, time: float, spilled: float | None, *, last: bool) -> None:
         """What the balance showed at a moment of a pour, beside what simulations foretold.
 
         Args:
             running: the pour, as `finish` returned it.
             time: since it began [s of bench time].
             spilled: by the liquid of a virtual bench, by then [kg].
+            last: whether it is the end of its film.
         """
         if running is None:
             return
-        if not running.begun:
-            running.begun = True
-            self._outlet.log(f"{PLACE}/pour", self._rr.Clear(recursive=True))
-            if running.verdict is not None:
-                self._number("pour/verdict", running.verdict)
+        if last and running.verdict is not None:
+            self._number("pour/verdict", running.verdict)
         if running.band is not None:
             for name, curve in zip(("low", "middle", "high"), running.band, strict=True):
                 self._number(f"pour/{name}", float(np.interp(time, running.times, curve)))
@@ -178,6 +174,8 @@ class BalanceStage:
             if len(walls) and wall <= walls[-1] + 1.0:
                 net = float(np.interp(wall, walls, grams)) - (running.tared or 0.0)
                 self._number("pour/weighed", net)
+        if last:
+            self._outlet.log(f"{PLACE}/pour", self._rr.Clear(recursive=True))
 
     def _foretold(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
         known = self._simulated.get(pour.scene, [])

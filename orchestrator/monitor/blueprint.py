@@ -188,6 +188,21 @@ def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/*
     )
 
 
+def _whole(origin: str, name: str, *, contents: Any = "$origin/**") -> Any:
+    """Curves of the whole campaign. Left to itself the viewer shows half a minute around now, which is mostly empty."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    ever = rr.TimeRangeBoundary.infinite
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(ever(), ever())),
+        plot_legend=rrb.Corner2D.RightTop,
+    )
+
+
 def _shares() -> Any:
     import rerun.blueprint as rrb
 
@@ -210,11 +225,7 @@ def _weighed_pour(under: str = "", name: str = "Pour: spilled [g], weighed and s
 
 
 def _trust(place: str, name: str) -> Any:
-    import rerun.blueprint as rrb
-
-    return rrb.TimeSeriesView(
-        origin=f"/learning/{place}", contents=["$origin/trust"], name=name, plot_legend=rrb.Corner2D.RightTop
-    )
+    return _whole(f"/learning/{place}", name, contents=["$origin/trust"])
 
 
 def _surrogate(place: str, name: str, *, sliced: bool) -> list[Any]:
@@ -223,9 +234,7 @@ def _surrogate(place: str, name: str, *, sliced: bool) -> list[Any]:
 
 
 def _loss(place: str, name: str) -> Any:
-    import rerun.blueprint as rrb
-
-    return rrb.TimeSeriesView(origin=f"/learning/{place}/loss", name=name, plot_legend=rrb.Corner2D.RightTop)
+    return _whole(f"/learning/{place}/loss", name)
 
 
 def _picture(entity: str, name: str) -> Any:
@@ -241,14 +250,8 @@ def _lanes() -> Any:
 
 
 def _machine() -> Any:
-    import rerun.blueprint as rrb
-
-    return rrb.TimeSeriesView(
-        origin="/machine",
-        contents=["/machine/load/**", "/machine/seconds", "/machine/wait", "/machine/dropped"],
-        name="Queue, seconds, waits, drops",
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
+    contents = ["/machine/load/**", "/machine/seconds", "/machine/wait", "/machine/dropped"]
+    return _recent("/machine", "Queue, seconds, waits, drops", 120.0, contents=contents)
 
 
 def _status(under: str = "") -> Any:

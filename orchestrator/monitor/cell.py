@@ -152,7 +152,7 @@ class Cell:
         *,
         now: float,
         step: int,
-        beside: Callable[[float, float | None], object],
+        beside: Callable[[float, float | None, bool], object],
     ) -> None:
         """Show what was done and what the liquid did.
 
@@ -162,7 +162,7 @@ class Cell:
             now: on the wall clock [s since 1970].
             step: of the campaign.
             beside: logs what else there is to say of a moment of the pour [s], and of what a virtual bench's liquid has
-                spilled by then [kg], where that is known.
+                spilled by then [kg], where that is known; and whether it is the last one.
         """
         moves = self._executed(measured)
         liquid, self._liquid = self._liquid, None
@@ -175,7 +175,7 @@ class Cell:
         radius = 0.0 if liquid is None else 0.5 * shapes.spacing(liquid.positions[0], scene.liquid.volume)
         path = self._path(moves, liquid)
 
-        def frame(moment: float, *, first: bool) -> Callable[[], None]:
+        def frame(moment: float, *, first: bool, last: bool) -> Callable[[], None]:
             def log() -> None:
                 if first and len(path) > 1:
                     self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
@@ -185,11 +185,11 @@ class Cell:
                 if liquid is not None:
                     share = self._pour(liquid, moment, radius, posed=moves is None)
                     spilled = share * measured.loaded
-                beside(moment, spilled)
+                beside(moment, spilled, last)
 
             return log
 
-        moments = [frame(float(moment), first=place == 0) for place, moment in enumerate(times)]
+        moments = [frame(float(t), first=t == times[0], last=t == times[-1]) for t in times]
         self._films.add(now, step, [float(moment) for moment in times], moments)
 
     def _executed(self, measured: PourMeasurement) -> tuple[FloatArray, FloatArray] | None:

@@ -202,7 +202,7 @@ class CampaignRecording:
                     measured,
                     now=event.time,
                     step=self._step,
-                    beside=lambda time, spilled: self._balance.beside(shown, time, spilled),
+                    beside=lambda time, spilled, last: self._balance.beside(shown, time, spilled, last=last),
                 )
             case Suggest() as request, Suggested() as outcome:
                 self._learning.suggested(event, request, outcome)

@@ -56,7 +56,7 @@ class SimulatedStage:
         radius = 0.5 * shapes.spacing(frames.positions[0], scene.liquid.volume)
         kept = thinned(times)
 
-        def frame(index: int, *, first: bool) -> Callable[[], None]:
+        def frame(index: int, *, first: bool, last: bool) -> Callable[[], None]:
             def log() -> None:
                 if first:
                     self._set(scene, title)
@@ -66,14 +66,15 @@ class SimulatedStage:
                 shares = 100.0 * np.bincount(states, minlength=5) / max(len(states), 1)
                 for state in range(len(SHARES)):
                     self._outlet.log(f"{PLACE}/share/{state}", self._rr.Scalars(float(shares[state])))
+                if last:
+                    self._outlet.log(f"{PLACE}/share", self._rr.Clear(recursive=True))  # no line to the next film
 
             return log
 
-        moments = [frame(index, first=place == 0) for place, index in enumerate(kept)]
+        moments = [frame(i, first=i == kept[0], last=i == kept[-1]) for i in kept]
         self._films.add(now, step, [float(times[index]) for index in kept], moments)
 
     def _set(self, scene: Scene, title: str) -> None:
-        self._outlet.log(f"{PLACE}/share", self._rr.Clear(recursive=True))  # no line from one film to the next
         self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
         for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
             # What is left out of the wall clock isn't there for those who watch by it.

@@ -15,7 +15,7 @@ from sim_engine.fluid.newtonian import STIFFEST, flow
 from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
-from sim_engine.fluid.vectors import dot, length, square, turned
+from sim_engine.fluid.vectors import dot, length, square, turned, turned_back
 from sim_engine.fluid.viscosity import relax
 from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
 from sim_engine.outcome import ParticleState
@@ -127,14 +127,13 @@ class Stepper:
     def look_at_walls(self, s, planes: ti.template()):
         """Distance and normal of both vessels' equivalent planes at all moving particles, to be linearised."""
         f = self.state
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            x = f.x[i]
-            for b in range(VESSELS):
-                look = distance_and_gradient(
-                    f, planes, f.plane_offset[s, b], s, b, to_vessel(f, s, b, x, False), f.sag[i][b]
-                )
+        for b in range(VESSELS):
+            turn, origin = f.turn[s, b], f.origin[s, b]
+            for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+                y = turned_back(turn, f.x[i] - origin)
+                look = distance_and_gradient(f, planes, f.plane_offset[s, b], s, b, y, f.sag[i][b])
                 f.phi[i][b] = look[3]
-                n = turned(f.turn[s, b], look)
+                n = turned(turn, look)
                 for c in ti.static(range(3)):
                     f.normal[i][b, c] = n[c]
 

@@ -29,10 +29,13 @@ STRETCH = 1.0 + LARGEST_LIP_DROP / LIP_BLEND
 @ti.func
 def look_up(f: ti.template(), s, b, y, sag):
     """Where the grid is read for a point of the vessel frame: near the rim `sag` [m] higher in the world."""
+    place = y
     blend = LIP_BLEND * f.spacing[s]
-    part = ti.min(ti.max((y[2] - f.rim[s, b] + sag) / blend + 1.0, 0.0), 1.0)
-    up = ti.Vector([f.turn[s, b][2, 0], f.turn[s, b][2, 1], f.turn[s, b][2, 2]])
-    return y + (sag * part) * up
+    over = y[2] - f.rim[s, b] + sag + blend
+    if over > 0.0 and sag > 0.0:
+        up = ti.Vector([f.turn[s, b][2, 0], f.turn[s, b][2, 1], f.turn[s, b][2, 2]])
+        place = y + (sag * ti.min(over / blend, 1.0)) * up
+    return place
 
 
 @ti.func
@@ -56,7 +59,7 @@ def to_world(f: ti.template(), s, b, y):
 def distance(f: ti.template(), grids: ti.template(), s, b, y, sag):
     """Trilinear signed distance at a point of the vessel frame [m]; `FAR` beyond the grid."""
     size = f.grid_size[s, b]
-    u = (look_up(f, s, b, y, sag) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
+    u = (look_up(f, s, b, y, sag) - f.grid_origin[s, b]) * (1.0 / f.grid_spacing[s, b])
     result = ti.cast(FAR, ti.f32)
     if (
         u[0] >= 0.0
@@ -85,7 +88,7 @@ def distance(f: ti.template(), grids: ti.template(), s, b, y, sag):
 def distance_and_gradient(f: ti.template(), grids: ti.template(), offset, s, b, y, sag):
     """(∂φ/∂y normalised, φ) as a 4-vector from the values that start at `offset`; 0 and `FAR` beyond the grid."""
     size = f.grid_size[s, b]
-    u = (look_up(f, s, b, y, sag) - f.grid_origin[s, b]) / f.grid_spacing[s, b]
+    u = (look_up(f, s, b, y, sag) - f.grid_origin[s, b]) * (1.0 / f.grid_spacing[s, b])
     result = ti.Vector([0.0, 0.0, 0.0, FAR])
     if (
         u[0] >= 0.0

@@ -19,6 +19,7 @@ from sim_engine.validation import (
     pours,
     sensitivity,
     sloshing,
+    thick,
     tilting,
     torricelli,
     walls,
@@ -225,6 +226,10 @@ def _repeatability(simulator: PourSimulator, effort: Effort) -> tuple[list[Measu
     return pours.repeatability(simulator, 2_000 if effort.full else 500, PLAIN), None
 
 
+def _of_thick_liquids(work: thick.Work) -> Callable[[PourSimulator, Effort], tuple[list[Measurement], Figure | None]]:
+    return lambda simulator, effort: work(simulator, effort.full)
+
+
 CASES: tuple[Case, ...] = (
     Case(
         "rest",
@@ -331,6 +336,7 @@ CASES: tuple[Case, ...] = (
         "The standard pour, twice with one seed and once with another.",
         _repeatability,
     ),
+    *(Case(name, title, about, _of_thick_liquids(work)) for name, title, about, work in thick.CASES),
 )
 
 

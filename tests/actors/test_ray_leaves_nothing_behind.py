@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -168,3 +169,42 @@ def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(
     with pytest.raises(LaboratoryError, match="Ray of its own"):
         ray_runtime.start_ray(LaboratorySpec("late"))
     assert ray.is_initialized()
+
+
+def test_logs_of_workers_that_are_gone_are_removed_and_those_of_living_ones_kept(tmp_path: Path) -> None:
+    logs = tmp_path / "session_1" / "logs"
+    logs.mkdir(parents=True)
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    names = {pid: [f"worker-a1-01-{pid}.out", f"worker-a1-01-{pid}.err", f"python-core-worker-a1_{pid}.log"]
+             for pid in (gone.pid, os.getpid())}  # fmt: skip
+    for name in [*names[gone.pid], *names[os.getpid()], "raylet.out", "python-core-driver-01_1.log"]:
+        (logs / name).write_text("a line")
+    with (tmp_path / "alive").open("w") as lock, subprocess.Popen(["true"]) as warden:
+        assert ray_private.forget_logs(ray_private.PrivateRay(tmp_path, lock, warden)) == 3
+    assert {path.name for path in logs.iterdir()} == {
+        *names[os.getpid()], "raylet.out", "python-core-driver-01_1.log"
+    }  # fmt: skip
+
+
+def test_a_class_is_made_one_of_actors_once_however_many_there_are(ray_running) -> None:
+    from actors.device import RayDevice
+    from actors.ray_class import actor_class
+
+    before = actor_class.cache_info().currsize
+    devices = [RayDevice(str(number), Counter) for number in range(3)]
+    assert actor_class.cache_info().currsize == before + 1
+    assert [asyncio.run(one.call("add", deadline=PATIENCE)) for one in devices] == [1, 1, 1]
+    for one in devices:
+        asyncio.run(one.close())
+
+
+class Counter:
+    """Counts."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def add(self) -> int:
+        self._count += 1
+        return self._count

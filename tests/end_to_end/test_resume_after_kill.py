@@ -39,10 +39,10 @@ def workplace(tmp_path: Path) -> Iterator[Workplace]:
 
 
 class Finished:
-    """What an undisturbed run came to."""
+    """What an undisturbed run in one process came to: with Ray it comes to the same."""
 
     def __init__(self, place: Workplace) -> None:
-        self.summary = place.finish(*RUN)
+        self.summary = place.finish(*RUN, "--in-process")
         self.entries = place.entries()
         self.directory = place.run_directory()
         place.assert_nothing_is_left()

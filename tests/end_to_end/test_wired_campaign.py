@@ -29,6 +29,7 @@ def write_wired(folder: Path) -> None:
     laboratory = yaml.load(LABORATORIES / "virtual.yaml")
     laboratory["simulators"] = 2
     laboratory["bench"]["liquid"]["particles"] = 400
+    laboratory["operator"]["time"] = "30 s"
     laboratory["bench"]["pose_error"] = {"x": "1 mm", "tilt": "0.5 deg"}
     yaml.dump(laboratory, folder / "lab.yaml")
 
@@ -36,6 +37,8 @@ def write_wired(folder: Path) -> None:
     campaign["laboratory"] = "lab.yaml"
     campaign["motion"]["return_velocity"] = "100 deg/s"
     calibration, deployment = campaign["calibration"], campaign["deployment"]
+    calibration |= {"simulations": 3, "initial": 2}
+    deployment |= {"prior_simulations": 2, "per_pour": 1}
     for stage in (calibration, deployment):
         stage["motion"]["height"] = "80 mm"
         stage["actions"]["angular_velocity"] = ["60 deg/s", "100 deg/s"]
@@ -97,6 +100,7 @@ def test_a_campaign_over_wires_is_killed_in_a_pour_resumed_and_comes_to_its_end(
 
 
 @pytest.mark.realtime
+@pytest.mark.slow  # over wires a stop is tried on the bench, and Ctrl-C without wires
 def test_ctrl_c_during_a_pour_over_wires_finishes_and_weighs_it(workplace: Workplace) -> None:
     process, errors = workplace.interrupt(pour_under_way, signal.SIGINT, *RUN)
     assert process.returncode == 130, errors

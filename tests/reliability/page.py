@@ -176,7 +176,7 @@ def write(results: Path) -> int:
     rows = list(found(results).values())
     page = PAGE.read_text(encoding="utf-8")
     for name, text in (
-        ("cases", overview(rows, all_cases(results))),
+        ("all cases", overview(rows, all_cases(results))),
         ("kill matrix", table(rows)),
         ("no meaning", reasons()),
     ):

@@ -111,6 +111,7 @@ def test_the_liquid_moves_off_with_the_cup() -> None:
     assert velocity[1] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_leaving_the_beginning_out_changes_the_pour_by_less_than_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = PourSimulator()
     tasks = [PourTask(SCENE, action(30.0), SimulationParameters(particles=1000), seed) for seed in (1, 2, 3)]

@@ -15,7 +15,6 @@ from sim_engine.pour import InvalidSceneError, PourSimulator, SimulationCancelle
 from sim_engine.sampled_motion import SampledMotion
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PoseError, PourTask, Scene
-from sim_engine.validation.at_rest import tall_column
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import VesselSpec, cylinder
 
@@ -131,19 +130,11 @@ def test_a_cup_at_rest_holds_its_true_volume(simulator: PourSimulator) -> None:
     assert radius.max() < 0.04
 
 
-def test_deep_liquid_stands_still(simulator: PourSimulator) -> None:
-    """29 layers of particles in a slim cup: nothing swings up, nothing leaves, and the height is that of the volume."""
-    simulator.vessel(CUP)  # the engine is the simulator's
-    kept, height = tall_column(5000, SimulationParameters(cohesion=0.0, friction=0.0, viscosity=1.0))
-    assert kept.value == 1.0
-    assert height.value == pytest.approx(0.1048, rel=0.02)
-
-
 def test_liquid_is_hardly_compressed(simulator: PourSimulator) -> None:
     assert run(simulator, particles=2000).outcome.density_error < 0.02
 
 
-@pytest.mark.parametrize("angle", [70, 80])
+@pytest.mark.parametrize("angle", [pytest.param(70, marks=pytest.mark.slow), 80])
 def test_what_is_left_shortly_after_a_turn_is_what_the_flow_over_a_weir_leaves(
     simulator: PourSimulator, angle: int
 ) -> None:
@@ -172,7 +163,14 @@ def test_drips_of_the_return_belong_to_the_pour(simulator: PourSimulator) -> Non
     assert kept.outcome.in_flight == 0.0
 
 
-@pytest.mark.parametrize(("wall", "particles", "speed"), [(0.001, 500, 180), (0.001, 3000, 180), (0.002, 800, 120)])
+@pytest.mark.parametrize(
+    ("wall", "particles", "speed"),
+    [
+        (0.001, 500, 180),
+        pytest.param(0.001, 3000, 180, marks=pytest.mark.slow),
+        (0.002, 800, 120),
+    ],
+)
 def test_thin_walls_hold_fast_liquid(simulator: PourSimulator, wall: float, particles: int, speed: float) -> None:
     thin = {
         "pourer": cylinder("thin cup", inner_radius=0.03, inner_height=0.09, wall=wall, floor=wall),

@@ -63,6 +63,7 @@ def test_deep_liquid_stays_in_its_cup(simulator: PourSimulator) -> None:
     assert failures(at_rest.tall_column(5_000, suite.PLAIN)) == []
 
 
+@pytest.mark.slow  # with fewer particles below
 def test_a_slowly_tilted_cup_drains_to_the_plane_through_its_lip(simulator: PourSimulator) -> None:
     """Within 2 % of the brimful volume at 80°. Dry friction on the walls, which no liquid has, would hold back more."""
     cup, angles = tilting.straight_cup(), tilting.ANGLES[-1:]
@@ -82,13 +83,13 @@ def test_the_slow_turn_waits_until_a_sharp_weir_would_have_drained() -> None:
     assert np.diff([0.0, *readings]).min() > 5.0
 
 
-@pytest.mark.parametrize("particles", [500, 1_000, 2_000])
+@pytest.mark.parametrize("particles", [500, 1_000, pytest.param(2_000, marks=pytest.mark.slow)])
 def test_the_standard_pour_flows_as_that_of_infinitely_fine_particles(simulator: PourSimulator, particles: int) -> None:
     measurements, _ = pours.outflow(simulator, particles, suite.PLAIN, seeds=3)
     assert failures(measurements) == []
 
 
-@pytest.mark.parametrize("angle", [0, 1, 2])
+@pytest.mark.parametrize("angle", [0, pytest.param(1, marks=pytest.mark.slow), 2])
 def test_few_particles_are_held_back_by_a_lip_no_more_than_liquid_is(simulator: PourSimulator, angle: int) -> None:
     """Within 2 % of the brimful volume at 60, 70 and 80°. With the rim as it is, 500 particles keep 7 to 26 mL more."""
     cup, angles, load = tilting.straight_cup(), tilting.ANGLES[angle : angle + 1], (200e-6, 130e-6, 80e-6)[angle]
@@ -277,11 +278,21 @@ NOT_MET: dict[str, str] = {
     "retention": "12.7 mL too much with 500 particles at 80°, 10.6 with 1,000 at 60°, 9.2 in the jug at 60°",
     "landing": "the spread at 30 °/s is 1.1 mm more with 1,000 particles than with 10,000",
     "convergence": "a fast pour into a bowl splashes out the more the finer the particles are",
+    "floor": "400 mm²/s are added to 2,000",
+    "film": "films of two and three spacings are 16 and 22 % too fast",
+    "tube": "no pressure holds a falling plug together",
+    "drainage": "a vertical film runs off too early",
+    "thick-outflow": ".1 Pa s leave later than in SPlisHSPlasH, where they leave as water does",
 }
 
 
+TOO_LONG = ("walls",)
+"""Take more than ten minutes of a core: `decant physics --full` writes them into docs/validation.md, and a part of each
+is a test of its own."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [case.name for case in suite.CASES])
+@pytest.mark.parametrize("name", [case.name for case in suite.CASES if case.name not in TOO_LONG])
 def test_full_case(simulator: PourSimulator, name: str) -> None:
     result = suite.case(name).run(simulator, suite.Effort(full=True))
     failed = failures(list(result.measurements))

@@ -195,7 +195,7 @@ def _check_header(
         column = line.find(name) + 1 if name and name in line else 1
         table.problems.append(Problem(path, 1, column, name, message, line))
 
-    for name in header:
+    for name in dict.fromkeys(header):
         if name not in known:
             guess = did_you_mean(name, known)
             hint = f"did you mean '{guess}'?" if guess else f"known columns: {', '.join(known)}"

@@ -115,7 +115,7 @@ class LaboratoryFile(Section):
     mode: Literal["virtual", "hardware"] = "virtual"
     """What it is made of: 'virtual' moves nothing, 'hardware' moves an arm."""
 
-    simulators: Count = 0
+    simulators: Annotated[Count, Field(le=10_000)] = 0
     """Simulators in the pool; 0: one per core, of this machine or of the cluster."""
 
     in_process: Switch = False

@@ -24,7 +24,7 @@ class ArmSection(Section):
 
     required: ClassVar[dict[str, str]] = {"repetitions": "10"}
 
-    repetitions: PositiveCount | None = None
+    repetitions: Annotated[PositiveCount, Field(le=10_000)] | None = None
     """How often it is run: a calibration each time on pours of its own, a deployment into each receiver."""
 
     def changes(self) -> dict[str, Any]:

@@ -238,6 +238,8 @@ def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) 
             report.add(
                 root.at("search", i), f"'{name}' is not searched by the campaign; searched are {', '.join(axes)}"
             )
+        elif name in file.search[:i]:
+            report.add(root.at("search", i), f"'{name}' stands twice; keep one")
     known = list(dict.fromkeys(name for name in file.search if name in axes))
     if not known:
         if not file.search:

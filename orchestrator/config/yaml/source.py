@@ -263,6 +263,11 @@ class Report:
         """Whether a problem was noted at this very place."""
         return (place.document.path, place.loc) in self.broken
 
+    def is_broken_within(self, place: Place) -> bool:
+        """Whether a problem was noted there or at anything in it."""
+        size = len(place.loc)
+        return any(path == place.document.path and loc[:size] == place.loc for path, loc in self.broken)
+
     def raise_if_any(self) -> None:
         """Raise everything collected, file by file and line by line.
 

@@ -162,7 +162,7 @@ def _cut_empty(data: Any, place: Place, report: Report) -> None:
 
 def _note_missing(section: Section, place: Place, report: Report) -> None:
     for key, example in section.required.items():
-        if section.value(key) is None and not report.is_broken(place.at(key)):
+        if section.value(key) is None and not report.is_broken_within(place.at(key)):
             shown = f"{key}: {example}"
             report.add(place, f"key '{key}' is missing; add for example '{shown}'", key=True)
     for key in section.written_keys():
@@ -196,9 +196,13 @@ def _message(model: type[Section], detail: ErrorDetails, loc: Loc, data: Any) ->
         case "bool_type":
             return f"should be true or false, got {_name(value)}"
         case "greater_than_equal":
-            return f"{value} is too small; at least {context['ge']:g}"
+            return f"{value} is too small; at least {_bound(context['ge'])}"
+        case "finite_number":
+            return f"should be a finite number, got {value}"
+        case "string_too_long":
+            return f"has {len(str(value))} characters; at most {context['max_length']}"
         case "less_than_equal":
-            return f"{value} is too large; at most {context['le']:g}"
+            return f"{value} is too large; at most {_bound(context['le'])}"
         case "list_type" | "tuple_type":
             return f"should be a list [...], got {_name(value)}"
         case "model_type" | "model_attributes_type" | "dict_type" | "union_tag_invalid":
@@ -209,6 +213,10 @@ def _message(model: type[Section], detail: ErrorDetails, loc: Loc, data: Any) ->
             return f"has {context['actual_length']} items; should have {context['max_length']}"
         case _:
             return str(detail["msg"])
+
+
+def _bound(number: float) -> str:
+    return f"{number:,}" if isinstance(number, int) and number >= 10_000 else f"{number:g}"
 
 
 def _unknown_key(model: type[Section], loc: Loc, data: Any) -> str:

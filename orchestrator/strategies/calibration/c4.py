@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field
 
 from actors.optimizer.core.problem import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
 from orchestrator.config.yaml.sections import PositiveCount
@@ -21,7 +23,7 @@ from orchestrator.strategies.calibration.posterior import (
     posterior_found,
     unit_prior,
 )
-from orchestrator.strategies.calibration.settings import Kappa, check_initial
+from orchestrator.strategies.calibration.settings import MOST_SIMULATIONS, Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.settings import CalibrationSettings, Complaints
 from orchestrator.strategies.trials import Trial
@@ -44,7 +46,7 @@ class C4Settings(CalibrationSettings):
     strategy: Literal["C4"] = "C4"
     """Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
 
-    simulations: PositiveCount | None = None
+    simulations: Annotated[PositiveCount, Field(le=MOST_SIMULATIONS)] | None = None
     """Single simulated pours."""
 
     initial: PositiveCount = 8

@@ -113,7 +113,7 @@ def test_an_arm_stopped_on_its_way_to_the_pour_goes_back_the_way_it_came(rig: Ri
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("phase", ["tilt", "hold", "return"])
+@pytest.mark.parametrize("phase", ["tilt", *(pytest.param(p, marks=pytest.mark.slow) for p in ("hold", "return"))])
 def test_a_protective_stop_holds_the_tilted_pourer_until_an_operator_has_looked(make_rig: Make, phase: str) -> None:
     rig = make_rig(LONG_HOLD)
     if phase == "tilt":

@@ -19,9 +19,15 @@ from sim_engine.outcome import PourMeasurement
 
 from .conftest import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
 
+DEFAULT = (Placement.TRAY, Placement.RECEIVER, Placement.MANUAL)
+
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("placement", Placement)
+@pytest.mark.parametrize(
+    "placement",
+    # what each one asks of balance and person is also tried without wires (test_bench_parts)
+    [p if p in DEFAULT else pytest.param(p, marks=pytest.mark.slow) for p in Placement],
+)
 def test_wherever_the_balance_stands_what_was_executed_is_what_is_measured(open_stage, placement):
     async def play():
         async with open_stage(placement=placement) as stage:

@@ -21,7 +21,7 @@ from orchestrator.config.yaml.errors import Problem
 from orchestrator.events import LogLine
 from orchestrator.progress import ProgressDisplay
 from tests.end_to_end import small
-from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, VESSEL, report, write
+from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, VESSEL, report, write, write_good
 
 
 @pytest.fixture(autouse=True)
@@ -115,6 +115,12 @@ def test_a_quiet_display_still_warns(campaign: Path) -> None:
 
 
 # -- how much is poured ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """What good campaigns refer to."""
+    return write_good(tmp_path)
 
 
 def test_a_load_is_given_by_its_volume_as_well(folder: Path) -> None:

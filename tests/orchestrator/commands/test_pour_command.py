@@ -100,6 +100,7 @@ def test_pours_that_can_t_be_are_refused_before_anything_is_reached(
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_record(
     tmp_path: Path, controller: VirtualController
 ) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.daemon import supervisor
+from actors.warm import WarmSimulators
+from orchestrator.daemon import lane, supervisor
 from orchestrator.daemon.retention import prune_recordings
 from orchestrator.daemon.settings import Settings
 from tests.orchestrator.daemon.served import run, serving
@@ -17,7 +18,7 @@ def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free = [700_000_000]
-    monkeypatch.setattr(supervisor, "free_space", lambda path: free[0])
+    monkeypatch.setattr(lane, "free_space", lambda path: free[0])
 
     async def work() -> None:
         async with serving(tmp_path) as served:
@@ -34,6 +35,24 @@ def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(
             served.daemon.wake()
             await served.until(key, "finished")
             assert (await served.get("/status"))["problems"] == []
+
+    run(work())
+
+
+def test_a_ray_that_has_died_is_said_until_it_is_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lost = ["raylet"]
+    monkeypatch.setattr(WarmSimulators, "lost", property(lambda self: lost[0]))
+    monkeypatch.setattr(supervisor, "LOOKING", 0.01)
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            while not (found := (await served.get("/status"))["problems"]):
+                pass
+            assert "Ray has lost its raylet" in found[0]
+            assert "start it again" in found[0]
+            lost[0] = ""
+            while (await served.get("/status"))["problems"]:
+                pass
 
     run(work())
 

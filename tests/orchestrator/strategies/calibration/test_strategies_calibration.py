@@ -199,6 +199,7 @@ def test_test_pours_are_not_used_for_fitting():
     assert len(regression.problem.data) == 28
 
 
+@pytest.mark.slow
 def test_signed_differences_calibrate_better_than_noise_at_the_same_price():
     pours = measured()
     scores = {}

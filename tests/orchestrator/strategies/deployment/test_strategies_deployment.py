@@ -112,6 +112,7 @@ def test_d1_predicts_the_spillage_of_its_action_whatever_it_minimised():
     assert result.recommended.predicted_loss > 10 * result.recommended.predicted_spillage  # in grams of 200
 
 
+@pytest.mark.slow
 def test_a_zero_mean_pours_worse_than_a_constant_one():
     # to a zero mean everything unexplored is perfect, so that it tries the corners of the plateau one by one
     spills = {

@@ -1,0 +1,96 @@
+"""Draw the picture of docs/liquids.md: water, oil and syrup leave the same cup.
+
+python docs/make_liquid_pictures.py
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sim_engine.action import DEG, Action
+from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.liquids import look_up
+from sim_engine.pour import PourSimulator
+from sim_engine.task import PourTask, Scene
+from sim_engine.vessel.spec import cylinder
+
+IMAGES = Path(__file__).resolve().parent / "images"
+TIMES = (1.5, 2.0, 3.0)
+VOLUME = 200e-6
+PARTICLES = 1_000
+
+
+def liquids() -> dict[str, Liquid]:
+    """What is poured, by what stands beside it."""
+    found = {"water, 1 mPa s": Liquid(mass=998.0 * VOLUME)}
+    for name, title in (("rapeseed oil", "rapeseed oil"), ("glycerol 100 %", "glycerol")):
+        known = look_up(name)
+        assert known is not None
+        found[f"{title}, {1e3 * known.dynamic_viscosity:,.0f} mPa s"] = Liquid(
+            name=name,
+            mass=known.density * VOLUME,
+            density=known.density,
+            surface_tension=known.surface_tension,
+            dynamic_viscosity=known.dynamic_viscosity,
+        )
+    return found
+
+
+def main() -> None:
+    """Simulate and draw."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    scene = Scene(
+        "cups",
+        cylinder("pourer", inner_radius=0.04, inner_height=0.1),
+        cylinder("receiver", inner_radius=0.045, inner_height=0.09),
+        Liquid(mass=0.2),
+    )
+    action = Action(angular_velocity=60 * DEG, x_offset=0.085, height=0.115, max_angle=110 * DEG, hold_time=2.0)
+    simulator = PourSimulator()
+    rows = liquids()
+    figure, axes = plt.subplots(len(rows), len(TIMES), figsize=(9.0, 8.4), sharex=True, sharey=True)
+    for row, (title, liquid) in zip(axes, rows.items(), strict=True):
+        task = PourTask(
+            replace(scene, liquid=liquid), action, SimulationParameters(particles=PARTICLES), 1, record_rate=20.0
+        )
+        run = simulator.simulate(task)
+        assert run.frames is not None
+        for panel, time in zip(row, TIMES, strict=True):
+            k = int(np.argmin(np.abs(run.frames.times - time)))
+            x = 1e3 * run.frames.positions[k]
+            order = np.argsort(-x[:, 1])
+            panel.scatter(x[order, 0], x[order, 2], s=7, c=x[order, 1], cmap="Blues_r", vmin=-60, vmax=60, lw=0)
+            _walls(panel, run.frames.pourer_poses[k], 40.0, 100.0)
+            _walls(panel, np.array([0.0, 0, 0, 1, 0, 0, 0]), 45.0, 90.0)
+            panel.set_aspect("equal")
+            panel.set_title(f"{run.frames.times[k]:.1f} s", fontsize=9)
+        left = 100.0 * run.outcome.retained
+        row[0].set_ylabel(f"{title}\n(kept at the end: {left:.0f} %)\nheight [mm]", fontsize=9)
+    for panel in axes[-1]:
+        panel.set_xlabel("[mm]")
+    figure.tight_layout()
+    figure.savefig(IMAGES / "liquids-cup.png", dpi=110)
+    print(IMAGES / "liquids-cup.png")
+
+
+def _walls(panel, pose, radius: float, height: float) -> None:  # type: ignore[no-untyped-def]
+    """The section of a straight cup of 4 mm walls in the plane y = 0, in millimetres."""
+    from sim_engine.contact import rotations
+
+    r, h = radius, height + 4.0
+    outline = np.array([[-r, h], [-r, 4], [r, 4], [r, h], [r + 4, h], [r + 4, 0], [-r - 4, 0], [-r - 4, h], [-r, h]])
+    points = np.column_stack([outline[:, 0], np.zeros(len(outline)), outline[:, 1]])
+    (turn,) = rotations(np.asarray(pose, dtype=float)[None])
+    world = points @ turn.T + 1e3 * np.asarray(pose[:3], dtype=float)
+    panel.fill(world[:, 0], world[:, 2], color="0.75", lw=0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Bad input of every kind that a person, a spreadsheet or a camera may make: one clear error, exit code 2."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.orchestrator.commands.typed import ROOT, invoke
+
+QUICKSTART, STUDY, VIRTUAL = "campaigns/quickstart.yaml", "studies/quick.yaml", "laboratories/virtual.yaml"
+
+ACTION = "--set angular_velocity=100 --set x_offset=100"
+
+# file to write: the file that it is made of, what is replaced, by what
+SPOILT: dict[str, tuple[str, str, str]] = {
+    "campaigns/tolerance.yaml": (QUICKSTART, "friction: [0, 0.6]", "receiver_x: {measured: 0 mm, tolerance: 3000 km}"),
+    "campaigns/measured.yaml": (QUICKSTART, "friction: [0, 0.6]", "receiver_x: {measured: .nan mm, tolerance: 3 mm}"),
+    "campaigns/many.yaml": (QUICKSTART, "simulations: 24", "simulations: 1000000000000"),
+    "campaigns/long.yaml": (QUICKSTART, "name: quickstart", f"name: {'x' * 300}"),
+    "campaigns/name.yaml": (QUICKSTART, "name: quickstart", "name: 注ぐ"),
+    "campaigns/two.yaml": (QUICKSTART, "name: quickstart", "name: a\n---\nname: quickstart"),
+    "campaigns/tag.yaml": (QUICKSTART, "strategy: C4", "strategy: !!python/object:os.system C4"),
+    "studies/ever.yaml": (STUDY, "repetitions: 2, per_axis: 2", "repetitions: 1000000000, per_axis: 2"),
+    "studies/twice.yaml": (STUDY, "search: [particles, cohesion]", "search: [particles, particles]"),
+    "studies/levels.yaml": (STUDY, "- name: large", "- name: small"),
+    "laboratories/many.yaml": (VIRTUAL, "simulators: 0", "simulators: 100000"),
+    "laboratories/scale.yaml": (VIRTUAL, "time_scale: 30", "time_scale: .inf"),
+    "laboratories/home.yaml": (VIRTUAL, "wrist3: 0 deg", "wrist3: .nan deg"),
+}
+
+HEADER = "angular_velocity_deg_s,max_angle_deg,lip_to_receiver_axis_mm,poured_g,spilled_g,retained_g,split\n"
+POUR = "15.1,95.0,44.0,200.0,0.4,0.0,train\n"
+
+WRITTEN: dict[str, str | bytes] = {
+    "nan.yaml": "name: x\nprofile: {unit: mm, inner: [[0, 0], [.nan, 0], [30, 70]], wall: 4 mm, floor: 4 mm}\n",
+    "open.yaml": "listen: {host: 0.0.0.0}\n",
+    "port.yaml": "listen: {port: 99999999999999999999}\n",
+    "tls.yaml": "listen: {tls: {certificate: README.md, key: README.md}}\n",
+    "state.yaml": "state: README.md\n",
+    "word.yaml": "notify: {to: ['nonsense://somebody:secret@x']}\n",
+    "rigs.yaml": "rigs: {a: laboratories/virtual.yaml, a: laboratories/twin.yaml}\n",
+    "twice.csv": HEADER.replace("poured_g", "poured_g,poured_g") + POUR,
+    "excel.csv": HEADER.replace(",", ";") + POUR.replace(",", ";").replace(".", ","),
+    "infinite.csv": HEADER + POUR.replace("15.1", "1e999"),
+    "utf16.csv": (HEADER + POUR).encode("utf-16"),
+    "twice.json": '{"theta": {"friction": 0.1, "friction": 0.2}}',
+    "weight.json": '{"theta": {"friction": 0.1}, "posterior": [{"theta": {"friction": 0.1}, "weight": -1}]}',
+    "deep.json": "[" * 100_000,
+    "text.png": "no picture",
+}
+
+PHOTO = "--known-height '100 mm' --wall '3 mm'"
+
+# command line: what stderr has to say
+BAD: dict[str, str] = {
+    "validate campaigns/tolerance.yaml": "receiver_x.tolerance: 3000 km is outside 0 … 60 mm",
+    "validate campaigns/measured.yaml": "receiver_x.measured: '.nan mm' is not a quantity; should be a length",
+    "validate campaigns/many.yaml": "calibration.simulations: 1000000000000 is too large; at most 200,000",
+    "validate campaigns/long.yaml": "name: has 300 characters; at most 60",
+    "validate campaigns/name.yaml": "name: '注ぐ' should consist of letters, digits",
+    "validate campaigns/two.yaml": "a file holds one document; remove the '---' line",
+    "validate campaigns/tag.yaml": "tag 'tag:yaml.org,2002:python/object:os.system' is not supported",
+    "validate studies/ever.yaml": "calibration.C1.repetitions: 1000000000 is too large; at most 10,000",
+    "validate studies/twice.yaml": "studies/twice.yaml:11:21: search[1]: 'particles' stands twice; keep one",
+    "validate studies/levels.yaml": "mismatch[1]: a level 'small' stands above already",
+    "validate laboratories/many.yaml": "simulators: 100000 is too large; at most 10,000",
+    "validate laboratories/scale.yaml": "bench.time_scale: inf is not finite",
+    "validate laboratories/home.yaml": "arm.home.wrist3: '.nan deg' is not a quantity",
+    "validate nan.yaml": "nan.yaml:2:38: profile.inner[1][0]: should be a finite number, got nan",
+    "serve open.yaml": "open.yaml:1:16: listen.host: other machines reach this address",
+    "serve port.yaml": "listen.port: 99999999999999999999 is too large; at most 65,535",
+    "serve tls.yaml": "tls.yaml:1:15: listen.tls: README.md and README.md are not a certificate and its key in PEM",
+    "serve state.yaml": "README.md is not a folder",
+    "serve word.yaml": "word.yaml:1:15: notify.to[0]: is not a URL that apprise knows",
+    "serve rigs.yaml": "rigs.a: duplicate key; it stands in line 1 already",
+    "simulate campaigns/recorded.yaml --from twice.csv": "twice.csv:1:62: poured_g: stands twice in the header",
+    "simulate campaigns/recorded.yaml --from excel.csv": "cells are separated by semicolons; save it with commas",
+    "simulate campaigns/recorded.yaml --from infinite.csv": "infinite.csv:2:1: angular_velocity_deg_s: '1e999' is not",
+    "simulate campaigns/recorded.yaml --from utf16.csv": "utf16.csv: is not text in UTF-8 (byte 0)",
+    "plan campaigns/quickstart.yaml --parameters twice.json": "twice.json:1:29: theta.friction: duplicate key",
+    f"simulate campaigns/quickstart.yaml {ACTION} --parameters weight.json": "needs a 'theta' and a 'weight' above 0",
+    "plan campaigns/quickstart.yaml --parameters deep.json": "is nested more than 30 deep",
+    f"vessel out.yaml --photo text.png {PHOTO}": "text.png: is not a picture that can be read",
+    f"vessel out.yaml --photo cut.png {PHOTO}": "cut.png: is not a picture that can be read (image file is truncated)",
+    f"vessel out.yaml --photo campaigns {PHOTO}": "campaigns: is a folder; name a file in it",
+    f"vessel out.yaml --photo white.png {PHOTO}": "the photograph shows nothing",
+    f"vessel out.yaml --photo large.png {PHOTO}": "large.png: 10000 × 9000 pixels; make it smaller",
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("strange") / "files"
+    shutil.copytree(ROOT / "configs", folder)
+    for name, (source, old, new) in SPOILT.items():
+        text = (folder / source).read_text(encoding="utf-8")
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1), encoding="utf-8")
+    for name, content in WRITTEN.items():
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    noise = np.random.default_rng(0).integers(0, 255, (60, 60, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(folder / "cut.png")
+    (folder / "cut.png").write_bytes((folder / "cut.png").read_bytes()[:3000])
+    Image.new("L", (200, 200), 255).save(folder / "white.png")
+    Image.new("1", (10_000, 9_000), 1).save(folder / "large.png")
+    return folder
+
+
+@pytest.fixture
+def there(place: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The working directory, which has to stay as it is."""
+    monkeypatch.chdir(place)
+    before = sorted(place.rglob("*"))
+    yield place
+    assert sorted(place.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", BAD)
+def test_strange_input_gets_one_clear_error(command: str, there: Path) -> None:
+    result = invoke(command)
+    assert isinstance(result.exception, SystemExit), result.exception
+    assert result.exit_code == 2, result.stderr
+    assert "Traceback" not in result.stderr
+    assert BAD[command] in result.stderr
+    assert "secret" not in result.stderr.partition(" | ")[0]
+    said = [line for line in result.stderr.splitlines() if "|" not in line and "can't be used" not in line]
+    assert len(said) == 1, result.stderr
