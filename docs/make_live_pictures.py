@@ -34,6 +34,9 @@ SMALL = {"width": 320, "height": 180}
 SETTLING = 30.0
 """So long it takes to draw a large picture well [s]."""
 
+LATE = (1570.0, 1065.0)
+"""Near the end of the time line [pixels of the large picture]: at the beginning of a replay little is known."""
+
 CATCHING_UP = 60.0
 """For a recording that is opened at once [s]."""
 
@@ -52,7 +55,7 @@ def main() -> None:
         recording = during_a_run(arguments.chromium, arguments.to)
     with LiveView(shown=(recording,)) as view, looking(arguments.chromium, view.url) as page:
         time.sleep(CATCHING_UP)
-        picture(page, arguments.to / "replaying.png")
+        picture(page, arguments.to / "replaying.png", LATE)
 
 
 def during_a_run(chromium: str, to: Path) -> Path:
@@ -133,10 +136,13 @@ def looking(chromium: str, url: str) -> Iterator[Any]:
             browser.close()
 
 
-def picture(page: Any, to: Path) -> None:
-    """Keep what a page shows, drawn large."""
+def picture(page: Any, to: Path, at: tuple[float, float] | None = None) -> None:
+    """Keep what a page shows, drawn large; once it was clicked on at a place, if one is given."""
     page.set_viewport_size(SIZE)
     time.sleep(SETTLING)
+    if at is not None:
+        page.mouse.click(*at)
+        time.sleep(SETTLING)
     page.screenshot(path=str(to), timeout=180_000)
     page.set_viewport_size(SMALL)
     print(to, flush=True)
