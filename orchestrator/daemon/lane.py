@@ -192,6 +192,7 @@ class Lane:
                 _log.exception("campaign %s: not published", key)
         ended = time.time() if state in ENDED else None
         store.change(key, state=state, reason=reason, wish=str(wish), ended=ended)
+        self.running = None  # whoever hears that it rests may have it go on
         self._common.feed.tell("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
         with contextlib.suppress(OSError):
             busy = {one.running.item.run for one in self._daemon.lanes.values() if one.running is not None}

@@ -36,6 +36,7 @@ BEGIN, END = "<!-- table: {} -->\n", "<!-- end of table -->"
 SEED = 13
 
 RIGS = {
+    "ray": "own_ray:RayRig",
     "program": "program:ProgramRig",
     "daemon": "served:DaemonRig",
     "simulator": "pooled:SimulatorRig",
@@ -44,9 +45,8 @@ RIGS = {
     "controller": "wired:ControllerRig",
     "balance": "wired:BalanceRig",
     "recording": "recorded:RecordingRig",
-    "ray": "own_ray:RayRig",
 }
-"""Where the rig of each target is."""
+"""Where the rig of each target is; the one that waits longest comes first."""
 
 
 def rig_of(target: str, folder: Path) -> Rig:
@@ -108,15 +108,23 @@ def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
 # ---- tables
 
 
-def overview(rows: Sequence[dict[str, Any]]) -> str:
-    """Targets by faults: how many cases, or why there are none."""
+def all_cases(results: Path) -> dict[str, int]:
+    """How many cases there are of each target whose rig was ever ready."""
+    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
+    heads = [head for head in map(json.loads, lines) if "target" in head]
+    return {head["target"]: head["cases"] for head in heads}
+
+
+def overview(rows: Sequence[dict[str, Any]], there_are: dict[str, int]) -> str:
+    """Targets by faults: how many cases were run, and how many there are."""
     count = Counter((row["case"]["target"], row["case"]["fault"]) for row in rows)
     lines = [
-        "| struck | " + " | ".join(FAULTS) + " |",
-        "|---|" + "---|" * len(FAULTS),
+        "| struck | " + " | ".join(FAULTS) + " | run | cases |",
+        "|---|" + "---|" * (len(FAULTS) + 2),
     ]
     for target in TARGETS:
         cells = [str(count[target, fault]) if count[target, fault] else "–" for fault in FAULTS]
+        cells += [str(sum(count[target, fault] for fault in FAULTS)), str(there_are.get(target, "?"))]
         lines.append(f"| {target} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
@@ -167,8 +175,13 @@ def write(results: Path) -> int:
     """The tables of what is in a file of results; returns how many cases went wrong."""
     rows = list(found(results).values())
     page = PAGE.read_text(encoding="utf-8")
-    for name, text in (("all cases", overview(rows)), ("kill matrix", table(rows)), ("no meaning", reasons())):
-        before, _, rest = page.partition(BEGIN.format(name))
+    for name, text in (
+        ("all cases", overview(rows, all_cases(results))),
+        ("kill matrix", table(rows)),
+        ("no meaning", reasons()),
+    ):
+        before, marker, rest = page.partition(BEGIN.format(name))
+        assert marker, f"{PAGE} has no place for the table '{name}'"
         page = before + BEGIN.format(name) + text + END + rest.partition(END)[2]
     PAGE.write_text(page, encoding="utf-8")
     order = {name: i for i, name in enumerate((*TARGETS, *FAULTS))}

@@ -49,7 +49,9 @@ from tests.reliability.case import (
 )
 from tests.reliability.formula import LOG
 
-PATIENCE = 180.0
+PATIENCE = 240.0
+"""Longest that one life may take [s]: Ray alone may wait for a simulator for two minutes."""
+
 LIVES = 4
 """A program that isn't done after so many of them never will be."""
 
@@ -198,7 +200,9 @@ class Rig:
         child = os.fork()
         if child == 0:
             self._in_child(life, resume=there)
-        status = wait(child)
+        if (status := wait(child)) is None:
+            life.note("hung", f"a life of the program did not end within {PATIENCE:g} s")
+            return "hung"
         if os.WIFSIGNALED(status):
             return f"ended by {signal.Signals(os.WTERMSIG(status)).name}"
         return "went on" if os.WEXITSTATUS(status) == 0 else f"came to rest: {state(life.directory)}"
@@ -293,6 +297,7 @@ class Rig:
     def _wrong(self, life: Life, unknown: set[tuple[str, int]]) -> Iterator[str]:
         if life.case is not None and not life.noted("struck"):
             yield "it was never struck"
+        yield from life.noted("hung")
         if life.noted("missed"):
             yield "there was nothing to be struck"
         if (found := state(life.directory)) is not State.FINISHED:
@@ -406,8 +411,8 @@ def label_of(drafts: Any) -> str:
 # ---- from outside
 
 
-def wait(child: int) -> int:
-    """The child's status; where it stopped it goes on a moment later."""
+def wait(child: int) -> int | None:
+    """The child's status; None if it doesn't end. Where it stopped it goes on a moment later."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         pid, status = os.waitpid(child, os.WUNTRACED | os.WNOHANG)
@@ -418,7 +423,8 @@ def wait(child: int) -> int:
             return status
         time.sleep(0.01)
     os.kill(child, signal.SIGKILL)
-    return os.waitpid(child, 0)[1]
+    os.waitpid(child, 0)
+    return None
 
 
 def leftovers(place: Path) -> list[psutil.Process]:

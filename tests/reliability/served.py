@@ -165,7 +165,7 @@ class _People:
         if self._running():
             os.kill(self._child, signal.SIGKILL)
             self._status = os.waitpid(self._child, 0)[1]
-            self._life.note("told", "the daemon did not end")
+            self._life.note("hung", f"the daemon did not end within {PATIENCE:g} s")
         if following is not None:
             following.join(30.0)
         assert self._status is not None

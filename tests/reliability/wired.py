@@ -60,7 +60,7 @@ class WiredRig(Rig):
             operator=OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
         )
         virtual_operator.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
-        async with InProcessLaboratory(spec, Formula) as opened:
+        async with InProcessLaboratory(spec, Formula, need_bench=True) as opened:
             attend(opened, life)
             yield _Open(opened)
 
