@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
-import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -94,16 +94,24 @@ def test_points_are_chosen_by_kind_and_stage() -> None:
 
 
 def test_a_line_that_is_cut_is_cut_at_both_ends_and_a_threads_own_is_not() -> None:
-    ours, theirs = socket.socketpair()
-    listening = socket.create_server(("127.0.0.1", 0))
-    with ours, theirs, listening, socket.create_connection(listening.getsockname()) as far:
-        near, _ = listening.accept()
-        with near:
-            assert strikes.cut([os.getpid()]) >= 2
-            assert far.recv(1) == near.recv(1) == b""
-            ours.send(b"x")
-            assert theirs.recv(1) == b"x"
-            socket.create_connection(listening.getsockname()).close()
+    """In a process of its own: this one has lines to whoever runs the tests."""
+    subprocess.run([sys.executable, "-c", CUT], check=True, cwd=ROOT)
+
+
+CUT = """
+import os, socket
+from tests.reliability import strikes
+
+ours, theirs = socket.socketpair()
+listening = socket.create_server(("127.0.0.1", 0))
+far = socket.create_connection(listening.getsockname())
+near, _ = listening.accept()
+assert strikes.cut([os.getpid()]) >= 2
+assert far.recv(1) == near.recv(1) == b""
+ours.send(b"x")
+assert theirs.recv(1) == b"x"
+socket.create_connection(listening.getsockname()).close()
+"""
 
 
 @pytest.fixture(params=[target for target in TARGETS if target != "program"])
