@@ -115,7 +115,7 @@ def test_what_can_t_be_compared_is_refused(bench: ModuleType, monkeypatch: pytes
         return str(refused.value)
 
     assert "--rows C7=3: should be a strategy and its simulations" in refusal("--rows", "C7=3")
-    assert "not searched by recorded.yaml; it searches cohesion, viscosity, wall" in refusal("--search", "friction")
+    assert "not searched by recorded.yaml; it searches eddies, friction, wall" in refusal("--search", "cohesion")
     assert "--known lip_drop: searched as well" in refusal("--known", "lip_drop=0")
     quickstart = BENCHMARKS.parent / "configs" / "campaigns" / "quickstart.yaml"
     assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
@@ -139,7 +139,7 @@ def test_the_table_is_of_what_was_made_and_what_was_kept_is_not_made_again(
         return made[-1]
 
     def table(*more: str) -> list[dict[str, Any]]:
-        arguments = ["--rows", "C4=20", "--random", "2", "--known", "cohesion=0", "--once", "random", *more, "--json"]
+        arguments = ["--rows", "C4=20", "--random", "2", "--known", "eddies=0", "--once", "random", *more, "--json"]
         monkeypatch.setattr(sys, "argv", ["calibration_strategies.py", *arguments])
         bench.main()
         rows: list[dict[str, Any]] = json.loads(capsys.readouterr().out.strip().splitlines()[-1])["rows"]
@@ -158,8 +158,8 @@ def test_the_table_is_of_what_was_made_and_what_was_kept_is_not_made_again(
         assert rows[-1][split] == pytest.approx(sum(values) / 2, abs=1e-4)
         low, high = rows[-1][f"{split}_interval"]
         assert low <= rows[-1][split] <= high
-    assert [theta["cohesion"] for theta in rows[-1]["thetas_found"]] == [0.0, 0.0]
-    assert rows[0]["thetas_found"][0]["cohesion"] > 0.0
+    assert [theta["eddies"] for theta in rows[-1]["thetas_found"]] == [0.0, 0.0]
+    assert rows[0]["thetas_found"][0]["eddies"] > 0.0
 
     monkeypatch.setattr(bench, "run_self", lambda *arguments: pytest.fail("made again"))
     assert table("--seeds", "11", "12") == rows

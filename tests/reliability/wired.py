@@ -6,6 +6,7 @@ same; time is scaled. A person mends what is broken: a balance whose process die
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
@@ -36,6 +37,9 @@ class WiredRig(Rig):
     process = ""
     """What stands on the command line of what is struck."""
 
+    stand_ins: Any = None
+    """Of the laboratory that is open, in the program's process."""
+
     def write_campaign(self, folder: Path) -> Path:
         write_wired(folder)
         path = folder / "small.yaml"
@@ -62,6 +66,8 @@ class WiredRig(Rig):
         virtual_operator.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
         async with InProcessLaboratory(spec, Formula, need_bench=True) as opened:
             attend(opened, life)
+            assert opened.opened is not None
+            self.stand_ins = opened.opened.stand_ins
             yield _Open(opened)
 
     def pids(self) -> list[int]:
@@ -133,3 +139,10 @@ class BalanceRig(WiredRig):
     """Its line is a pseudo-terminal, not a socket: cut is unplugged."""
 
     target, process = "balance", "actors.balance.virtual_serial"
+
+    def strike(self, fault: str, life: Life) -> None:
+        if fault != CUT:
+            super().strike(fault, life)
+            return
+        task = asyncio.get_running_loop().create_task(self.stand_ins.order("unplug"))
+        self.unplugging = task  # somebody has to hold it

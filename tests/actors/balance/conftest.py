@@ -41,9 +41,12 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSpec:
     return replace(spec, **changes)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def voices() -> Iterator[Callable[[str], VirtualSerialBalance]]:
-    """One virtual balance of each voice, started when first asked for."""
+    """One virtual balance of each voice, started when first asked for.
+
+    They end with these tests: at this pace each keeps an eighth of a core busy.
+    """
     started: dict[str, VirtualSerialBalance] = {}
 
     def of(voice: str) -> VirtualSerialBalance:
