@@ -176,7 +176,7 @@ class _OpenLaboratory:
         """Stop what moves, past everything that waits for the arm; it stays locked. Returns whether there is an arm.
 
         Raises:
-            LaboratoryError: it can't be told; only its own emergency stop helps then.
+            LaboratoryError: it can't be reached; only its own emergency stop helps then.
         """
         if self._opened is None:
             return False

@@ -24,7 +24,7 @@ class BenchLostError(LaboratoryError):
 
 
 class NotPouredError(LaboratoryError):
-    """The pour did not begin, and nothing was poured: it may be made once a person has seen to what is said here."""
+    """The pour did not begin, and nothing was poured: it may be made once a person has seen to what stands here."""
 
 
 class UnknownPourError(LaboratoryError):
@@ -174,7 +174,7 @@ class Stoppable(Protocol):
         """Stop what moves; it stays locked. Returns whether there is an arm.
 
         Raises:
-            LaboratoryError: it can't be told.
+            LaboratoryError: it can't be reached.
         """
         ...
 

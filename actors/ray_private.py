@@ -189,7 +189,7 @@ def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
 
 
 def _end_log_monitor() -> None:
-    """End the process that reads all workers' logs: nobody is told of them, and it holds up to 200 of them open."""
+    """End the process that reads all workers' logs: nobody gets them, and it holds up to 200 of them open."""
     from ray._private import worker
 
     worker._global_node.kill_log_monitor(check_alive=False)

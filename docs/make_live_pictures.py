@@ -64,9 +64,10 @@ def during_a_run(chromium: str, to: Path) -> Path:
         shutil.copytree(ROOT / "configs", Path(name) / "configs")
         campaign = Path(name) / "configs" / "campaigns" / "quickstart.yaml"
         with running(campaign) as (process, url, run), looking(chromium, url) as page:
-            wait(process, run, stage="calibration", kind=Kind.TOLD, count=22)
+            # each a little before what it is to show: the picture itself takes half a minute, the whole run some two
+            wait(process, run, stage="pours", kind=Kind.POUR_FINISHED, count=7)
             picture(page, to / "calibrating.png")
-            wait(process, run, stage="deployment", kind=Kind.POUR_FINISHED, count=2)
+            wait(process, run, stage="deployment", kind=Kind.TOLD, count=4)
             picture(page, to / "deploying.png")
             process.wait(1800.0)
         kept = Path(tempfile.gettempdir()) / "live-quickstart-run"

@@ -68,7 +68,7 @@ class Rehearsal:
     def _built(self, stage: StageDefinition, results: Results) -> Strategy | None:
         try:
             return stage.build(results, stage_seed(self.seed, stage.name))
-        except Exception:  # it needs what nobody can know yet: whatever is wrong is said when its turn comes
+        except Exception:  # it needs what nobody can know yet: whatever is wrong is reported when its turn comes
             return None
 
     def _acted_out(self, stage: StageDefinition) -> Learnt | None:

@@ -129,7 +129,7 @@ class TerminalOperator:
                 return understood
 
     def _understood(self, question: Question, line: str) -> str | None:
-        """The answer that a line is, else None, and it is said what would be one."""
+        """The answer that a line is; else None, and what would be one is printed."""
         said = " ".join(line.lower().split())
         if said == GIVE_UP:
             raise LaboratoryError(f"given up by the operator at: {question.text.rstrip('.')}")

@@ -109,7 +109,7 @@ class Liquid(BaseModel):
 class SimulationParameters(BaseModel):
     """What calibration may turn: θ_s and nuisances of the bench. Names follow FleX where it has one; meanings are ours.
 
-    Nuisances say how a bench differs, pour after pour, from what it was told: where the receiver stands, how the pourer
+    Nuisances say how a bench differs, pour after pour, from what was given: where the receiver stands, how the pourer
     is held, how fast the arm's clock runs. The simulator applies them in one place (`PourTask.placement`).
     """
 

@@ -25,7 +25,7 @@ Follow = Callable[[ArmState], None]
 
 
 def _nobody(state: ArmState) -> None:
-    """Whoever is told where an arm is that nobody follows."""
+    """Whoever gets the place of an arm that nobody follows."""
 
 
 class DeviceArm:
@@ -57,7 +57,7 @@ class DeviceArm:
         await self.device.call("release", deadline=PATIENCE, urgent=True)
 
     async def move_to_start(self, path: PlannedPour, follow: Follow = _nobody) -> None:
-        """From home to the pour's start; `follow` is told now and then where it is."""
+        """From home to the pour's start; `follow` is called now and then with its place."""
         async with self._followed(follow):
             await self.device.call("move_to_start", path, deadline=self._deadline(path.approach_time))
 
@@ -108,7 +108,7 @@ class DeviceArm:
 
     @contextlib.asynccontextmanager
     async def _followed(self, follow: Follow) -> AsyncIterator[None]:
-        """Somebody is told where the arm is, meanwhile."""
+        """Somebody gets the arm's place, meanwhile."""
         if follow is _nobody:
             yield
             return

@@ -78,15 +78,15 @@ class DeviceBalance:
         await self.device.call("close", deadline=ANSWER_DEADLINE)
 
     async def prepare(self, seed: tuple[int, ...]) -> None:
-        """Balances that are told what stands on them only: empty tray, bench time 0, noise of a new pour."""
+        """Balances that are only given what stands on them: empty tray, bench time 0, noise of a new pour."""
         await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
 
     async def put(self, load: Load) -> None:
-        """Balances that are told what stands on them only: what comes onto the tray from now on."""
+        """Balances that are only given what stands on them: what comes onto the tray from now on."""
         await self.device.call("put", load, deadline=ANSWER_DEADLINE)
 
     async def pass_time(self, seconds: float) -> None:
-        """Balances that are told what stands on them only: bench time passes [s]."""
+        """Balances that are only given what stands on them: bench time passes [s]."""
         await self.device.call("pass_time", seconds, deadline=self._deadline(seconds))
 
     async def interrupt(self) -> None:

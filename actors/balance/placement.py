@@ -40,7 +40,7 @@ class Step:
     """Something to do, in order.
 
     Attributes:
-        do: 'tare' the balance with what is said on it, 'weigh' what is said, or 'pour'.
+        do: 'tare' the balance with what is listed on it, 'weigh' what is listed, or 'pour'.
         put: what has to stand where, for the person who puts it there; whole sentences.
         when: 'once' for a vessel (and again when it is replaced), else 'before' or 'after' the pour.
         key: of the weighing; '' for other steps.

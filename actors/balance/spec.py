@@ -61,7 +61,7 @@ class BalanceDevice(ABC):
 
     Attributes:
         kind: as registered at the door `decant.balances`, and as written in files.
-        told: on a virtual bench nothing is at its far end: the driver itself is told what stands on it, and has
+        told: on a virtual bench nothing is at its far end: the driver itself is given what stands on it, and has
             `prepare` and `put` as `actors.balance.virtual_balance.VirtualBalance` has them.
         time_scale: bench seconds per second of the clock; 1 for anything real, 0 waits for nothing.
         repeatability: standard deviation of weighing the same thing again [kg].

@@ -135,7 +135,7 @@ def _numbers(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -
 
 
 def _nobody(notice: Notice) -> None:
-    """Whoever would be told of every weighing on a bench of numbers."""
+    """Whoever would get every weighing on a bench of numbers."""
 
 
 async def _wired(

@@ -69,7 +69,7 @@ class PourReport:
 
     @property
     def watched(self) -> bool:
-        """Whether anybody is told."""
+        """Whether anybody gets it."""
         return self._progress is not None
 
     def pour(self, liquid: RecordedFrames) -> None:

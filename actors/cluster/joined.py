@@ -85,7 +85,7 @@ class JoinedCluster:
         """All of the bench's resource on one node: a second program can't move the same arm.
 
         Returns:
-            The node's id, and what Ray has to be told to put an actor there.
+            The node's id, and what Ray needs to put an actor there.
         """
         from ray.util.placement_group import placement_group, placement_group_table
         from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy

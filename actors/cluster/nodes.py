@@ -53,7 +53,7 @@ class PinnedNode:
 
     Attributes:
         node: which.
-        options: what Ray has to be told to put an actor there.
+        options: what Ray needs to put an actor there.
     """
 
     node: Node

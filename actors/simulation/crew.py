@@ -16,7 +16,7 @@ RESTART_PAUSE = 20.0
 """After a member's process failed to start, another one is tried so much later [s]: the cause may be lasting."""
 
 _TELLING_PAUSE = 1.0
-"""Losses within so much time are told together [s]: a lost node takes many with it."""
+"""Losses within so much time are reported together [s]: a lost node takes many with it."""
 
 
 class Crew:

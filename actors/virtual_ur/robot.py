@@ -1,4 +1,4 @@
-"""The arm itself: where it is told to be, where it is, what it carries, what it reports of itself."""
+"""The arm itself: where it is commanded to be, where it is, what it carries, what it reports of itself."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class Safety:
 
     @property
     def checksum(self) -> str:
-        """As people and programs are told."""
+        """As it is shown to people and sent to programs."""
         return self.reported_checksum or self.configuration.checksum
 
     @property

@@ -39,7 +39,7 @@ RUNS = (
     Column("begun", "time", "when its journal was begun"),
     Column("ended", "time", "when the last entry was written; of a run that goes on, until now"),
     Column("state", "text", "of the campaign, as in its journal; 'interrupted' where its process died without a word"),
-    Column("reason", "text", "why it is in that state, where something was to be said"),
+    Column("reason", "text", "why it is in that state, where there is something to report"),
     Column("laboratory", "text", "name of the laboratory"),
     Column("seed", "integer", "of every random choice"),
     Column("liquid", "texts", "names of the liquids"),

@@ -45,7 +45,7 @@ class RunRead:
 
 
 def read_run(directory: Path) -> RunRead:
-    """Read a run, also one that is being written. What can't be read is said in `problem`; it is never raised."""
+    """Read a run, also one that is being written. What can't be read is written into `problem`; it is never raised."""
     row: Row = {"run": directory.name, "path": str(directory)}
     try:
         remarks = read_remarks(directory)

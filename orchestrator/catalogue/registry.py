@@ -20,7 +20,7 @@ _said = False
 
 
 def register(directory: Path) -> None:
-    """Enter a run's folder. A state directory that can't be written is said once, and never stops a run."""
+    """Enter a run's folder. A state directory that can't be written is reported once, and never stops a run."""
     global _said
     try:
         enter([directory])

@@ -38,7 +38,7 @@ _TOLD = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """What `run` and `calibrate` are told on the command line beside their campaign."""
+    """What `run` and `calibrate` are given on the command line beside their campaign."""
 
     resume: bool = False
     run_id: str | None = None

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """What `simulate` is told on the command line beside its campaign."""
+    """What `simulate` is given on the command line beside its campaign."""
 
     assignments: list[str] | None = None
     """Values of the action, `name=value`."""

@@ -210,7 +210,7 @@ def _desk(daemon: bool) -> Iterator[Desk]:
 
 @contextlib.contextmanager
 def _catalogue(*, anew: bool = False, before: Any = None) -> Iterator[Catalogue]:
-    """The catalogue, up to date; what of it can't be read is said at the end."""
+    """The catalogue, up to date; what of it can't be read is printed at the end."""
     from orchestrator.catalogue.index import Catalogue
     from orchestrator.state_directory import state_directory
 

@@ -164,7 +164,7 @@ def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, Spread], delivere
 
 
 def _regimes(task: PourTask) -> Regimes | None:
-    """What the planned pour is like; what the simulator lacks for it is told on stderr."""
+    """What the planned pour is like; what the simulator lacks for it is printed on stderr."""
     from orchestrator.report.regimes import numbers_line, regimes_of
 
     try:

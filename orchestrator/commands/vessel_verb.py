@@ -37,7 +37,7 @@ def vessel(
     """Make a vessel file from what you can measure: callipers, photograph, points, a mesh, a fill or a tilt table.
 
     Sources for a turned vessel can be joined: each says what it knows, with its own uncertainty. Beside the file there
-    is a picture with the section, its band and what was measured. What was measured is said in the file.
+    is a picture with the section, its band and what was measured. What was measured is written into the file.
     """
     sources = given(locals(), "out", "name", "as_json")
     from orchestrator.commands import vessel as verb

@@ -226,7 +226,7 @@ def _first(given: float | None, known: float) -> float:
 
 
 PLAIN_WATER = Properties(density=998.0, dynamic_viscosity=1.0e-3, surface_tension=0.0728)
-"""What a liquid is like that nothing is said of."""
+"""What a liquid is like whose properties are not given."""
 
 
 def _known(section: LiquidFile, place: Place, report: Report) -> Properties | None:

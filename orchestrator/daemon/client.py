@@ -1,4 +1,4 @@
-"""The daemon from the command line, on this machine or another: HTTP calls whose refusals are told as they are."""
+"""The daemon from the command line, on this machine or another: HTTP calls whose refusals are passed on as they are."""
 
 from __future__ import annotations
 

@@ -28,8 +28,8 @@ PASSING = (PourProgressed, StrategyProgressed)
 def event_json(event: Event) -> dict[str, Any]:
     """The fields of an event, with the name of its class under 'type'.
 
-    Recorded particles are left out (they are in the recording), a question to the optimiser is told by its purpose, its
-    answer by its points; what a strategy has learnt is in the event that closes its stage.
+    Recorded particles are left out (they are in the recording), a question to the optimiser has its purpose, its
+    answer its points; what a strategy has learnt is in the event that closes its stage.
     """
     left_out = {"frames"}
     if isinstance(event, StrategyProgressed):

@@ -1,7 +1,7 @@
 """Everything that happens, in order and numbered, for whoever watches: from now on, or from where they left off.
 
 Readers wait for nothing that they have not asked for and keep nobody waiting: each has seen so much of the sequence and
-takes from there what is still kept. One that is too slow is told how much it has missed.
+takes from there what is still kept. One that is too slow is sent how much it has missed.
 """
 
 from __future__ import annotations

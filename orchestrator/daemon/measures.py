@@ -1,4 +1,4 @@
-"""What Prometheus is told: counts of what there is, and of what happened."""
+"""What is reported to Prometheus: counts of what there is, and of what happened."""
 
 from __future__ import annotations
 

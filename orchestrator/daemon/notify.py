@@ -58,12 +58,12 @@ class NotifySection(Section):
     the environment, for URLs with secrets in them."""
 
     about: list[Literal["question", "ended", "failed", "silence", "emergency"]] | None = None
-    """What is told: all unless given. `question`: a person has to answer; `ended`: a campaign is finished or was
+    """What is sent: all unless given. `question`: a person has to answer; `ended`: a campaign is finished or was
     stopped; `failed`: it can't go on, or a pour is UNKNOWN; `silence`: nothing happens; `emergency`: an emergency
     stop."""
 
     silence: Annotated[float, Quantity("s", "15 min", 1.0, 86_400.0, positive=True)] = 900.0
-    """A running campaign without news for so long hangs; a question that is open for so long is told once more."""
+    """A running campaign without news for so long hangs; a question that is open for so long is reported once more."""
 
     page: Text | None = None
     """Address of the page as people elsewhere reach it: the link in messages."""
@@ -92,12 +92,12 @@ class NotifyError(ValueError):
 
 
 class Notifier:
-    """Sends word to all receivers. `note` is told everything that happens; it returns at once and never raises.
+    """Sends word to all receivers. `note` is called with everything that happens; it returns at once and never raises.
 
     Args:
         receivers: URLs.
-        about: occasions that are told.
-        silence: without news from a running campaign [s] before that is told.
+        about: occasions that are reported.
+        silence: without news from a running campaign [s] before that is reported.
         page: link for people.
         clock: seconds, monotonic.
 

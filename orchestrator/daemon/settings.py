@@ -84,7 +84,7 @@ class RecordingsSection(Section):
 
 
 class DaemonFile(Section):
-    """What a daemon is told."""
+    """A daemon's settings."""
 
     state: FilePath | None = None
     """Folder of everything that it keeps: queue, questions, events, tokens, runs."""

@@ -61,12 +61,12 @@ class LearningStage:
         self._waiting: dict[str, Callable[[], bytes]] = {}
         self._least: dict[str, float] = {}
         self.best: dict[str, str] = {}
-        """What people are told of the best pour, by the receiver's name."""
+        """What is shown of the best pour, by the receiver's name."""
         self.trust = ""
         """Whether the simulator is to be trusted, in words."""
 
     def opened(self) -> None:
-        """A campaign begins: where pictures will come, it is said when."""
+        """A campaign begins: where pictures will come, a text says when."""
         plan = self._plan
         if plan.calibration is not None:
             self._coming(f"{CALIBRATION}/surrogate", "The discrepancy over θ comes with the first simulations.")

@@ -23,7 +23,7 @@ _PURPOSES = {
     "tilt": style.BEST,
     "idle": style.PALE,
 }
-"""Colours of lanes that are told apart; others get Rerun's."""
+"""Colours of lanes that have one of their own; others get Rerun's."""
 
 
 class Machine:

@@ -91,7 +91,7 @@ def ended_with_parent() -> Callable[[], None] | None:
 
     def tie() -> None:
         prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it died before it was said
+        if os.getppid() != parent:  # it died before that was asked for
             os._exit(1)
 
     return tie

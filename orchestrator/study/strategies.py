@@ -114,7 +114,7 @@ class SimulatedTable:
         return Progress(len(self._rows), self._total)
 
     def result(self) -> Tabled:
-        """One row for each simulation, once all are there: watchers are told how many until then."""
+        """One row for each simulation, once all are there: watchers get their number until then."""
         return Tabled(simulations=len(self._rows), rows=tuple(self._rows) if self.finished else ())
 
 

@@ -1,6 +1,6 @@
 """Cohesion: the surface's energy, its tension times its area, and that energy's exact gradient as the force.
 
-What a particle has of the surface is told by two sums over its neighbours: the attraction that does not cancel, a
+What a particle has of the surface follows from two sums over its neighbours: the attraction that does not cancel, a
 vector g (1 on a plane surface, 0 inside), and the share of bonds that it lacks, δ. Its energy is
 
     E_i = σ d² / SURFACE · (√(max(|g| − CALM, 0)² + (ALONE δ)² + BLUNT²) − BLUNT).

@@ -27,7 +27,7 @@ class Stretch:
         joints: (N, 6) [rad]; of no meaning where `unreached`.
         spec: of the arm and its cell.
         phases: of a pour: name, start and end [s]; empty otherwise.
-        unreached: flange in the base's frame, for poses that the arm can't take: some can be said of them all the same.
+        unreached: flange in the base's frame, for poses that the arm can't take: some have one all the same.
     """
 
     name: str

@@ -69,7 +69,7 @@ def stop_program(address: str, patience: float = PATIENCE) -> None:
     """End whatever program runs.
 
     Raises:
-        DashboardError: it can't be told so.
+        DashboardError: it can't be reached.
     """
     with Dashboard(address, patience) as dashboard:
         dashboard.demand("stop", "Stopped")

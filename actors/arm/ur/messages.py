@@ -143,7 +143,7 @@ class Outcome:
         joints: where the arm stands [rad]; as last seen, if `standing` is None.
         standing: when it was first seen at rest [s of `time.monotonic`].
         answered: when the program was first seen to have taken an order to stop [s of `time.monotonic`].
-        moved: it had been told to go.
+        moved: it had been commanded to go.
         slider: the lowest it was seen at.
     """
 

@@ -3,7 +3,7 @@
 A package is `int32 size, uint8 type, …`, big-endian; a robot state (16) consists of sub-packages of the same shape.
 
 Source: the manufacturer's page on primary and secondary interfaces; the safety data's first four bytes are the
-checksum, as was said in the manufacturer's forum.
+checksum, as the manufacturer's forum has it.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Primary:
         address: of the controller.
 
     Attributes:
-        state: as it was told first, with the tool in it.
+        state: as it was sent first, with the tool in it.
         complaints: the last things it said about programs.
         broken: it said that a program can't be read, or can't go on.
 

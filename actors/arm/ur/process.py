@@ -108,7 +108,7 @@ class WorkerProcess:
         self._gone.wait(2.0)
 
     def _send(self, message: Any) -> None:
-        with self._sending, contextlib.suppress(OSError):  # that it is gone is noticed where it is heard
+        with self._sending, contextlib.suppress(OSError):  # that it is gone is noticed where its answers are read
             self._connection.send(message)
 
     def _hear(self) -> None:

@@ -154,7 +154,7 @@ def _stop_function(number: int) -> list[str]:
 
 
 def _preparation(settings: Settings, number: int) -> list[str]:
-    """The number is told last, so that whoever sees it sees all the rest."""
+    """The number is written last, so that whoever sees it sees all the rest."""
     return [
         f'  rtde_set_watchdog("input_int_register_{HEARTBEAT}", {SLOWEST_HEARTBEAT:.1f}, "stop")',
         f"  set_tcp(p{_list(settings.tool)})",

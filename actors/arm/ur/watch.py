@@ -222,7 +222,7 @@ class Watch:
         return self._broken_off(kind, text)
 
     def _stopped_by_program(self, primary: Primary) -> Outcome:
-        time.sleep(0.05)  # the safety mode may be told a little later
+        time.sleep(0.05)  # the safety mode may be reported a little later
         reading = self._look()
         if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
             return self._stopped_by_safety(reading)

@@ -28,11 +28,11 @@ class Character(Protocol):
         ...
 
     def speak(self, now: float) -> bytes:
-        """What is to be said by now."""
+        """What is to be sent by now."""
         ...
 
     def due(self, now: float) -> float | None:
-        """When to ask again though nothing was heard; None: not before."""
+        """When to ask again though nothing was received; None: not before."""
         ...
 
     def control(self, order: dict[str, Any], now: float) -> dict[str, Any]:

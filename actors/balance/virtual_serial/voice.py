@@ -77,7 +77,7 @@ class Voice(Protocol):
         ...
 
     def commands(self, heard: bytearray) -> list[bytes]:
-        """Take whole commands out of what was heard."""
+        """Take whole commands out of what was received."""
         ...
 
     def answer(self, command: bytes, display: Display) -> Said:

@@ -22,7 +22,7 @@ class ScriptConnection(Connection):
             programs = self._splitter.feed(data.decode("utf-8", "replace"))
         except ScriptError as error:
             self.controller.tell("exception", error.text)
-            self.drop()  # what follows can't be told from programs
+            self.drop()  # what follows can't be distinguished from programs
             return
         for program in programs:
             self.connections.uploads.put(program, self)

@@ -4,7 +4,7 @@ A package is `int32 size, uint8 type, …`, big-endian, the size including itsel
 sub-packages of the same shape.
 
 Source: the manufacturer's page on primary and secondary interfaces (software 5.10). Where it says "used internally",
-zeros are sent; the safety data's first four bytes are the checksum, as was said in the manufacturer's forum.
+zeros are sent; the safety data's first four bytes are the checksum, as the manufacturer's forum has it.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def _short(text: str) -> bytes:
 
 
 def version_message(time: float, version: tuple[int, int, int, int]) -> bytes:
-    """What a client is told first."""
+    """What a client is sent first."""
     major, minor, bugfix, build = version
     numbers = struct.pack(">BBii", major, minor, bugfix, build)
     return _message(time, VERSION, _short("URControl"), numbers, b"01-01-2022, 00:00:00")

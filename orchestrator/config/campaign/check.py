@@ -180,7 +180,7 @@ class _Checker:
         self.add((("liquid", "mass"), ("liquid",)), text)
 
     def _never_pours(self, scene: Scene, trials: Sequence[dict[str, float]], pourer: Vessel, role: _Role) -> bool:
-        """Whether the liquid stays below the lip at the largest tilt of the space, which is told."""
+        """Whether the liquid stays below the lip at the largest tilt of the space; warned of if not."""
         tilts = []
         for chosen in trials:
             try:
@@ -255,8 +255,8 @@ def check_campaign(
     Args:
         plan: of the campaign.
         as_written: whether its vessels are those of its file; places in it would else mislead.
-        warn: is told what can be run and makes little sense.
-        doing: is told what is being tried, where that takes long.
+        warn: called with what can be run and makes little sense.
+        doing: called with what is being tried, where that takes long.
 
     Returns:
         What is wrong, with its place as far as the campaign's file has one; empty when the campaign can start.

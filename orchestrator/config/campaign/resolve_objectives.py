@@ -13,7 +13,7 @@ from sim_engine.task import Scene
 def resolve_objectives(
     section: DeploymentSection, place: Place, scene: Scene, actions: Space, report: Report
 ) -> Objectives | None:
-    """What is minimised in place of a loss; None where nothing is said, or something is wrong."""
+    """What is minimised in place of a loss; None where nothing is given, or something is wrong."""
     before, parts = len(report.problems), section.objectives
     if parts is None:
         for key in ("pareto", "floor"):

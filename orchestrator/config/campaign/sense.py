@@ -1,6 +1,6 @@
-"""What can be run and makes little sense: told as warnings, with the part of the box of actions that would.
+"""What can be run and makes little sense: warned of, with the part of the box of actions that would.
 
-What is told here costs no pour: a stream that can't hit its receiver (a free jet's range), and tilts that are faster
+Finding it costs no pour: a stream that can't hit its receiver (a free jet's range), and tilts that are faster
 than the laboratory's arm may turn.
 """
 
@@ -67,7 +67,7 @@ def _misses(
         try:
             action = scene.action({"x_offset": 0.0, **values})
         except ValueError:
-            continue  # no such action, which is told elsewhere
+            continue  # no such action, which is reported elsewhere
         key = (scene.pourer, scene.liquid, scene.pivot, scene.hold_cap, action)
         if key not in known:
             known[key] = _landing(scene, action, pourer, receiver)
@@ -86,7 +86,7 @@ def _misses(
         return _where(actions, "height"), text
     if not hits:
         if not beside:
-            return None  # nothing leaves, which is told elsewhere
+            return None  # nothing leaves, which is reported elsewhere
         return (
             _where(actions, "y_offset"),
             f"the stream passes {1e3 * beside:.0f} mm beside the axis of '{scene.receiver.name}', whose opening has a "
@@ -123,7 +123,7 @@ def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> 
     try:
         course = flow_course(plan_motion(scene, action, pourer, receiver), scene.liquid.volume, pourer, receiver)
     except ValueError:
-        return None  # a motion that can't be made, which is told elsewhere
+        return None  # a motion that can't be made, which is reported elsewhere
     if course is None:
         return None
     return course.landing() if course.quantile(course.fall, 0.5) > 0.0 else math.nan

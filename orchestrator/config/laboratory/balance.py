@@ -179,7 +179,7 @@ class SerialSection(BalanceDeviceSection):
 
 
 class NumbersSection(BalanceDeviceSection):
-    """A balance of numbers: nothing is at its far end, and its driver is told what stands on it."""
+    """A balance of numbers: nothing is at its far end, and its driver is given what stands on it."""
 
     kind: Literal["numbers"] = "numbers"
     """A balance of numbers, on a virtual bench."""

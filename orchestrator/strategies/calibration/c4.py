@@ -114,7 +114,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
     Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
     Limitations: θ that make the simulated pour stop short are judged only by the actions at which they do pour. With
     `averaging` 'noise' the optimiser sees heteroscedastic noise, large where the discrepancy varies over g, and nothing
-    can be said about θ beside θ*.
+    is known about θ beside θ*.
     """
 
     def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:

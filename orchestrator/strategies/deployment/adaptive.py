@@ -24,7 +24,7 @@ STOP: Final = "stop"
 OPTIONS = (GO_ON, STOP)
 
 WORDS = ((0.05, "is borne out"), (0.3, "is borne out so far"), (0.7, "is in doubt"), (0.95, "is probably wrong here"))
-"""What is said of a simulator whose ignorance is below each of these; above all of them it is wrong here."""
+"""The words for a simulator whose ignorance is below each of these; above all of them it is wrong here."""
 
 
 class IgnoranceSettings(Section):
@@ -48,7 +48,7 @@ class RiskLimitSettings(Section):
     """With which a pour may lose more."""
 
     otherwise: Otherwise = GO_ON
-    """Where no action keeps it, which is said before the pour. go on: the least risky one is poured; stop: the
+    """Where no action keeps it, which is logged before the pour. go on: the least risky one is poured; stop: the
     deployment ends; ask: the campaign pauses with a question."""
 
 
@@ -164,7 +164,7 @@ class Trust:
         self._accepted = False
         self.decisions: list[Decision] = []
 
-    # -- what is said ----------------------------------------------------------------------------------------------
+    # -- what is logged --------------------------------------------------------------------------------------------
 
     def hear(self, found: MismatchFound, pours: Sequence[PourTrial]) -> None:
         """Take in an answer, and say in words what the latest pour changed."""
@@ -273,7 +273,7 @@ class Trust:
     # -- results ---------------------------------------------------------------------------------------------------
 
     def result(self) -> Believed:
-        """All that was said."""
+        """All that was logged."""
         ignorance = self._after[-1].ignorance if self._after else 0.0
         displaced = {} if self._latest is None else dict(zip(self._actions.names, self._shifts(), strict=True))
         return Believed(

@@ -53,7 +53,7 @@ class Deployment(ABC, Generic[S]):
     """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
 
     An action that can't be made, because the vessels touch or the arm can't reach, is refused before anything is
-    simulated or moved. It has no cost; the optimiser is told the place, and keeps away from where another refusal is
+    simulated or moved. It has no cost; the optimiser is given the place, and keeps away from where another refusal is
     likely. A refusal does not count against a budget, but only so many are free. A pour that failed after something had
     moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
     """

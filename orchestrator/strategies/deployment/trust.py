@@ -17,7 +17,7 @@ from orchestrator.strategies.deployment.pours import PourTrial
 from orchestrator.strategies.learnt import Part
 
 FEWEST_POURS = 3
-"""Pours before which nothing is said: one or two may be bad luck."""
+"""Pours before which nothing is logged: one or two may be bad luck."""
 
 TOLERANCE = 0.01
 """Share of the worst loss by which a simulator may be wrong without being called so: most people don't care about a

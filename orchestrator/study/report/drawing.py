@@ -49,7 +49,7 @@ PALEST, DARKEST = 0.45, -0.35
 
 @dataclass(frozen=True)
 class Look:
-    """How one arm is drawn; no two of a figure share it, and none is told by its colour alone that has kin.
+    """How one arm is drawn; no two of a figure share it, and none is known by its colour alone that has kin.
 
     Attributes:
         colour: of lines and marks.

@@ -145,7 +145,7 @@ def find_outline(
 ) -> Outline:
     """The most likely profile given everything that was measured.
 
-    Where the measurements scatter more than they were said to, the uncertainty grows accordingly.
+    Where the measurements scatter more than was given, the uncertainty grows accordingly.
 
     Args:
         height: from the inner floor to the rim [m].

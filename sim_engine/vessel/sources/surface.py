@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 MOST_DIRECTIONS, LEAST_DIRECTIONS = 48, 16
-"""Directions in which the radius is told; there are two thirds as many heights."""
+"""Directions in which the radius is given; there are two thirds as many heights."""
 
 IN_A_CELL = 20
 """Points that should fall to each direction and height."""
