@@ -129,7 +129,10 @@ class LearningStage:
         if deploying and self._plan.deployment is not None:
             unit = deployment_unit(self._plan.deployment)
         subject = self._names.get(scene or "", scene or "") if deploying else "θ"
-        title = f"{subject}: what is known after {len(problem.data)} observations"
+        known = f"{len(problem.data)} observations"
+        if len(problem.simulated):
+            known = f"{len(problem.data)} pours and {len(problem.simulated)} simulations"
+        title = f"{subject}: what is known after {known}"
         self._picture(
             f"{PLACE}/{where}/surrogate",
             event.time,
