@@ -37,7 +37,7 @@ class KnownLiquid:
 
     Attributes:
         name: without the share.
-        share: smallest and largest percent by mass; None: it is no solution.
+        share: smallest and largest percent by mass; None: it is not a solution.
         temperatures: for which the data are good [°C].
         uncertainty: of the viscosity, a standard deviation over it: data, and a degree of temperature.
         source: of the data.
@@ -188,7 +188,7 @@ def find(name: str) -> tuple[KnownLiquid, float] | None:
             if liquid.share is None:
                 if share is None:
                     return liquid, 0.0
-                raise ValueError(f"{liquid.name} is no solution; write '{liquid.name}'")
+                raise ValueError(f"{liquid.name} is not a solution: write '{liquid.name}'")
             if share is None:
                 raise ValueError(f"how much {liquid.name}? Write for example '{liquid.name} 60 %' (by mass)")
             if not liquid.share[0] <= share <= liquid.share[1]:

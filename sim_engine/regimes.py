@@ -44,7 +44,11 @@ Re = 75. Above, so short a time is not enough for the liquid's viscosity to be f
 of others it is simulated, …"""
 
 CREEPING = 2.0
-"""… up to this viscosity [Pa s], the largest that was held against theory (`decant physics film`)."""
+"""… up to this viscosity [Pa s], the largest that was held against theory (`decant physics film`) …"""
+
+FLOOR = 400e-6
+"""… and roughly below that kinematic viscosity [m²/s]: so much the solver adds by itself at most, in a tank 41 mm deep
+(`decant physics floor`, spacings of 2.7 and 4.6 mm)."""
 
 PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer none has neighbours all around it, and the stream is a string."""
@@ -156,8 +160,15 @@ def _wetting(course: FlowCourse, liquid: Liquid) -> NotCovered:
 
 def _viscous(course: FlowCourse, liquid: Liquid) -> NotCovered:
     if liquid.is_thick:
-        stiff = f"{liquid.dynamic_viscosity:.3g} Pa*s; the simulator was held against theory up to {CREEPING:g} Pa*s"
-        return NotCovered("viscous", 1.0 if liquid.dynamic_viscosity > CREEPING else 0.0, f"the viscosity is {stiff}")
+        stiff, limit = liquid.dynamic_viscosity > CREEPING, f"was held against theory up to {CREEPING:g} Pa*s"
+        if not stiff:
+            limit = (
+                f"adds up to {1e6 * FLOOR:g} mm^2/s of its own, so that a liquid below that pours later than it "
+                "should; calibrate viscosity_factor on pours of this very liquid"
+            )
+        amount = f"{liquid.dynamic_viscosity:.3g} Pa*s ({1e6 * liquid.kinematic_viscosity:.3g} mm^2/s)"
+        share = float(stiff or liquid.kinematic_viscosity < FLOOR)
+        return NotCovered("viscous", share, f"the viscosity is {amount}; the simulator {limit}")
     share = course.share(reynolds(liquid, course.velocity, course.film) < VISCOUS_REYNOLDS)
     return NotCovered(
         "viscous",

@@ -43,7 +43,7 @@ def test_every_liquid_is_thinner_and_lighter_when_it_is_warm(known) -> None:  # 
     [
         ("glycerol", 20.0, "how much glycerol? Write for example 'glycerol 60 %'"),
         ("sugar syrup 90 %", 20.0, "sugar syrup is known from 0 to 78 %"),
-        ("ethanol 50 %", 20.0, "ethanol is no solution; write 'ethanol'"),
+        ("ethanol 50 %", 20.0, "ethanol is not a solution: write 'ethanol'"),
         ("ethanol", 90.0, "ethanol is known from 0 to 75 °C, not at 90 °C"),
     ],
 )
