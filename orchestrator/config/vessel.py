@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, create_model
 
+from orchestrator.config.yaml.errors import did_you_mean
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.quantities import Quantity, parse_quantity
 from orchestrator.config.yaml.sections import MADE, FilePath, Name, Number, Section, Text
@@ -242,4 +243,11 @@ def _known(section: LiquidFile, place: Place, report: Report) -> Properties | No
         names = ", ".join(f"'{one.name}{' 60 %' if one.share else ''}'" for one in KNOWN)
         report.add(place.at("temperature"), f"says nothing of a liquid that is not in the table; it has {names}")
         return None
+    if found is None and section.viscosity is None:
+        meant = did_you_mean(section.name.partition(" ")[0], [one.name for one in KNOWN])
+        if meant is not None or section.name.endswith("%"):
+            which = f"; did you mean '{meant}'?" if meant else "."
+            text = f"'{section.name}' is not in the table{which} Or give its 'viscosity' as well"
+            report.add(place.at("name"), text)
+            return None
     return found or PLAIN_WATER

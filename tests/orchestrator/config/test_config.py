@@ -95,6 +95,27 @@ def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, mes
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("glycerin 80 %", "'glycerin 80 %' is not in the table; did you mean 'glycerol'?"),
+        ("honey 80 %", "'honey 80 %' is not in the table. Or give its 'viscosity' as well"),
+        ("ethanoll", "did you mean 'ethanol'?"),
+    ],
+)
+def test_a_liquid_that_is_misspelt_is_not_poured_as_water(name: str, message: str, tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
+    path = tmp_path / "campaign.yaml"
+    path.write_text(text.replace("name: water", f"name: {name}"), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_campaign(path)
+    assert message in str(caught.value)
+    path.write_text(text.replace("name: water", f"name: {name}, viscosity: 50 mPa*s"), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:  # for its vessels alone, which are not there
+        load_campaign(path)
+    assert "table" not in str(caught.value)
+
+
 def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_after_its_density_was(
     tmp_path: Path,
 ) -> None:
