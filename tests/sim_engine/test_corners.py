@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_engine.pour import inside_mask
 from sim_engine.validation.tanks import box, holed_cup
 from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.corners import equivalent_distance, half_space
+from sim_engine.vessel.corners import equivalent_distance, half_space, inside_mask
 from sim_engine.vessel.spec import cylinder
 
 CUP = build_vessel(cylinder("cup", inner_radius=0.04, inner_height=0.1))
-MASK = inside_mask(CUP)
+MASK = inside_mask(CUP.grid)
 
 
 def at(field: np.ndarray[tuple[int, ...], np.dtype[np.float32]], r: float, z: float) -> float:
