@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -73,3 +76,16 @@ def test_a_box_s_corner_counts_three_walls() -> None:
     grid = type(tank.grid)(tank.grid.origin, tank.grid.spacing, plane, tank.grid.cavity)
     wall, edge, corner = grid.sample(np.array([[0.025, 0.0, 0.003], [0.003, 0.0, 0.003], [0.003, -0.022, 0.003]]))
     assert corner < edge < wall
+
+
+def test_what_is_inside_is_kept_and_a_damaged_file_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path))
+    np.testing.assert_array_equal(inside_mask(CUP.grid), MASK)
+    (kept,) = tmp_path.glob("inside-*.npz")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "scipy", None)
+        np.testing.assert_array_equal(inside_mask(CUP.grid), MASK)
+        kept.write_bytes(kept.read_bytes()[:100])
+        with pytest.raises(ImportError):
+            inside_mask(CUP.grid)
+    np.testing.assert_array_equal(inside_mask(CUP.grid), MASK)
