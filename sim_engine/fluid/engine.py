@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_engine.backend import BackendError, require_backend
 from sim_engine.cache import cache_directory
-from sim_engine.fluid.setup import POSE_STEP, SceneSetup
+from sim_engine.contact import rotations
+from sim_engine.fluid.setup import POSE_STEP, SceneSetup, pose_at
 from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState, of_parameters
 from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 from sim_engine.outcome import ParticleState
@@ -77,6 +78,8 @@ class FluidEngine:
             both = (setup.pourer, setup.receiver)
             for walls in both:
                 insides.add(walls.inside, walls.grid.values)
+            pose = pose_at(setup.poses, setup.start)
+            origins, turns = [pose[:3], setup.receiver_at], [*rotations(pose[None]), np.eye(3)]
             scenes.append(
                 {
                     **of_parameters(setup),
@@ -95,8 +98,10 @@ class FluidEngine:
                     "grid_spacing": [walls.grid.spacing for walls in both],
                     "wall": [walls.thickness for walls in both],
                     "rim": [walls.rim for walls in both],
-                    "origin": [np.zeros(3), setup.receiver_at],
-                    "turn": [np.eye(3), np.eye(3)],
+                    "origin": origins,
+                    "origin0": origins,
+                    "turn": turns,
+                    "turn0": turns,
                     "spill_level": setup.spill_level,
                     "poses_begin": row,
                     "table_step": POSE_STEP,
@@ -104,6 +109,9 @@ class FluidEngine:
                     "time": setup.start - setup.settling,
                     "start": setup.start,
                     "drift": setup.drift,
+                    "moving": count,
+                    "stale": 1,
+                    "dt": LONGEST_STEP,
                 }
             )
             begin += count
@@ -114,7 +122,7 @@ class FluidEngine:
         self._begins = [0, *np.cumsum([len(setup.positions) for setup in setups]).tolist()]
         self._thick = [setup.viscosity > 0.0 for setup in setups]
         positions = np.concatenate([s.positions for s in setups]).astype(np.float32)
-        self._load(self.state.table.rows(scenes), positions, self._poses)
+        self._load(self.state.table.rows(scenes), positions)
         self._facts = np.full((self.scenes, len(FACTS)), np.nan)
 
     @ti.kernel
@@ -122,7 +130,6 @@ class FluidEngine:
         self,
         rows: ti.types.ndarray(dtype=ti.f64, ndim=2),
         positions: ti.types.ndarray(dtype=ti.f32, ndim=2),
-        poses: ti.types.ndarray(dtype=ti.f32, ndim=2),
     ):
         f = self.state
         ti.loop_config(serialize=True)
@@ -143,7 +150,6 @@ class FluidEngine:
                 f.name[i] = i - f.begin[s]
                 f.count[i] = 0
                 f.first[i] = 0
-            self.stepper.begin(s, poses)
 
     @ti.kernel
     def _get(

@@ -351,18 +351,6 @@ class Stepper:
         f.steps[s] += 1
         f.open[s] = 0
 
-    @ti.func
-    def begin(self, s, poses: ti.template()):
-        """Put a scene's vessels in their first pose and ask for lists."""
-        f = self.state
-        self.place_pourer(s, f.time[s], poses)
-        for b in range(VESSELS):
-            f.origin0[s, b] = f.origin[s, b]
-            f.turn0[s, b] = f.turn[s, b]
-        f.stale[s] = 1
-        f.moving[s] = f.particles[s]
-        f.dt[s] = LONGEST_STEP
-
     @ti.kernel
     def advance(
         self,

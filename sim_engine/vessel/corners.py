@@ -44,6 +44,8 @@ def _fast_length(n: int) -> int:
 def _convolved(values: Floats, kernel: Floats) -> Floats:
     """Sums over the kernel where all of it lies inside the values; scipy, which has that, takes long to load.
 
+    Single precision: what comes of it is kept in that.
+
     Args:
         values: (a, b, c).
         kernel: (k, k, k), symmetric.
@@ -51,12 +53,12 @@ def _convolved(values: Floats, kernel: Floats) -> Floats:
     Returns:
         (a − k + 1, b − k + 1, c − k + 1).
     """
+    values, kernel = values.astype(np.float32), kernel.astype(np.float32)
     shape = tuple(_fast_length(n + k - 1) for n, k in zip(values.shape, kernel.shape, strict=True))
     axes = (0, 1, 2)
     product = np.fft.rfftn(values, shape, axes) * np.fft.rfftn(kernel, shape, axes)
     inside = tuple(slice(k - 1, n) for n, k in zip(values.shape, kernel.shape, strict=True))
-    result: Floats = np.fft.irfftn(product, shape, axes)[inside]
-    return result
+    return np.fft.irfftn(product, shape, axes)[inside].astype(np.float64)
 
 
 def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
