@@ -176,8 +176,18 @@ class RayDevice:
         return True
 
     async def pid(self) -> int:
-        """Process id of the actor."""
-        pid: int = await asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
+        """Process id of the actor.
+
+        Raises:
+            DeviceLostError: it has died.
+        """
+        import ray
+
+        try:
+            pid: int = await asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
+        except ray.exceptions.RayActorError as error:
+            self._lost = True
+            raise DeviceLostError(f"{self.name}: its process has died") from error
         return pid
 
     async def close(self) -> None:

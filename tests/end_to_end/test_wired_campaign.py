@@ -70,6 +70,7 @@ def far_ends(place: Workplace) -> list[psutil.Process]:
     return found
 
 
+@pytest.mark.slow  # killed over wires is also what the kill matrix does, and killed without wires a quick test
 @pytest.mark.realtime
 def test_a_campaign_over_wires_is_killed_in_a_pour_resumed_and_comes_to_its_end(workplace: Workplace) -> None:
     def tilting(entries: list[Entry]) -> bool:

@@ -85,6 +85,7 @@ def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_n
     assert tabs_as_they_came(tmp_path / "seen.rrd")[-2:] == ["Calibrating", "Deploying"]
 
 
+@pytest.mark.slow
 def test_two_campaigns_are_served_side_by_side(tmp_path: Path) -> None:
     plan = watched.campaign(pours=1)
     with LiveView() as live:
@@ -129,7 +130,7 @@ def test_address_that_is_not_one_is_refused_with_what_would_be_right() -> None:
             parsed(wrong)
 
 
-@pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("death", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
 def test_server_that_dies_or_hangs_costs_the_recording_nothing(tmp_path: Path, death: signal.Signals) -> None:
     plan = watched.campaign(pours=1)
     with LiveView() as live:

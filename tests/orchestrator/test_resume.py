@@ -27,7 +27,10 @@ from tests.orchestrator.toy import ToyLaboratory, ToyStrategy, logical_record, t
 from tests.patience import PATIENCE
 
 
-@pytest.mark.parametrize("after_commit", [False, True], ids=["before the write", "after the write"])
+@pytest.mark.parametrize(
+    "after_commit",
+    [pytest.param(False, id="before the write", marks=pytest.mark.slow), pytest.param(True, id="after the write")],
+)
 def test_killed_at_any_point_it_makes_the_requests_it_would_have_made(tmp_path: Path, after_commit: bool) -> None:
     run(tmp_path / "undisturbed")
     expected = logical_record(tmp_path / "undisturbed")

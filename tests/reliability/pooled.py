@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from actors.device import RayDevice
+from actors.device import DeviceLostError, RayDevice
 from actors.optimizer.actor import DeviceOptimizer, Proposer
 from actors.simulation.pool import RaySimulatorPool
 from actors.spec import LaboratorySpec
@@ -56,6 +56,8 @@ class PooledRig(Rig):
             self._device = RayDevice("optimiser", Proposer)
         while len(await self._pool.pids()) < SIMULATORS:
             await asyncio.sleep(0.05)
+        with contextlib.suppress(DeviceLostError):  # struck where nobody asked it any more
+            await self._device.pid()
         await self._device.revive()
         await self._device.pid()
         yield ToyLaboratory(self._pool, LoggingBench(life), DeviceOptimizer(self._device))  # type: ignore[arg-type]
