@@ -17,7 +17,7 @@ from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.daemon.guard import Daemon, Viewer
 from orchestrator.daemon.measures import measures
 from orchestrator.daemon.people import question_json
-from orchestrator.daemon.reading import REPORT, pours_of, summary_of
+from orchestrator.daemon.reading import REPORT, summary_of
 from orchestrator.daemon.running import job_of
 from orchestrator.daemon.shapes import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
 from orchestrator.daemon.store import Item
@@ -96,8 +96,8 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
         directory = daemon.settings.runs / item.run
 
         def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
-            plan = job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan
-            return pours_of(plan, directory), summary_of(directory)
+            pours = daemon.pours.of(directory, lambda: job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan)
+            return pours, summary_of(directory)
 
         try:
             pours, summary = await asyncio.to_thread(read)

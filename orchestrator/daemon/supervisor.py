@@ -21,6 +21,7 @@ from orchestrator.daemon.feed import Feed
 from orchestrator.daemon.lane import Lane
 from orchestrator.daemon.notify import Counts
 from orchestrator.daemon.people import Asking
+from orchestrator.daemon.reading import Pours
 from orchestrator.daemon.running import Common, Running
 from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
@@ -59,6 +60,7 @@ class Supervisor:
         self.lanes: dict[str, Lane] = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
         self.problems: dict[str, str] = {}
         self.words: dict[str, Counts] = {}
+        self.pours = Pours()
         self.stopping = False
         self.suspect = False
         """Whether the simulators may be past mending: they are started anew when nobody uses them."""
