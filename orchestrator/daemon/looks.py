@@ -23,6 +23,7 @@ from orchestrator.daemon.shapes import CampaignDetailOut, CampaignOut, QuestionO
 from orchestrator.daemon.store import Item
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.errors import RunError
+from orchestrator.plan import CampaignPlan
 
 READERS = 400
 """Readers of events at a time."""
@@ -96,8 +97,10 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
         directory = daemon.settings.runs / item.run
 
         def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
-            pours = daemon.pours.of(directory, lambda: job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan)
-            return pours, summary_of(directory)
+            def plan() -> CampaignPlan:
+                return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan
+
+            return daemon.pours.of(directory, plan), summary_of(directory)
 
         try:
             pours, summary = await asyncio.to_thread(read)
