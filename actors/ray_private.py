@@ -1,8 +1,8 @@
 """A Ray of our own: on this machine only, and with nothing left behind.
 
 It runs with stated memory, without dashboard, autoscaler or usage statistics, on the loopback interface, with a token
-of its own, in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed at the next
-start. `actors.ray_warden` cleans up behind a program that was killed. `actors.ray_runtime` decides when.
+of its own, in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed
+at the next start. `actors.ray_warden` cleans up behind a program that was killed. `actors.ray_runtime` decides when.
 """
 
 from __future__ import annotations

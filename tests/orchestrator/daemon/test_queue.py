@@ -56,9 +56,8 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
             found = await served.until(key, "finished")
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
             settings, item = served.daemon.settings, served.daemon.item(key)
-            afresh = Pours().of(
-                settings.runs / str(item.run), lambda: job_of(settings, item, settings.rig(item.rig)).plan
-            )
+            plan = job_of(settings, item, settings.rig(item.rig)).plan
+            afresh = Pours().of(settings.runs / str(item.run), lambda: plan)
             assert found["pours_made"] == afresh
 
     run(work())
