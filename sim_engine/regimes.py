@@ -46,9 +46,9 @@ of others it is simulated, …"""
 CREEPING = 2.0
 """… up to this viscosity [Pa s], the largest that was held against theory (`decant physics film`) …"""
 
-FLOOR = 400e-6
+FLOOR = 300e-6
 """… and roughly below that kinematic viscosity [m²/s]: so much the solver adds by itself at most, in a tank 41 mm deep
-(`decant physics floor`, spacings of 2.7 and 4.6 mm)."""
+(`decant physics floor`, spacings of 4.1 to 5.9 mm, .05 and .2 m/s)."""
 
 PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer none has neighbours all around it, and the stream is a string."""

@@ -25,8 +25,8 @@ THETA = SimulationParameters(cohesion=0.0, viscosity=0.0)
 
 FLOOR = (
     "Taylor and Green's vortices in a tank with slippery walls die away as exp(−2νk²t), whatever their speed. What is "
-    "found above the given viscosity is the solver's own: pressure makes of the packing of particles a weak solid, "
-    "whose stress counts the more the slower the shear."
+    "found above the given viscosity is the solver's own: under pressure the packing of particles is a weak solid, and "
+    "what is taken out of its stress inside is left beside walls and the surface."
 )
 FILM = "A film of 10 mm, ν = 1,000 mm²/s, runs down a plane of 20°: mean velocity g sin α e²/3ν (Nusselt 1916)."
 TUBE = (

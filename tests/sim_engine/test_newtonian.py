@@ -10,7 +10,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import THIN, Liquid, SimulationParameters
 from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
-from sim_engine.validation import films
+from sim_engine.validation import films, thick
 from sim_engine.vessel.spec import cylinder
 
 PLAIN = SimulationParameters(cohesion=0.0, viscosity=0.0)
@@ -33,6 +33,11 @@ def poured(viscosity: float, factor: float = 1.0) -> PourTask:
 def test_a_puddle_of_syrup_spreads_as_huppert_says(simulator: PourSimulator) -> None:
     found, _ = films.spreading(1_000, 2e-3, PLAIN)
     assert found[0].value < 0.12  # of the radius, over a second and a half
+
+
+def test_the_packing_adds_little_to_a_viscosity_however_slow_the_shear(simulator: PourSimulator) -> None:
+    value, _, _ = thick.own_viscosity(1_000, 1e-4, 0.05)
+    assert value < 6e-4  # it was 11e-4 before the packing's stress was taken out of the velocities
 
 
 def test_a_film_on_an_incline_is_slow_at_the_wall_and_as_fast_as_nusselt_s_in_the_mean(
