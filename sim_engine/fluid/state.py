@@ -82,6 +82,7 @@ class FluidState:
         self.particles = ti.field(ti.i32, shape=scenes)
         self.spacing = ti.field(ti.f32, shape=scenes)
         self.cohesion = ti.field(ti.f32, shape=scenes)  # scale of its accelerations [m/s²]
+        self.adhesion = ti.field(ti.f32, shape=scenes)  # of walls, in units of cohesion's; 0: 90° of contact angle
         self.viscosity = ti.field(ti.f32, shape=scenes)
         self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over that at which a pair parts
         self.friction = ti.field(ti.f32, shape=scenes)
@@ -127,12 +128,13 @@ class FluidState:
 
     def set_parameters(self, s: int, setup: SceneSetup) -> None:
         """What θ_s of a scene is to the methods."""
-        from sim_engine.fluid.tension import cohesion_acceleration, pull_interval
+        from sim_engine.fluid.tension import adhesion, cohesion_acceleration, pull_interval
         from sim_engine.fluid.viscosity import eddy_rate, relax_interval
 
         theta, density, d = setup.parameters, setup.density, setup.spacing
         tension = theta.cohesion if setup.tension is None else setup.tension
         self.cohesion[s] = cohesion_acceleration(tension, density, d)
+        self.adhesion[s] = adhesion(setup.contact_angle, theta.wall_distance)
         self.pull_waited[s], self.pull_wait[s] = 0.0, pull_interval(tension, density, d)
         self.viscosity[s] = theta.viscosity
         self.eddies[s] = eddy_rate(theta.eddies)

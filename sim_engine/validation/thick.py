@@ -13,7 +13,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
-from sim_engine.validation import films
+from sim_engine.validation import films, wetting
 from sim_engine.validation.result import Figure, Measurement, Series, reported, within
 from sim_engine.validation.stage import run, stir
 from sim_engine.validation.tanks import block, box
@@ -204,6 +204,7 @@ CASES: tuple[tuple[str, str, str, Work], ...] = (
     ("tube", "Tube", TUBE, tube),
     ("drainage", "Drainage of a wall film", DRAINAGE, drainage),
     ("puddle", "Viscous dam break", PUDDLE, puddle),
+    ("wetting", "Contact angle", wetting.ABOUT, wetting.wetting),
     ("thick-outflow", "Outflow of thick liquids", CUP, cup),
 )
 """Name, title, what it is about, and what runs it, in short or in full."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import THIN, Liquid, SimulationParameters
 from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
-from sim_engine.validation import films, thick
+from sim_engine.validation import films, thick, wetting
 from sim_engine.vessel.spec import cylinder
 
 PLAIN = SimulationParameters(cohesion=0.0, viscosity=0.0)
@@ -72,6 +73,24 @@ def test_the_factor_is_that_of_the_viscosity_and_none_to_a_liquid_as_thin_as_wat
         simulator.simulate(poured(1e-3, 5.0)).outcome.curve_poured
         == simulator.simulate(poured(2e-3)).outcome.curve_poured
     )
+
+
+@pytest.mark.parametrize("degrees", [150.0, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_a_puddle_stands_as_high_as_its_contact_angle_says(simulator: PourSimulator, degrees: float) -> None:
+    angle = math.radians(degrees)
+    value, _, _ = wetting.puddle(2_000, angle)
+    assert value == pytest.approx(wetting.height(angle), rel=0.2)
+
+
+def test_a_contact_angle_that_nobody_gave_is_none(simulator: PourSimulator) -> None:
+    plain, wet = SCENE.liquid, SCENE.liquid.model_copy(update={"contact_angle": 0.5})
+    assert "contact_angle" in plain.free_fields()  # runs of before keep their fingerprint
+    assert "contact_angle" not in wet.free_fields()
+    curves = [
+        simulator.simulate(replace(poured(1e-3), scene=replace(SCENE, liquid=liquid))).outcome.curve_poured
+        for liquid in (plain, wet)
+    ]
+    assert curves[0] != curves[1]
 
 
 @pytest.mark.parametrize(("viscosity", "thick"), [(0.99 * THIN * 998.0, False), (1.01 * THIN * 998.0, True)])
