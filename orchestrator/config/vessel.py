@@ -116,8 +116,8 @@ class LiquidFile(Section):
     simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is the parameter `viscosity`."""
 
     contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = NEUTRAL
-    """Contact angle on the vessels' walls. Felt where particles are finer than the capillary length (1.9 mm for oil,
-    2.7 mm for water), and hardly at the spacing of a usual simulation."""
+    """Contact angle on the vessels' walls. Held against theory where particles are finer than the capillary length
+    (1.9 mm for oil, 2.7 mm for water); at the spacing of a usual simulation it is felt, and not validated."""
 
 
 def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselSpec | None:
