@@ -154,7 +154,7 @@ def _wetting(course: FlowCourse, liquid: Liquid) -> NotCovered:
         share,
         f"{_percent(share)} of what is poured leaves in a film thinner than the capillary length "
         f"({1e3 * capillary_length(liquid):.1f} mm; Bond number below {WETTING_BOND:g}). How the liquid wets the lip "
-        "decides when such a film starts and stops to flow; contact angles are right for particles finer than that only",
+        "decides when such a film starts and stops to flow; contact angles are right for finer particles only",
     )
 
 
