@@ -119,11 +119,14 @@ def equivalent_distance(
     u = np.clip(1.0 - r, 0.0, None)
     kernel = u**4 * (1.0 + 4.0 * r)
     kernel /= kernel.sum()
-    padded = np.pad(solid, reach, mode="edge")
+    near = _grown(inside > 0)
+    # Only beside the cavity is anything else than the signed distance wanted.
+    box = tuple(slice(int(where.min()), int(where.max()) + 1) for where in np.nonzero(near))
+    padded = np.pad(solid, reach, mode="edge")[tuple(slice(b.start, b.stop + 2 * reach) for b in box)]
     share = np.clip(_convolved(padded, kernel), 0.0, 1.0)
     q = np.linspace(-1.0, 1.0, 801)
     plane = support * np.interp(-share, -half_space(q), q)
-    plane = np.where(share > 1e-4, plane, np.maximum(grid.values, support))
-    mixed = weight * plane + (1.0 - weight) * grid.values
-    found = np.where(_grown(inside > 0), mixed, grid.values)
+    plane = np.where(share > 1e-4, plane, np.maximum(grid.values[box], support))
+    found = grid.values.astype(np.float64)
+    found[box] = np.where(near[box], weight[box[2]] * plane + (1.0 - weight[box[2]]) * found[box], found[box])
     return np.ascontiguousarray(found, dtype=np.float32)
