@@ -42,7 +42,7 @@ class Device(Protocol):
             urgent: don't queue behind other calls.
 
         Raises:
-            DeviceLostError: its process died, or the deadline passed; MachineLostError: with its machine.
+            DeviceLostError: its process died, or the deadline passed; MachineLostError: with its machine, or with Ray.
             LaboratoryError: whatever of this kind the method raises.
         """
         ...
@@ -105,6 +105,8 @@ class RayDevice:
         self._args, self._node = args, node
         self._actor: Any = None
         self._lost = False
+        self._abandoned = ""
+        self._calls: set[asyncio.Future[Any]] = set()
         self._start()
 
     def _start(self) -> None:
@@ -117,14 +119,18 @@ class RayDevice:
         """See `Device.call`."""
         import ray
 
+        self._check_ray()
         if self._lost:
             raise DeviceLostError(f"{self.name}: its process has died")
         group = "control" if urgent else "work"
         ref = getattr(self._actor, method).options(concurrency_group=group).remote(*args)
         future = asyncio.wrap_future(ref.future())
         future.add_done_callback(_seen)
+        self._calls.add(future)
+        future.add_done_callback(self._calls.discard)
         done, _ = await asyncio.wait({future}, timeout=deadline)
-        if not done:
+        if not done or future.cancelled():
+            self._check_ray()
             # It may hang for good; a new one is made before the next pour.
             self._lost = True
             with contextlib.suppress(Exception):
@@ -142,7 +148,22 @@ class RayDevice:
                 raise error.cause from None
             raise LaboratoryError(f"{self.name}: '{method}' failed: {error.cause!r}") from error
 
+    def abandon(self, reason: str) -> None:
+        """Whoever waits for an answer, or will ask, is told that none comes: Ray itself is gone.
+
+        Args:
+            reason: what has died, in words for people.
+        """
+        self._abandoned = self._abandoned or reason
+        for call in self._calls:
+            call.cancel()
+
+    def _check_ray(self) -> None:
+        if self._abandoned:
+            raise MachineLostError(f"{self.name}: {self._abandoned}")
+
     async def _check_machine(self, method: str) -> None:
+        self._check_ray()
         if self._node is not None and await self._node.is_gone():
             raise MachineLostError(f"{self.name}: its machine {self._node.node.host} was lost during '{method}'")
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from actors.bench.opening import MakeDevice, OpenBench, needs_person, open_bench
-from actors.device import Device, LocalDevice
+from actors.device import Device, LocalDevice, RayDevice
 from actors.operator import Operator
 from actors.optimizer.actor import DeviceOptimizer, Proposer
 from actors.protocols import (
@@ -20,6 +20,7 @@ from actors.protocols import (
     Optimizer,
     SimulatorPool,
 )
+from actors.ray_watch import watch_ray
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
@@ -243,6 +244,7 @@ class RayLaboratory(_OpenLaboratory):
 
     _cluster: JoinedCluster | None = None
     _liquid: RaySimulatorPool | None = None
+    _watching: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> RayLaboratory:
         from actors.ray_runtime import keep_signals, start_ray
@@ -263,6 +265,8 @@ class RayLaboratory(_OpenLaboratory):
 
                 self._cluster = JoinedCluster(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
                 await self._cluster.open(need_bench=self._needs_bench)
+            else:
+                self._watching = asyncio.create_task(watch_ray(self._ray_died))
             await self._open_all()
         except BaseException:
             await self.__aexit__()
@@ -270,8 +274,6 @@ class RayLaboratory(_OpenLaboratory):
         return self
 
     async def _open_all(self) -> None:
-        from actors.device import RayDevice
-
         here = None if self._cluster is None else self._cluster.here
         self._pool = self._kept or self._open_pool()
         self._optimizer = self._kept_optimizer or self._own_optimizer(RayDevice("optimiser", Proposer, node=here))
@@ -320,9 +322,18 @@ class RayLaboratory(_OpenLaboratory):
         self._lose_bench(reason)
         if isinstance(self._pool, RaySimulatorPool):
             self._pool.abandon(LaboratoryError(reason))
+        for device in self._devices:
+            if isinstance(device, RayDevice):
+                device.abandon(reason)
+
+    def _ray_died(self, reason: str) -> None:
+        self._tell(Notice("error", reason))
+        self._lose_all(reason)
 
     async def __aexit__(self, *exc: object) -> None:
         try:
+            if self._watching is not None:
+                self._watching.cancel()
             await self._close_all()
             if self._cluster is not None:
                 await self._cluster.close()

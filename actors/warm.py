@@ -9,6 +9,7 @@ from actors.device import Device, LocalDevice, RayDevice
 from actors.laboratory import ClosablePool
 from actors.optimizer.actor import DeviceOptimizer, Proposer
 from actors.protocols import LaboratoryError, Optimizer
+from actors.ray_watch import watch_ray
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
@@ -39,6 +40,7 @@ class WarmSimulators:
         self._pool: ClosablePool | None = None
         self._fair: FairPool | None = None
         self._proposer: Device | None = None
+        self._watching: asyncio.Task[None] | None = None
         self._opening = asyncio.Lock()
 
     @property
@@ -64,11 +66,17 @@ class WarmSimulators:
                 self._pool = InProcessSimulatorPool(make=self._make)
                 self._proposer = LocalDevice("optimiser", Proposer)
             else:
-                self._pool = await self._open_ray()
-                self._proposer = RayDevice("optimiser", Proposer)
+                self._pool = pool = await self._open_ray()
+                self._proposer = proposer = RayDevice("optimiser", Proposer)
+
+                def died(reason: str) -> None:
+                    pool.abandon(LaboratoryError(reason))
+                    proposer.abandon(reason)
+
+                self._watching = asyncio.create_task(watch_ray(died))
             self._fair = FairPool(self._pool)
 
-    async def _open_ray(self) -> ClosablePool:
+    async def _open_ray(self) -> RaySimulatorPool:
         from actors.ray_private import simulator_count
         from actors.ray_runtime import keep_signals, start_ray, stop_ray
 
@@ -125,6 +133,8 @@ class WarmSimulators:
             pool, self._pool, self._fair = self._pool, None, None
             if pool is None:
                 return
+            if self._watching is not None:
+                self._watching.cancel()
             proposer, self._proposer = self._proposer, None
             if proposer is not None:
                 await proposer.close()

@@ -286,7 +286,8 @@ class RaySimulatorPool:
                 self._waiting.append(sent.job)
         while self._waiting:
             self._waiting.popleft().fail(SimulationError("the pool of simulators is closed"))
-        await self._crew.close(CLOSE_DEADLINE + (DRAIN_DEADLINE if busy else 0.0))
+        patience = CLOSE_DEADLINE + (DRAIN_DEADLINE if busy else 0.0)
+        await self._crew.close(0.0 if self._abandoned is not None else patience)
 
 
 def _recall(member: Member, sent: Sent) -> None:

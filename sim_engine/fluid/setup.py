@@ -75,3 +75,16 @@ class SceneSetup:
     viscosity: float = 0.0
     no_slip: bool = True
     tension: float | None = None
+
+
+def pose_at(poses: NDArray[np.float64], time: float) -> NDArray[np.float64]:
+    """The pose at a time, from the table of poses: place [m] and quaternion (w, x, y, z), not normalised, (7,).
+
+    Args:
+        poses: see `SceneSetup`.
+        time: [s].
+    """
+    row = max(time, 0.0) / POSE_STEP
+    k = min(int(row), len(poses) - 2)
+    pose: NDArray[np.float64] = poses[k] + min(row - k, 1.0) * (poses[k + 1] - poses[k])
+    return pose

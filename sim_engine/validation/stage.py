@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquid import SimulationParameters
-from sim_engine.pour import inside_mask
-from sim_engine.vessel.corners import equivalent_distance
+from sim_engine.vessel.corners import equivalent_distance, inside_mask
 from sim_engine.vessel.sdf import SignedDistanceGrid
 from sim_engine.vessel.vessel import Vessel
 
@@ -55,7 +54,7 @@ class Container:
     @classmethod
     def of(cls, vessel: Vessel) -> Container:
         """A vessel's."""
-        return cls(vessel.grid, inside_mask(vessel), vessel.wall_thickness, vessel.rim_height)
+        return cls(vessel.grid, inside_mask(vessel.grid), vessel.wall_thickness, vessel.rim_height)
 
     def plane(self, support: float) -> NDArray[np.float32]:
         """Distance of the equivalent plane at the grid's nodes for a kernel's support [m]."""

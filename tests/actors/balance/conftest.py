@@ -41,11 +41,11 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSpec:
     return replace(spec, **changes)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def voices() -> Iterator[Callable[[str], VirtualSerialBalance]]:
     """One virtual balance of each voice, started when first asked for.
 
-    They end with these tests: at this pace each keeps an eighth of a core busy.
+    They end with the file that needs them: at this pace each keeps an eighth of a core busy.
     """
     started: dict[str, VirtualSerialBalance] = {}
 

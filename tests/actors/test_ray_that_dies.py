@@ -1,0 +1,94 @@
+"""Ray's own processes are killed under an open laboratory: whoever waits is told why, after seconds and not minutes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+pytestmark = pytest.mark.ray
+
+ROOT = Path(__file__).parents[2]
+
+PROGRAM = """
+import asyncio, json, sys
+from actors.laboratory import open_laboratory
+from actors.optimizer.core.problem import Data, SuggestProblem
+from actors.spec import LaboratorySpec
+from actors.warm import WarmSimulators
+from sim_engine.liquid import SimulationParameters
+from sim_engine.space import Axis, Space
+from sim_engine.task import PourTask
+from tests.actors.conftest import make_scene
+from sim_engine.action import Action
+from tests.reliability.formula import Formula
+
+TASK = PourTask(make_scene(), Action(1.0, 0.09, 0.05, 1.7, 0.5), SimulationParameters(), 1)
+
+async def tell(asked):
+    try:
+        await asked
+        answer = ""
+    except Exception as error:
+        answer = f"{type(error).__name__}: {error}"
+    print(json.dumps(answer), flush=True)
+
+async def questions(simulators, optimizer):
+    problem = SuggestProblem(space=Space((Axis("a", 0.0, 1.0),)), data=Data(((0.2,), (0.8,)), (1.0, 2.0)))
+    await simulators.simulate(TASK)
+    await optimizer.suggest(problem)
+    print(json.dumps("ready"), flush=True)
+    await asyncio.to_thread(sys.stdin.readline)
+    await tell(simulators.simulate(TASK))
+    await tell(optimizer.suggest(problem))
+    print(json.dumps("closing"), flush=True)
+
+async def of_its_own():
+    heard = []
+    async with open_laboratory(LaboratorySpec("desk", simulators=1), need_bench=False, make=Formula) as laboratory:
+        laboratory.listen(heard.append)
+        await questions(laboratory.simulators, laboratory.optimizer)
+    print(json.dumps(" ".join(notice.text for notice in heard)))
+
+async def kept():
+    warm = WarmSimulators(1, make=Formula)
+    await warm.open()
+    await questions(warm.share(), warm.optimizer())
+    await warm.close()
+    print(json.dumps(warm.lost))
+
+asyncio.run({"own": of_its_own, "kept": kept}[sys.argv[1]]())
+"""
+
+
+@pytest.mark.parametrize("whose", ["own", pytest.param("kept", marks=pytest.mark.slow)])
+def test_whoever_asks_simulators_or_optimiser_is_told_that_ray_has_died(whose: str, tmp_path: Path) -> None:
+    program = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, whose],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env={**os.environ, "HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert program.stdin is not None
+    assert program.stdout is not None
+    with program:
+        try:
+            assert json.loads(program.stdout.readline()) == "ready"
+            names = ("raylet", "ray::SimulatorProcess", "ray::Proposer")
+            struck = [p for p in psutil.Process(program.pid).children(recursive=True) if p.name() in names]
+            assert len(struck) == 3
+            for process in struck:
+                process.kill()
+            program.stdin.write("\n")
+            program.stdin.flush()
+            simulator, optimiser, closing, said = [json.loads(line) for line in program.stdout if line[0] == '"']
+        finally:
+            program.kill()
+    assert "Ray on this machine has died (its raylet)" in simulator
+    assert "MachineLostError" in optimiser
+    assert "Ray on this machine has died" in optimiser
+    assert closing == "closing"
+    assert "raylet" in said or whose == "kept"
