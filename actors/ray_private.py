@@ -1,8 +1,8 @@
 """A Ray of our own: on this machine only, and with nothing left behind.
 
-It runs with stated memory, without dashboard or usage statistics, on the loopback interface, with a token of its own,
-in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed at the next
-start. `actors.ray_warden` cleans up behind a program that was killed. `actors.ray_runtime` decides when.
+It runs with stated memory, without dashboard, autoscaler or usage statistics, on the loopback interface, with a token
+of its own, in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed
+at the next start. `actors.ray_warden` cleans up behind a program that was killed. `actors.ray_runtime` decides when.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ _LONGEST_FOLDER = 40
 
 _WORKER_LOG = re.compile(r"(?:worker-|python-core-worker-).*[-_](\d+)\.(?:out|err|log)")
 """Name of a worker's log; the number is its process id."""
+
+_NEEDLESS = ("start_api_server", "start_monitor", "start_log_monitor")
+"""What Ray's node starts and nobody here uses: a dashboard's server, an autoscaler, a reader of logs."""
 
 _TOKEN = secrets.token_hex(32)
 """Without it nobody else on this machine may talk to our Ray. One per process, since Ray reads it only once."""
@@ -161,17 +164,18 @@ def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
     try:
         for attempt in range(3):
             try:
-                ray.init(
-                    address="local",
-                    num_cpus=simulator_count(spec),
-                    num_gpus=0,
-                    object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
-                    include_dashboard=False,
-                    logging_level=logging.ERROR,
-                    log_to_driver=False,
-                    _temp_dir=str(private.folder),
-                    _node_ip_address="127.0.0.1",
-                )
+                with _bare_ray():
+                    ray.init(
+                        address="local",
+                        num_cpus=simulator_count(spec),
+                        num_gpus=0,
+                        object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
+                        include_dashboard=False,
+                        logging_level=logging.ERROR,
+                        log_to_driver=False,
+                        _temp_dir=str(private.folder),
+                        _node_ip_address="127.0.0.1",
+                    )
                 break
             except Exception:
                 # Two programs that start at once may be given the same free port.
@@ -182,17 +186,31 @@ def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
     finally:
         # Programs that this one starts later are not Ray's and must not be ended with it.
         del os.environ[MARK]
-    _end_log_monitor()
     address = ray.util.get_node_ip_address()
     if address != "127.0.0.1":
         raise LaboratoryError(f"Ray listens on {address} instead of this machine only; was it imported too early?")
 
 
-def _end_log_monitor() -> None:
-    """End the process that reads all workers' logs: nobody gets them, and it holds up to 200 of them open."""
-    from ray._private import worker
+@contextlib.contextmanager
+def _bare_ray() -> Iterator[None]:
+    """A Ray that is started within this has neither a server for a dashboard, nor an autoscaler, nor a log monitor.
 
-    worker._global_node.kill_log_monitor(check_alive=False)
+    Nobody uses them. The first two take 90 MB and seconds of Ray's start each, the third holds up to 200 logs open. Ray
+    has no setting for that: `include_dashboard=False` has the server serve less.
+    """
+    from ray._private.node import Node
+
+    def left_out(node: Node, **settings: object) -> None:
+        """Start nothing."""
+
+    before = {name: getattr(Node, name) for name in _NEEDLESS if hasattr(Node, name)}
+    for name in before:
+        setattr(Node, name, left_out)
+    try:
+        yield
+    finally:
+        for name, method in before.items():
+            setattr(Node, name, method)
 
 
 def forget_logs(private: PrivateRay) -> int:

@@ -45,6 +45,7 @@ PASSES = {
     "sim_engine.fluid.step.relax": "viscosity",
     "sim_engine.fluid.step.pull": "cohesion",
     "sim_engine.fluid.step.Stepper.classify": "classify",
+    "sim_engine.fluid.step.Stepper.conclude": "the end of a step",
 }
 """Functions of the solver by the name under which a step finds them, and what people read."""
 

@@ -153,7 +153,7 @@ def iterations_of(outcome: PourOutcome) -> int:
         return int(told)
     from sim_engine.fluid.engine import engine
 
-    return int(engine().state.iterations[0])
+    return engine().iterations()
 
 
 def in_frame(points: Floats, time_: float) -> Floats:

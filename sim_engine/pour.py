@@ -24,7 +24,7 @@ from sim_engine.outcome import ParticleState
 from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.task import PoseError, PourTask, Scene
 from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.corners import equivalent_distance
+from sim_engine.vessel.corners import equivalent_distance, inside_mask
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.spec import VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
@@ -59,18 +59,6 @@ def check_motion(
         contact, tilt = found
         text = describe_contact(contact, tilt=tilt)
         raise InvalidSceneError(f"{text} ({action.display('x_offset', 'y_offset', 'height')})")
-
-
-def inside_mask(vessel: Vessel) -> NDArray[np.uint8]:
-    """Where a particle counts as inside the vessel, on the grid's nodes.
-
-    The cavity, continued into the wall up to its middle: a particle that leans on the wall stays inside.
-    """
-    from scipy import ndimage  # brings a third of a second of imports, for those who only check a motion
-
-    solid = vessel.grid.values <= 0.0
-    nearest = ndimage.distance_transform_edt(solid, return_distances=False, return_indices=True)
-    return np.ascontiguousarray(vessel.grid.cavity[tuple(nearest)].astype(np.uint8))
 
 
 class PourSimulator:
@@ -240,6 +228,7 @@ class PourSimulator:
             drift=(float(drift[0]), float(drift[1]), float(drift[2])),
             viscosity=liquid.kinematic_viscosity * parameters.viscosity_factor if liquid.is_thick else 0.0,
             tension=liquid.surface_tension if liquid.is_thick else None,
+            contact_angle=liquid.contact_angle,
         )
 
     def _walls(self, spec: VesselSpec, support: float) -> SolidWalls:
@@ -250,7 +239,7 @@ class PourSimulator:
             if len(self._planes) >= PLANES_KEPT:
                 self._planes.pop(next(iter(self._planes)))
             if spec not in self._masks:
-                self._masks[spec] = inside_mask(vessel)
+                self._masks[spec] = inside_mask(vessel.grid)
             self._planes[key] = equivalent_distance(vessel.grid, self._masks[spec], vessel.rim_height, support)
         return SolidWalls(vessel.grid, self._planes[key], self._masks[spec], vessel.wall_thickness, vessel.rim_height)
 

@@ -13,7 +13,7 @@ from sim_engine.task import PourTask
 
 LONG_FIRST_JOB = 5.0
 """CPU seconds of a process' first job above which its kernels may have been compiled for it. Loaded from the cache they
-cost one second; compiled, a dozen."""
+cost a second or two; compiled, six to eight."""
 
 
 class JobCancelledError(Exception):

@@ -128,7 +128,7 @@ def _simulated(simulator: PourSimulator, tasks: list[PourTask]) -> list[Simulate
     runs: list[SimulatedPour] = []
 
     def doing() -> str:
-        note = "" if runs else "; the first pour ever also compiles kernels, about 10 s"
+        note = "" if runs else "; the first pour ever also compiles kernels, about 8 s"
         return f"simulating seed {len(runs) + 1} of {len(tasks)}, {time.monotonic() - begin:.0f} s so far{note}"
 
     with stdout_for_results(), waiting_for(doing):

@@ -18,7 +18,7 @@ from typing import Any
 from orchestrator.daemon.encode import PASSING, event_json, text
 from orchestrator.events import Event
 
-RING = 4_000
+RING = 1_000
 """Events kept in memory."""
 
 FLUSH = 0.25

@@ -106,7 +106,7 @@ class Lane:
         task.add_done_callback(self._background.discard)
 
     def _next(self) -> Item | None:
-        if self.latched or self._daemon.stopping:
+        if self.latched or self._daemon.stopping or self._common.warm.lost:
             return None
         store = self._common.store
         mine = [one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.wish == Wish.RUN]
@@ -158,6 +158,9 @@ class Lane:
         except Exception as error:
             state, reason = "failed", f"{type(error).__name__}: {error}"
             _log.exception("campaign %s failed", item.id)
+        if state in ("failed", "paused") and (lost := self._common.warm.lost):
+            # No fault of the campaign's, and nobody's wish: it goes on when there is a Ray again.
+            state, reason, wish = "paused", f"Ray had lost its {lost}", self._kept_wish(item)
         await self._leave(running, state, reason, wish)
         if result is None and state != "finished":
             _log.warning("campaign %s: %s: %s", item.id, state, reason, extra={"campaign": item.id})

@@ -17,12 +17,13 @@ from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.daemon.guard import Daemon, Viewer
 from orchestrator.daemon.measures import measures
 from orchestrator.daemon.people import question_json
-from orchestrator.daemon.reading import REPORT, pours_of, summary_of
+from orchestrator.daemon.reading import REPORT, summary_of
 from orchestrator.daemon.running import job_of
 from orchestrator.daemon.shapes import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
 from orchestrator.daemon.store import Item
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.errors import RunError
+from orchestrator.plan import CampaignPlan
 
 READERS = 400
 """Readers of events at a time."""
@@ -96,8 +97,10 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
         directory = daemon.settings.runs / item.run
 
         def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
-            plan = job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan
-            return pours_of(plan, directory), summary_of(directory)
+            def plan() -> CampaignPlan:
+                return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan
+
+            return daemon.pours.of(directory, plan), summary_of(directory)
 
         try:
             pours, summary = await asyncio.to_thread(read)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from orchestrator.codec import CodecError, decode_outcome, decode_request
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal import JOURNAL_NAME, Entry, JournalReader, Kind
 from orchestrator.journal_file import JournalError
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
@@ -16,33 +19,71 @@ from orchestrator.report.run_page import REPORT_NAME as REPORT
 from orchestrator.report.units import is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured
 
-__all__ = ["REPORT", "pours_of", "summary_of"]
+__all__ = ["REPORT", "Pours", "summary_of"]
 
 
-def pours_of(plan: CampaignPlan, directory: Path) -> list[dict[str, Any]]:
-    """The pours of a run that were asked for, in order: what was predicted, and what was weighed."""
-    pours: dict[int, dict[str, Any]] = {}
-    requests: dict[int, Pour] = {}
-    try:
+class Pours:
+    """Pours of runs. Each journal is read on from where it was left: people look again at every event.
+
+    Args:
+        keep: runs that are remembered, the latest that were looked at. May be asked from several threads.
+    """
+
+    def __init__(self, keep: int = 16) -> None:
+        self._keep = keep
+        self._read: OrderedDict[Path, _Read] = OrderedDict()
+        self._guard = Lock()
+
+    def of(self, directory: Path, plan: Callable[[], CampaignPlan]) -> list[dict[str, Any]]:
+        """The pours of a run that were asked for, in order: what was predicted, and what was weighed.
+
+        Args:
+            directory: of the run.
+            plan: makes its campaign's plan, once. What it raises is passed on.
+        """
+        with self._guard:
+            read = self._read.pop(directory, None) or _Read(plan())
+            try:
+                read.on(directory)
+            except (JournalError, CodecError, OSError):
+                return read.rows()  # a run that is just being made, or another version's: begun anew next time
+            self._read[directory] = read
+            if len(self._read) > self._keep:
+                self._read.popitem(last=False)
+            return read.rows()
+
+
+class _Read:
+    """What was read of one run."""
+
+    def __init__(self, plan: CampaignPlan) -> None:
+        self._plan, self._last = plan, 0
+        self._pours: dict[int, dict[str, Any]] = {}
+        self._requests: dict[int, Pour] = {}
+
+    def rows(self) -> list[dict[str, Any]]:
+        return [dict(pour) for pour in self._pours.values()]
+
+    def on(self, directory: Path) -> None:
+        kinds = [Kind.REQUESTED, Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED]
         with JournalReader(directory / JOURNAL_NAME) as journal:
-            kinds = [Kind.REQUESTED, Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED]
-            for entry in journal.entries(kinds=kinds):
-                key = entry.body["id"]
-                if entry.kind == Kind.REQUESTED:
-                    if entry.body["request"]["type"] == Pour.__name__:
-                        request = decode_request(entry.body["request"])
-                        assert isinstance(request, Pour)
-                        requests[key], pours[key] = request, _asked(plan, entry.stage, request)
-                    continue
-                if entry.kind == Kind.POUR_FINISHED:
-                    outcome = decode_outcome(entry.body["outcome"])
-                    pours[key] |= {"time": entry.t, **_outcome(plan, requests[key], outcome)}
-                else:
-                    begun = entry.kind == Kind.POUR_STARTED
-                    pours[key] |= {"state": "under way" if begun else "asked", "time": entry.t}
-    except (JournalError, CodecError, OSError):
-        return list(pours.values())  # a run that is just being made, or another version's
-    return list(pours.values())
+            for entry in journal.entries(after=self._last, kinds=kinds):
+                self._take(entry)
+                self._last = entry.seq
+
+    def _take(self, entry: Entry) -> None:
+        key = entry.body["id"]
+        if entry.kind == Kind.REQUESTED:
+            if entry.body["request"]["type"] == Pour.__name__:
+                request = decode_request(entry.body["request"])
+                assert isinstance(request, Pour)
+                self._requests[key], self._pours[key] = request, _asked(self._plan, entry.stage, request)
+        elif entry.kind == Kind.POUR_FINISHED:
+            outcome = decode_outcome(entry.body["outcome"])
+            self._pours[key] |= {"time": entry.t, **_outcome(self._plan, self._requests[key], outcome)}
+        else:
+            begun = entry.kind == Kind.POUR_STARTED
+            self._pours[key] |= {"state": "under way" if begun else "asked", "time": entry.t}
 
 
 def _asked(plan: CampaignPlan, stage: str, pour: Pour) -> dict[str, Any]:

@@ -249,6 +249,11 @@ class Running:
             await asyncio.to_thread(work)
 
     @property
+    def pouring(self) -> bool:
+        """Whether a pour of it is under way."""
+        return self.watching is not None and self.watching.checkpoint != ""
+
+    @property
     def pours_nothing(self) -> bool:
         """Whether it is at the desk."""
         return self._rig.name == DESK

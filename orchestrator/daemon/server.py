@@ -18,6 +18,7 @@ from pythonjsonlogger.json import JsonFormatter
 from orchestrator.daemon.api import serve_app
 from orchestrator.daemon.auth import Tokens
 from orchestrator.daemon.notify import OCCASIONS, Notifier, NotifyError, pass_on
+from orchestrator.daemon.renewal import RayWatch, Renewal
 from orchestrator.daemon.settings import Settings
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.errors import RunError
@@ -54,21 +55,25 @@ def serve(settings: Settings, ready: Callable[[str], None] = lambda url: None) -
     """
     os.umask(0o077)
     use_state_directory(settings.state)
-    asyncio.run(_serve(settings, ready))
+    asyncio.run(_serve(settings, ready, Renewal()))
 
 
-async def _serve(settings: Settings, ready: Callable[[str], None]) -> None:
+async def _serve(settings: Settings, ready: Callable[[str], None], renewal: Renewal) -> None:
     settings.state.mkdir(parents=True, exist_ok=True, mode=0o700)
     tokens = Tokens(settings.tokens)
     with contextlib.ExitStack() as opened:
-        listening = opened.enter_context(_listen(settings))
+        listening = opened.enter_context(renewal.listening or _listen(settings))
+        renewal.keep(listening)
         notifier = _notifier(settings)
         if notifier is not None:
             opened.callback(notifier.close)
         live = None if settings.live is None else LiveView(address=settings.live[0], web_port=settings.live[1])
         if live is not None:
             opened.enter_context(live)
-        await _serve_with(settings, tokens, listening, ready, live, notifier)
+        again = await _serve_with(settings, tokens, listening, ready, live, notifier, renewal)
+    if again:  # from inside of the loop: its end would wait for threads that hang in calls to a dead Ray
+        _log.warning("begins anew")
+        renewal.begin_anew()
     _log.info("ended")
 
 
@@ -94,7 +99,9 @@ async def _serve_with(
     ready: Callable[[str], None],
     live: LiveView | None,
     notifier: Notifier | None,
-) -> None:
+    renewal: Renewal,
+) -> bool:
+    """Serve until told to end, or until Ray has died: then everything has come to rest, and True is returned."""
     daemon = Supervisor(settings, live)
     ending = _Ending(daemon)
     app = serve_app(daemon, tokens, ending, None if live is None else lambda campaign: live.url)
@@ -119,21 +126,29 @@ async def _serve_with(
     daemon.words = {} if notifier is None else notifier.counts
     url = _url(settings, listening)
     settings.address.write_text(url + "\n", encoding="utf-8")
+    watch = RayWatch(daemon, renewal, ending.asked.is_set)
     try:
         await daemon.start()
         _log.info("serving %s", url, extra={"url": url, "state": str(settings.state)})
         ready(url)
-        await asyncio.wait({serving, asyncio.ensure_future(ending.asked.wait())}, return_when=asyncio.FIRST_COMPLETED)
-        _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
+        until = [asyncio.ensure_future(event.wait()) for event in (ending.asked, daemon.left)]
+        await asyncio.wait({serving, *until}, return_when=asyncio.FIRST_COMPLETED)
+        if not daemon.left.is_set():
+            _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
         await daemon.close()
         if telling is not None:
             await telling
     finally:
-        settings.address.unlink(missing_ok=True)
+        again = daemon.left.is_set() and not ending.asked.is_set()
+        if not again:
+            watch.close()
+            renewal.drop()
+            settings.address.unlink(missing_ok=True)
         server.should_exit = True
         await serving
         for number in ENDING:
             loop.remove_signal_handler(number)
+    return again
 
 
 class _Ending:

@@ -21,14 +21,15 @@ from orchestrator.daemon.feed import Feed
 from orchestrator.daemon.lane import Lane
 from orchestrator.daemon.notify import Counts
 from orchestrator.daemon.people import Asking
+from orchestrator.daemon.reading import Pours
 from orchestrator.daemon.running import Common, Running
 from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
 from orchestrator.errors import RunError
 from orchestrator.monitor.live import LiveView
 
-LOOKING = 3.0
-"""Between two looks whether Ray lives [s]."""
+LEAVING = 10.0
+"""Time that campaigns have to come to rest where Ray has died [s]; then those that don't pour are given up."""
 
 PAUSED, EMERGENCY = "paused", "emergency"
 
@@ -59,10 +60,11 @@ class Supervisor:
         self.lanes: dict[str, Lane] = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
         self.problems: dict[str, str] = {}
         self.words: dict[str, Counts] = {}
+        self.pours = Pours()
         self.stopping = False
         self.suspect = False
         """Whether the simulators may be past mending: they are started anew when nobody uses them."""
-        self.ended = asyncio.Event()
+        self.left = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
         self.began = time.time()
 
@@ -76,7 +78,6 @@ class Supervisor:
                 self.feed.tell("CampaignFound", {"state": item.state, "text": found}, item.id)
         self._tasks = [asyncio.create_task(self.feed.flushing(), name="feed")]
         self._tasks += [asyncio.create_task(lane.work(), name=f"rig {lane.rig.name}") for lane in self.lanes.values()]
-        self._tasks.append(asyncio.create_task(self._watch_simulators(), name="watch over simulators"))
         if self.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         self.feed.tell("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})
@@ -95,16 +96,36 @@ class Supervisor:
         else:
             self.feed.tell("SimulatorsReady", {"simulators": self.warm.size})
 
-    async def _watch_simulators(self) -> None:
-        """Where Ray dies under what runs, nothing that was asked of it comes to an end: people are told."""
-        while True:
-            await asyncio.sleep(LOOKING)
-            lost = self.warm.lost
-            text = (
-                f"Ray has lost its {lost}: no simulation comes to an end any more. End the daemon and start it again; "
-                "what ran goes on from its journal"
+    # ---- beginning anew, where Ray has died: what runs on it comes to no end by itself
+
+    @property
+    def lost(self) -> str:
+        """Which of Ray's own processes has died; '' while all is well."""
+        return self.warm.lost
+
+    @property
+    def pouring(self) -> bool:
+        """Whether a pour is under way somewhere."""
+        return any(lane.running is not None and lane.running.pouring for lane in self.lanes.values())
+
+    def leave(self, lost: str) -> None:
+        """Come to rest as far as that is possible, to begin anew; `left` is set then."""
+        if not self.stopping:
+            self.stopping = True
+            self.problem(
+                "ray", f"Ray has lost its {lost}: the daemon begins anew, and what ran goes on from its journal"
             )
-            self.problem("ray", text if lost else None)
+            self._tasks.append(asyncio.create_task(self._leave(), name="leaving"))
+
+    async def _leave(self) -> None:
+        resting = [asyncio.ensure_future(lane.close()) for lane in self.lanes.values()]
+        await asyncio.wait(resting, timeout=LEAVING)
+        for lane in self.lanes.values():
+            if lane.running is not None and not lane.running.pouring:
+                lane.background(lane.running.give_up())
+        await asyncio.wait(resting)
+        self.feed.flush()
+        self.left.set()
 
     async def close(self) -> None:
         """Come to rest at the next safe point; cancelled or told again, at once."""
@@ -113,7 +134,8 @@ class Supervisor:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self.warm.close()
+        if not self.left.is_set():  # a Ray that has died may hang on for good
+            await self.warm.close()
         self.feed.tell("DaemonStopped", {})
         self.feed.close()
         self.store.close()
@@ -151,7 +173,8 @@ class Supervisor:
         if self.emergency is not None:
             raise RefusedError("the emergency stop is latched; nothing is taken before somebody has cleared it")
         if self.stopping:
-            raise RefusedError("the daemon is ending")
+            again = "ray" in self.problems
+            raise RefusedError("the daemon is just beginning anew; try again" if again else "the daemon is ending")
 
     def item(self, key: str) -> Item:
         """A campaign by its id, or by the beginning of one. Raises KeyError."""

@@ -8,13 +8,14 @@ from typing import Generic, TypeVar
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sim_engine.backend import BackendError, require_backend
 from sim_engine.cache import cache_directory
-from sim_engine.fluid.setup import POSE_STEP, SceneSetup
-from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState
-from sim_engine.fluid.step import LONGEST_STEP, Stepper
+from sim_engine.contact import rotations
+from sim_engine.fluid.setup import POSE_STEP, SceneSetup, pose_at
+from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState, of_parameters
+from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 from sim_engine.outcome import ParticleState
 
 POOLS = {"cpu": (50_000, 64), "cuda": (2_500_000, 1_024)}
@@ -45,6 +46,8 @@ class FluidEngine:
         self._cavities = np.zeros(1, np.uint8)
         self._poses = np.zeros((1, 7), np.float32)
         self._thick: list[bool] = []
+        self._begins = [0]
+        self._facts = np.zeros((0, len(FACTS)))
 
     def room_for(self, counts: Sequence[int]) -> int:
         """How many of these scenes, given by their numbers of particles, fit into one load: the first so many.
@@ -66,61 +69,87 @@ class FluidEngine:
         """
         if self.room_for([len(s.positions) for s in setups]) < len(setups):
             raise ValueError(f"{len(setups)} scenes do not fit into one load")
-        f = self.state
         values, planes = _Pool[np.float32](), _Pool[np.float32]()
         insides = _Pool[np.uint8]()
         begin, row = 0, 0
+        scenes: list[dict[str, ArrayLike]] = []
         for s, setup in enumerate(setups):
-            count, d = len(setup.positions), setup.spacing
-            f.begin[s], f.particles[s], f.spacing[s] = begin, count, d
-            f.list_begin[s] = begin * NEIGHBOURS + s * LIST_RESERVE
-            f.cells_begin[s] = begin * CELLS + s * (LEAST_CELLS + 2)
-            f.cells[s] = count * CELLS + LEAST_CELLS
-            f.set_parameters(s, setup)
-            f.gravity[s] = setup.gravity
-            f.longest_step[s] = LONGEST_STEP if setup.longest_step is None else setup.longest_step
-            for b, walls in enumerate((setup.pourer, setup.receiver)):
-                f.grid_offset[s, b] = values.add(walls.grid.values)
-                f.plane_offset[s, b] = planes.add(walls.plane)
+            count = len(setup.positions)
+            both = (setup.pourer, setup.receiver)
+            for walls in both:
                 insides.add(walls.inside, walls.grid.values)
-                f.grid_size[s, b] = list(walls.grid.values.shape)
-                f.grid_origin[s, b], f.grid_spacing[s, b] = list(walls.grid.origin), walls.grid.spacing
-                f.wall[s, b], f.rim[s, b] = walls.thickness, walls.rim
-            f.origin[s, 1], f.turn[s, 1] = list(setup.receiver_at), np.eye(3, dtype=np.float32)
-            f.spill_level[s] = setup.spill_level
-            f.poses_begin[s], f.table_step[s], f.table_length[s] = row, POSE_STEP, len(setup.poses)
-            f.time[s], f.start[s], f.compression[s] = setup.start - setup.settling, setup.start, 0.0
-            f.drift[s] = list(setup.drift)
-            f.steps[s], f.rebuilds[s], f.iterations[s], f.passes[s], f.fault[s] = 0, 0, 0, 0, 0
-            self._put(begin, np.ascontiguousarray(setup.positions, dtype=np.float32))
+            pose = pose_at(setup.poses, setup.start)
+            origins, turns = [pose[:3], setup.receiver_at], [*rotations(pose[None]), np.eye(3)]
+            scenes.append(
+                {
+                    **of_parameters(setup),
+                    "begin": begin,
+                    "particles": count,
+                    "spacing": setup.spacing,
+                    "list_begin": begin * NEIGHBOURS + s * LIST_RESERVE,
+                    "cells_begin": begin * CELLS + s * (LEAST_CELLS + 2),
+                    "cells": count * CELLS + LEAST_CELLS,
+                    "gravity": setup.gravity,
+                    "longest_step": LONGEST_STEP if setup.longest_step is None else setup.longest_step,
+                    "grid_offset": [values.add(walls.grid.values) for walls in both],
+                    "plane_offset": [planes.add(walls.plane) for walls in both],
+                    "grid_size": [walls.grid.values.shape for walls in both],
+                    "grid_origin": [walls.grid.origin for walls in both],
+                    "grid_spacing": [walls.grid.spacing for walls in both],
+                    "wall": [walls.thickness for walls in both],
+                    "rim": [walls.rim for walls in both],
+                    "origin": origins,
+                    "origin0": origins,
+                    "turn": turns,
+                    "turn0": turns,
+                    "spill_level": setup.spill_level,
+                    "poses_begin": row,
+                    "table_step": POSE_STEP,
+                    "table_length": len(setup.poses),
+                    "time": setup.start - setup.settling,
+                    "start": setup.start,
+                    "drift": setup.drift,
+                    "moving": count,
+                    "stale": 1,
+                    "dt": LONGEST_STEP,
+                }
+            )
             begin += count
             row += len(setup.poses)
         self._grids, self._planes, self._cavities = values.array(), planes.array(), insides.array()
         self._poses = np.concatenate([s.poses for s in setups]).astype(np.float32)
         self.scenes = len(setups)
+        self._begins = [0, *np.cumsum([len(setup.positions) for setup in setups]).tolist()]
         self._thick = [setup.viscosity > 0.0 for setup in setups]
-        self.stepper.begin(0, self.scenes, self._poses)
+        positions = np.concatenate([s.positions for s in setups]).astype(np.float32)
+        self._load(self.state.table.rows(scenes), positions)
+        self._facts = np.full((self.scenes, len(FACTS)), np.nan)
 
     @ti.kernel
-    def _put(self, begin: ti.i32, positions: ti.types.ndarray(dtype=ti.f32, ndim=2)):
+    def _load(
+        self,
+        rows: ti.types.ndarray(dtype=ti.f64, ndim=2),
+        positions: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    ):
         f = self.state
         ti.loop_config(serialize=True)
-        for k in range(positions.shape[0]):
-            i = begin + k
-            x = ti.Vector([positions[k, 0], positions[k, 1], positions[k, 2]])
-            f.x[i] = x
-            f.x0[i] = x
-            f.x_listed[i] = x
-            f.v[i] = ti.Vector([0.0, 0.0, 0.0])
-            f.pressure[i] = 0.0
-            f.density[i] = 1.0
-            f.phi[i] = ti.Vector([0.0, 0.0])
-            f.push[i] = ti.Vector([0.0, 0.0])
-            f.sag[i] = ti.Vector([0.0, 0.0])
-            f.home[i] = 0
-            f.name[i] = k
-            f.count[i] = 0
-            f.first[i] = 0
+        for s in range(rows.shape[0]):
+            f.table.write(s, rows)
+            for i in range(f.begin[s], f.begin[s] + f.particles[s]):
+                x = ti.Vector([positions[i, 0], positions[i, 1], positions[i, 2]])
+                f.x[i] = x
+                f.x0[i] = x
+                f.x_listed[i] = x
+                f.v[i] = ti.Vector([0.0, 0.0, 0.0])
+                f.pressure[i] = 0.0
+                f.density[i] = 1.0
+                f.phi[i] = ti.Vector([0.0, 0.0])
+                f.push[i] = ti.Vector([0.0, 0.0])
+                f.sag[i] = ti.Vector([0.0, 0.0])
+                f.home[i] = 0
+                f.name[i] = i - f.begin[s]
+                f.count[i] = 0
+                f.first[i] = 0
 
     @ti.kernel
     def _get(
@@ -158,7 +187,14 @@ class FluidEngine:
             last = first + 1
             while last < end and self._thick[last] == thick:
                 last += 1
-            self.stepper.advance(first, last, until, self._grids, self._planes, self._cavities, self._poses, thick)
+            due = np.ones(last, np.int32)
+            while due[first:].any():
+                self.stepper.advance(
+                    first, last, until, self._grids, self._planes, self._cavities, self._poses, due, thick
+                )
+                if due[first:].any():
+                    self.stepper.cohere(first, last, due)
+            self._facts[first:last] = np.nan
             first = last
 
     def census(self, scene: int = 0) -> NDArray[np.int32]:
@@ -172,13 +208,14 @@ class FluidEngine:
 
     def _counts(self, first: int, end: int) -> NDArray[np.int32]:
         counts = np.zeros((end, len(ParticleState)), np.int32)
-        self.stepper.census(first, end, counts)
+        self.stepper.look(first, end, counts, self._facts)
         return counts
 
     def _copies(self, scene: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-        n = int(self.state.particles[scene])
+        begin, end = self._begins[scene : scene + 2]
+        n = end - begin
         found = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
-        self._get(int(self.state.begin[scene]), n, *found)
+        self._get(begin, n, *found)
         return found
 
     def particles(self, scene: int = 0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -190,25 +227,30 @@ class FluidEngine:
         """Velocities (N, 3) [m/s], in the order in which they were loaded."""
         return self._copies(scene)[1]
 
+    def _fact(self, name: str, scene: int) -> float:
+        if np.isnan(self._facts[scene, 0]):
+            self._counts(scene, scene + 1)
+        return float(self._facts[scene, FACTS.index(name)])
+
     def time(self, scene: int = 0) -> float:
         """[s]."""
-        return float(self.state.time[scene])
+        return self._fact("time", scene)
 
     def steps(self, scene: int = 0) -> int:
         """Time steps so far."""
-        return int(self.state.steps[scene])
+        return int(self._fact("steps", scene))
 
     def iterations(self, scene: int = 0) -> int:
         """Passes over the density constraint so far."""
-        return int(self.state.iterations[scene])
+        return int(self._fact("iterations", scene))
 
     def fault(self, scene: int = 0) -> str | None:
         """Why the solver stopped, if it did."""
-        return FAULTS[int(self.state.fault[scene])]
+        return FAULTS[int(self._fact("fault", scene))]
 
     def mean_compression(self, scene: int = 0) -> float:
         """Mean over the steps of the interior particles' max(ρ/ρ₀ − 1, 0)."""
-        return float(self.state.compression[scene]) / max(self.steps(scene), 1)
+        return self._fact("compression", scene) / max(self.steps(scene), 1)
 
 
 T = TypeVar("T", np.float32, np.uint8)
@@ -272,6 +314,8 @@ def start(backend: str) -> None:
             enable_fallback=False,
             # Its passes over one large kernel take two thirds of the time to compile it, and win nothing in a pour.
             cfg_optimization=False,
+            # The columns of a scene's table are meant to be unrolled.
+            unrolling_limit=0,
         )
 
 

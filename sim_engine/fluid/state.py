@@ -3,6 +3,7 @@
 import taichi as ti
 
 from sim_engine.fluid.setup import SceneSetup
+from sim_engine.fluid.table import SceneTable
 
 SUPPORT = 2.2
 """Kernel support h over spacing d. At 2.0 liquid at rest was a crystal, too stiff for waves (sloshing 6 % fast)."""
@@ -73,6 +74,7 @@ class FluidState:
         self.neighbour, self.pair = ti.field(ti.i32, shape=entries), ti.field(ti.f32, shape=entries)
         self.cell_start = ti.field(ti.i32, shape=pool * CELLS + scenes * (LEAST_CELLS + 2))
 
+        arrays = set(vars(self))
         # Per scene: its place in the pools …
         self.begin = ti.field(ti.i32, shape=scenes)
         self.list_begin = ti.field(ti.i32, shape=scenes)
@@ -82,6 +84,7 @@ class FluidState:
         self.particles = ti.field(ti.i32, shape=scenes)
         self.spacing = ti.field(ti.f32, shape=scenes)
         self.cohesion = ti.field(ti.f32, shape=scenes)  # scale of its accelerations [m/s²]
+        self.adhesion = ti.field(ti.f32, shape=scenes)  # of walls, in units of cohesion's; 0: 90° of contact angle
         self.viscosity = ti.field(ti.f32, shape=scenes)
         self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over that at which a pair parts
         self.friction = ti.field(ti.f32, shape=scenes)
@@ -107,6 +110,7 @@ class FluidState:
         self.dt = ti.field(ti.f32, shape=scenes)
         self.waited = ti.field(ti.f32, shape=scenes)  # since viscosity acted [s]
         self.pull_waited = ti.field(ti.f32, shape=scenes)  # … and cohesion [s]
+        self.open = ti.field(ti.i32, shape=scenes)  # 1: a step has begun, and waits for cohesion
         self.steps = ti.field(ti.i32, shape=scenes)
         self.iterations = ti.field(ti.i32, shape=scenes)
         self.passes = ti.field(ti.i32, shape=scenes)  # of conjugate gradients
@@ -124,20 +128,26 @@ class FluidState:
         self.swing = ti.field(ti.f32, shape=(scenes, VESSELS))  # farthest that they carry a point in this step [m]
         self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]
+        self.table = SceneTable({name: field for name, field in vars(self).items() if name not in arrays})
 
-    def set_parameters(self, s: int, setup: SceneSetup) -> None:
-        """What θ_s of a scene is to the methods."""
-        from sim_engine.fluid.tension import cohesion_acceleration, pull_interval
-        from sim_engine.fluid.viscosity import eddy_rate, relax_interval
 
-        theta, density, d = setup.parameters, setup.density, setup.spacing
-        tension = theta.cohesion if setup.tension is None else setup.tension
-        self.cohesion[s] = cohesion_acceleration(tension, density, d)
-        self.pull_waited[s], self.pull_wait[s] = 0.0, pull_interval(tension, density, d)
-        self.viscosity[s] = theta.viscosity
-        self.eddies[s] = eddy_rate(theta.eddies)
-        self.waited[s], self.wait[s] = 0.0, relax_interval(theta.viscosity)
-        self.friction[s] = theta.friction
-        self.kinematic[s], self.no_slip[s] = setup.viscosity, 1.0 if setup.no_slip else 0.0
-        self.lip_drop[s] = theta.lip_drop
-        self.wall_shift[s] = (theta.wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT
+def of_parameters(setup: SceneSetup) -> dict[str, float]:
+    """What θ_s of a scene is to the methods, by field."""
+    from sim_engine.fluid.tension import adhesion, cohesion_acceleration, pull_interval
+    from sim_engine.fluid.viscosity import eddy_rate, relax_interval
+
+    theta, density, d = setup.parameters, setup.density, setup.spacing
+    tension = theta.cohesion if setup.tension is None else setup.tension
+    return {
+        "cohesion": cohesion_acceleration(tension, density, d),
+        "adhesion": adhesion(setup.contact_angle, theta.wall_distance),
+        "pull_wait": pull_interval(tension, density, d),
+        "viscosity": theta.viscosity,
+        "eddies": eddy_rate(theta.eddies),
+        "wait": relax_interval(theta.viscosity),
+        "friction": theta.friction,
+        "kinematic": setup.viscosity,
+        "no_slip": 1.0 if setup.no_slip else 0.0,
+        "lip_drop": theta.lip_drop,
+        "wall_shift": (theta.wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT,
+    }

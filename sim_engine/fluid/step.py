@@ -12,6 +12,7 @@ import taichi as ti
 from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
 from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.newtonian import STIFFEST, flow
+from sim_engine.fluid.packing import yield_to_shear
 from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
@@ -49,6 +50,9 @@ then answer to what was, not to what is (docs/how-it-works.md has the analysis).
 TREACLE = 0.7
 """Before the start velocities shrink to this part in every step: a lattice settles without splashing."""
 
+FACTS = ("time", "fault", "steps", "iterations", "compression")
+"""What `Stepper.look` tells of a scene beside its particles; names of fields."""
+
 IN_POURER, IN_FLIGHT, RECEIVED, SPILLED, ESCAPED = (int(s) for s in ParticleState)
 
 
@@ -71,6 +75,7 @@ class Stepper:
 
     def __init__(self, state: FluidState) -> None:
         self.state = state
+        self.facts = [getattr(state, name) for name in FACTS]
 
     @ti.func
     def place_pourer(self, s, time, poses: ti.template()):
@@ -298,7 +303,7 @@ class Stepper:
         poses: ti.template(),
         thick: ti.template(),
     ):
-        """One time step of one scene."""
+        """One time step of one scene, up to cohesion, which has a kernel of its own: `conclude` does the rest."""
         f = self.state
         fastest = self.top_speed(s)
         longest = ti.min(f.longest_step[s], PACE * ti.sqrt(f.spacing[s] / ti.max(f.gravity[s], 1e-3)))
@@ -322,16 +327,21 @@ class Stepper:
         self.look_at_walls(s, planes)
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
-        if ti.static(not thick):
+        if ti.static(thick):
+            yield_to_shear(f, s, dt)
+        else:
             f.waited[s] += dt
             if f.waited[s] >= f.wait[s]:
                 relax(f, s, f.waited[s])
                 f.waited[s] = 0.0
-        # Too late is unstable: before it could be, not after.
         f.pull_waited[s] += dt
-        if f.cohesion[s] > 0.0 and f.pull_waited[s] + dt > f.pull_wait[s]:
-            pull(f, s, f.pull_waited[s])
-            f.pull_waited[s] = 0.0
+        f.open[s] = 1
+
+    @ti.func
+    def conclude(self, s, cavities: ti.template(), thick: ti.template()):
+        """The rest of a time step."""
+        f = self.state
+        dt = f.dt[s]
         if f.time[s] < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] * TREACLE
@@ -342,19 +352,7 @@ class Stepper:
         self.classify(s, cavities)
         self.let_fall(s, dt)
         f.steps[s] += 1
-
-    @ti.kernel
-    def begin(self, s0: ti.i32, s1: ti.i32, poses: ti.types.ndarray(dtype=ti.f32, ndim=2)):
-        """Put the vessels of some scenes in their first pose and ask for lists."""
-        f = self.state
-        for s in range(s0, s1):
-            self.place_pourer(s, f.time[s], poses)
-            for b in range(VESSELS):
-                f.origin0[s, b] = f.origin[s, b]
-                f.turn0[s, b] = f.turn[s, b]
-            f.stale[s] = 1
-            f.moving[s] = f.particles[s]
-            f.dt[s] = LONGEST_STEP
+        f.open[s] = 0
 
     @ti.kernel
     def advance(
@@ -366,23 +364,52 @@ class Stepper:
         planes: ti.types.ndarray(dtype=ti.f32, ndim=1),
         cavities: ti.types.ndarray(dtype=ti.u8, ndim=1),
         poses: ti.types.ndarray(dtype=ti.f32, ndim=2),
+        due: ti.types.ndarray(dtype=ti.i32, ndim=1),
         thick: ti.template(),
     ):
-        """Run each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s] or a fault stops it.
+        """Run each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s], a fault stops it, or cohesion is
+        due.
+
+        Cohesion is due in the middle of a step: with `due[s]` 1 call `cohere`, and this again. Two kernels are compiled
+        in less time than one that has both, and who simulates without cohesion never compiles it.
 
         Scenes are independent: on a GPU each has a thread, on a CPU they follow each other. All of them are `thick`,
         liquids of a viscosity in SI, or none is: two kernels, so that the one knows nothing of the other.
         """
         f = self.state
         for s in range(s0, s1):
-            while f.time[s] < until[s] and f.fault[s] == 0:
-                self.step(s, grids, planes, cavities, poses, thick)
+            due[s] = 0
+            while due[s] == 0 and (f.open[s] == 1 or (f.time[s] < until[s] and f.fault[s] == 0)):
+                if f.open[s] == 1:
+                    self.conclude(s, cavities, thick)
+                else:
+                    self.step(s, grids, planes, cavities, poses, thick)
+                    # Too late is unstable: before it could be, not after.
+                    if f.cohesion[s] > 0.0 and f.pull_waited[s] + f.dt[s] > f.pull_wait[s]:
+                        due[s] = 1
 
     @ti.kernel
-    def census(self, s0: ti.i32, s1: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=2)):
-        """Number of particles in each state, for each of the scenes s0 … s1 − 1."""
+    def cohere(self, s0: ti.i32, s1: ti.i32, due: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+        """Let cohesion act in those of the scenes s0 … s1 − 1 in which it is due."""
         f = self.state
         for s in range(s0, s1):
+            if due[s] == 1:
+                pull(f, s, f.pull_waited[s])
+                f.pull_waited[s] = 0.0
+
+    @ti.kernel
+    def look(
+        self,
+        s0: ti.i32,
+        s1: ti.i32,
+        counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
+        facts: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    ):
+        """Number of particles in each state, and `FACTS`, for each of the scenes s0 … s1 − 1."""
+        f = self.state
+        for s in range(s0, s1):
+            for k in ti.static(range(len(FACTS))):
+                facts[s, k] = self.facts[k][s]
             for k in range(5):
                 counts[s, k] = 0
             for i in range(f.begin[s], f.begin[s] + f.particles[s]):

@@ -102,6 +102,18 @@ def test_kill_9_leaves_nothing(tmp_path):
 
 
 @pytest.mark.realtime
+def test_no_helper_of_ray_runs_that_nobody_uses(tmp_path):
+    program, facts = start("wait", tmp_path)
+    lines = [word for pid in facts["pids"] if psutil.pid_exists(pid) for word in psutil.Process(pid).cmdline()]
+    program.kill()
+    program.communicate(timeout=PATIENCE)
+    names = {Path(word).name for word in lines}
+    assert {"raylet", "gcs_server"} <= names
+    assert not {"dashboard.py", "monitor.py", "log_monitor.py"} & names
+    assert_clean(facts, tmp_path)
+
+
+@pytest.mark.realtime
 def test_ctrl_c_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
     os.killpg(program.pid, signal.SIGINT)

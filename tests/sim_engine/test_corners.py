@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from sim_engine.pour import inside_mask
 from sim_engine.validation.tanks import box, holed_cup
 from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.corners import equivalent_distance, half_space
+from sim_engine.vessel.corners import equivalent_distance, half_space, inside_mask
 from sim_engine.vessel.spec import cylinder
 
 CUP = build_vessel(cylinder("cup", inner_radius=0.04, inner_height=0.1))
-MASK = inside_mask(CUP)
+MASK = inside_mask(CUP.grid)
 
 
 def at(field: np.ndarray[tuple[int, ...], np.dtype[np.float32]], r: float, z: float) -> float:
@@ -74,3 +76,16 @@ def test_a_box_s_corner_counts_three_walls() -> None:
     grid = type(tank.grid)(tank.grid.origin, tank.grid.spacing, plane, tank.grid.cavity)
     wall, edge, corner = grid.sample(np.array([[0.025, 0.0, 0.003], [0.003, 0.0, 0.003], [0.003, -0.022, 0.003]]))
     assert corner < edge < wall
+
+
+def test_what_is_inside_is_kept_and_a_damaged_file_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path))
+    np.testing.assert_array_equal(inside_mask(CUP.grid), MASK)
+    (kept,) = tmp_path.glob("inside-*.npz")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "scipy", None)
+        np.testing.assert_array_equal(inside_mask(CUP.grid), MASK)
+        kept.write_bytes(kept.read_bytes()[:100])
+        with pytest.raises(ImportError):
+            inside_mask(CUP.grid)
+    np.testing.assert_array_equal(inside_mask(CUP.grid), MASK)

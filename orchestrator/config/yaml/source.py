@@ -38,7 +38,7 @@ class Mark:
     inline: bool
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _known(text: str, path: Path) -> Document:
     """Vessels and laboratories are named by many files. Nobody changes a document once it has been read."""
     return Document.parse(text, path)

@@ -11,8 +11,11 @@ from typer.testing import CliRunner
 
 from orchestrator.cli import app
 from orchestrator.config.load import load_laboratory
+from orchestrator.daemon.reading import Pours
 from orchestrator.daemon.running import job_of
-from orchestrator.daemon.settings import DESK, Rig
+from orchestrator.daemon.settings import DESK, Rig, Settings
+from orchestrator.daemon.store import Item
+from orchestrator.jobs import Job
 from tests.end_to_end.small import NARROW
 from tests.orchestrator.daemon.served import HeldLaboratory, campaign_in, held, run, serving
 
@@ -30,6 +33,35 @@ def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path
             assert before["run"] != found["run"]
 
     run(work())
+
+
+def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+
+    def counted(settings: Settings, item: Item, rig: Rig) -> Job:
+        read.append(item.id)
+        return job_of(settings, item, rig)
+
+    monkeypatch.setattr("orchestrator.daemon.looks.job_of", counted)
+
+    async def work() -> None:
+        async with serving(tmp_path, held) as served:
+            key = await served.submit()
+            laboratory = await served.pouring()
+            shown = [(await served.get(f"/campaigns/{key}"))["pours_made"] for _ in range(2)]
+            assert [[pour["state"] for pour in pours] for pours in shown] == [["under way"]] * 2
+            laboratory.bench.go.set()
+            found = await served.until(key, "finished")
+            assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
+            settings, item = served.daemon.settings, served.daemon.item(key)
+            plan = job_of(settings, item, settings.rig(item.rig)).plan
+            afresh = Pours().of(settings.runs / str(item.run), lambda: plan)
+            assert found["pours_made"] == afresh
+
+    run(work())
+    assert len(read) == 1
 
 
 def test_higher_priorities_come_first_and_people_may_change_the_order(tmp_path: Path) -> None:

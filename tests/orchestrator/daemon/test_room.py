@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.warm import WarmSimulators
-from orchestrator.daemon import lane, supervisor
+from orchestrator.daemon import lane
 from orchestrator.daemon.retention import prune_recordings
 from orchestrator.daemon.settings import Settings
 from tests.orchestrator.daemon.served import run, serving
@@ -35,24 +34,6 @@ def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(
             served.daemon.wake()
             await served.until(key, "finished")
             assert (await served.get("/status"))["problems"] == []
-
-    run(work())
-
-
-def test_a_ray_that_has_died_is_said_until_it_is_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lost = ["raylet"]
-    monkeypatch.setattr(WarmSimulators, "lost", property(lambda self: lost[0]))
-    monkeypatch.setattr(supervisor, "LOOKING", 0.01)
-
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            while not (found := (await served.get("/status"))["problems"]):
-                pass
-            assert "Ray has lost its raylet" in found[0]
-            assert "start it again" in found[0]
-            lost[0] = ""
-            while (await served.get("/status"))["problems"]:
-                pass
 
     run(work())
 

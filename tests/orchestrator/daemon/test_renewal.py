@@ -1,0 +1,112 @@
+"""A daemon whose Ray has died begins anew: what it finishes before, what it leaves, and when people have to mend it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from actors.warm import WarmSimulators
+from orchestrator.daemon import renewal, supervisor
+from orchestrator.daemon.renewal import MOST, RENEWED, RayWatch, Renewal
+from tests.orchestrator.daemon.served import held, run, serving
+
+
+def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = ["raylet"]
+    monkeypatch.setattr(supervisor, "LEAVING", 0.05)
+
+    async def work() -> None:
+        async with serving(tmp_path, held) as served:
+            keys = [await served.submit(), await served.submit()]
+            laboratory = await served.pouring()
+            monkeypatch.setattr(WarmSimulators, "lost", property(lambda self: lost[0]))
+            assert served.daemon.pouring
+            served.daemon.leave("raylet")
+            told = await served.post("/queue/pause")
+            told = await served.post(f"/campaigns/{keys[1]}/resume", status=409)
+            assert "just beginning anew" in told["detail"]
+            (problem,) = (await served.get("/status"))["problems"]
+            assert "Ray has lost its raylet" in problem
+            await asyncio.sleep(0.2)
+            assert not served.daemon.left.is_set()
+            assert laboratory.bench.aborted == []
+            laboratory.bench.go.set()
+            await served.daemon.left.wait()
+            found = await served.until(keys[0], "paused")
+            assert [pour["state"] for pour in found["pours_made"]] == ["weighed"]
+            await served.post("/queue/resume")
+        lost[0] = ""
+        async with serving(tmp_path) as served:
+            for key in keys:
+                await served.until(key, "finished")
+
+    run(work())
+
+
+class Daemon:
+    lost, pouring = "raylet", False
+
+    def __init__(self) -> None:
+        self.left: list[str] = []
+        self.problems: list[str] = []
+
+    def leave(self, lost: str) -> None:
+        self.left.append(lost)
+
+    def problem(self, key: str, text: str | None) -> None:
+        self.problems.append(str(text))
+
+
+def watched(monkeypatch: pytest.MonkeyPatch, daemon: Daemon, *, rests: bool = False) -> list[float]:
+    """When the program was replaced, seconds after Ray was seen to be dead."""
+    monkeypatch.setattr(renewal, "COMING_TO_REST", 0.4)
+    monkeypatch.setattr(renewal, "POURING", 0.8)
+    begun, replaced = time.monotonic(), []
+
+    class Kept(Renewal):
+        def begin_anew(self) -> Any:
+            replaced.append(time.monotonic() - begun)
+
+    async def work() -> None:
+        watch = RayWatch(daemon, Kept(), lambda: False)
+        await asyncio.sleep(0.05)
+        if rests:
+            watch.close()
+        time.sleep(1.5)  # as a loop that hangs in a call to a dead Ray
+        await asyncio.sleep(0)
+
+    with contextlib.suppress(TimeoutError):
+        asyncio.run(work())
+    return replaced
+
+
+def test_a_loop_that_hangs_keeps_nobody_from_beginning_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = Daemon()
+    assert len(watched(monkeypatch, daemon)) == 1
+    assert daemon.left == ["raylet"]
+    assert not daemon.problems
+    assert watched(monkeypatch, Daemon(), rests=True) == []
+
+
+def test_a_pour_gets_more_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = Daemon()
+    daemon.pouring = True
+    (after,) = watched(monkeypatch, daemon)
+    assert after > 0.8
+
+
+def test_people_are_told_where_ray_dies_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = Daemon()
+    monkeypatch.setenv(RENEWED, " ".join(str(time.time()) for _ in range(MOST)))
+    assert watched(monkeypatch, daemon) == []
+    assert daemon.left == []
+    assert "start it again" in daemon.problems[0]
+    monkeypatch.setenv(RENEWED, " ".join(str(time.time() - renewal.WITHIN) for _ in range(MOST)))
+    assert len(watched(monkeypatch, Daemon())) == 1
