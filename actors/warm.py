@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from actors.device import Device, LocalDevice, RayDevice
 from actors.laboratory import ClosablePool
+from actors.memory import give_back
 from actors.optimizer.actor import DeviceOptimizer, Proposer
 from actors.protocols import LaboratoryError, Optimizer
 from actors.ray_watch import watch_ray
@@ -121,7 +122,8 @@ class WarmSimulators:
         return ray_lost()
 
     async def tidy(self) -> None:
-        """Forget what laboratories that are closed have left behind."""
+        """Forget what laboratories that are closed have left behind, and give its memory back."""
+        await asyncio.to_thread(give_back)
         if self._pool is not None and not self._spec.in_process:
             from actors.ray_runtime import forget_ray_logs
 

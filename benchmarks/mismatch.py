@@ -6,10 +6,11 @@
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
-interrupted comparison goes on; `--write` makes none, and puts the table of FILE into docs/optimiser.md.
+interrupted comparison goes on; `--write` makes none, and puts the rows of FILE into the table of docs/optimiser.md.
 
-Primary questions, written before any of it was run. Seeds below 1000 are for tuning, those from 1000 on for answers;
-what is lost is without scatter, means over at least 20 seeds with 95 % bootstrap intervals:
+Primary questions, written before any of it was run. Seeds below 1000 are for tuning, those from 1000 on for answers:
+1000 to 1019, and 2000 to 2019 for what was changed after the answers of those were known. What is lost is without
+scatter, means over at least 20 seeds with 95 % bootstrap intervals:
 
 1. Mean of 15 pours of `adaptive` at no, small, moderate and large mismatch: at most 0.05, 0.08, 0.10, 0.25?
 2. Its pours that lose more than 10 % after the first that lost less than 1 %: at most 0.2 a campaign?
@@ -153,10 +154,18 @@ def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
 
 
 def write(text: str) -> None:
-    """Put a table into the page."""
+    """Put a table into the page; rows that it lacks stay as they are there."""
     begin, end = "<!-- measured: mismatch -->\n", "<!-- end of measured -->"
     before, rest = PAGE.read_text().split(begin)
-    PAGE.write_text(f"{before}{begin}{text}\n{end}{rest.split(end, 1)[1]}")
+    shown, after = rest.split(end, 1)
+    new = {_row(line): line for line in text.splitlines()}
+    lines = [new.pop(_row(line), line) for line in shown.splitlines()]
+    PAGE.write_text(before + begin + "\n".join([*lines, *new.values()]) + "\n" + end + after)
+
+
+def _row(line: str) -> tuple[str, ...]:
+    """What a line of the table is about: its simulator and its arm."""
+    return tuple(cell.strip() for cell in line.split("|")[1:3])
 
 
 def main() -> None:

@@ -14,6 +14,9 @@ THIN = 5e-6
 """Up to this kinematic viscosity a liquid is as thin as water to the solver: its boundary layers √(πνt), a millimetre
 or two in what a pour takes, are thinner than half a spacing of a usual simulation [m²/s]."""
 
+NEUTRAL = 0.5 * math.pi
+"""Contact angle of a wall that is neither wet nor shunned: what the solver has where nobody says otherwise [rad]."""
+
 FARTHEST_TILT = math.radians(5.0)
 
 SHOWN = {"mm": 1e-3, "deg": math.pi / 180.0}
@@ -65,7 +68,7 @@ class Liquid(BaseModel):
         density: [kg/m³].
         surface_tension: against air [N/m].
         dynamic_viscosity: [Pa s].
-        contact_angle: of the liquid on the vessels [rad]; kept, not simulated yet.
+        contact_angle: of the liquid on the vessels [rad].
 
     A liquid of more than `THIN` is simulated with this viscosity and this tension, and sticks to walls. For one as thin
     as water they decide nothing: θ's `viscosity` and `cohesion` do, and it slips. From all of them and the planned flow
@@ -79,7 +82,7 @@ class Liquid(BaseModel):
     density: float = Field(default=998.0, gt=100.0, lt=20_000.0)
     surface_tension: float = Field(default=0.0728, ge=1e-3, le=1.0)
     dynamic_viscosity: float = Field(default=1.0e-3, ge=1e-5, le=1e3)
-    contact_angle: float = Field(default=0.0, ge=0.0, le=math.pi)
+    contact_angle: float = Field(default=NEUTRAL, ge=0.0, le=math.pi)
 
     @property
     def volume(self) -> float:
@@ -98,8 +101,8 @@ class Liquid(BaseModel):
 
     def free_fields(self) -> frozenset[str]:
         """Fields that decide no request of this very liquid; of a thin one a simulation does not look at them."""
-        thin = frozenset({"surface_tension", "dynamic_viscosity"})
-        return (frozenset() if self.is_thick else thin) | {"contact_angle"}
+        free = set() if self.is_thick else {"surface_tension", "dynamic_viscosity"}
+        return frozenset(free | ({"contact_angle"} if self.contact_angle == NEUTRAL else set()))
 
     def millilitres(self, mass: float) -> float:
         """Volume of some of it, as people read it [mL]; mass in [kg]."""

@@ -228,6 +228,7 @@ class PourSimulator:
             drift=(float(drift[0]), float(drift[1]), float(drift[2])),
             viscosity=liquid.kinematic_viscosity * parameters.viscosity_factor if liquid.is_thick else 0.0,
             tension=liquid.surface_tension if liquid.is_thick else None,
+            contact_angle=liquid.contact_angle,
         )
 
     def _walls(self, spec: VesselSpec, support: float) -> SolidWalls:

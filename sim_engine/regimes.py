@@ -46,9 +46,9 @@ of others it is simulated, …"""
 CREEPING = 2.0
 """… up to this viscosity [Pa s], the largest that was held against theory (`decant physics film`) …"""
 
-FLOOR = 400e-6
+FLOOR = 300e-6
 """… and roughly below that kinematic viscosity [m²/s]: so much the solver adds by itself at most, in a tank 41 mm deep
-(`decant physics floor`, spacings of 2.7 and 4.6 mm)."""
+(`decant physics floor`, spacings of 4.1 to 5.9 mm, .05 and .2 m/s)."""
 
 PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer none has neighbours all around it, and the stream is a string."""
@@ -154,7 +154,7 @@ def _wetting(course: FlowCourse, liquid: Liquid) -> NotCovered:
         share,
         f"{_percent(share)} of what is poured leaves in a film thinner than the capillary length "
         f"({1e3 * capillary_length(liquid):.1f} mm; Bond number below {WETTING_BOND:g}). How the liquid wets the lip "
-        "decides when such a film starts and stops to flow; contact angles are not simulated",
+        "decides when such a film starts and stops to flow; contact angles are right for finer particles only",
     )
 
 

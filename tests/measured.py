@@ -95,8 +95,9 @@ class Bench:
         result: Floats = (found + self.rng.normal(0.0, noise, found.shape)) @ turn.T + [0.1, -0.2, 0.5]
         return result
 
-    def save_cloud(self, path: Path) -> Path:
-        np.savetxt(path, 1e3 * self.cloud(), delimiter=",", header="x,y,z", comments="")
+    def save_cloud(self, path: Path, *, hole: bool = False, seen: float = 2.0) -> Path:
+        points = 1e3 * self.cloud(hole=hole, seen=seen)
+        np.savetxt(path, points, delimiter=",", header="x,y,z", comments="")
         return path
 
 

@@ -139,7 +139,8 @@ def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     assert (run["level"], run["arm"], run["seed"], len(run["poured"])) == ("small", "adaptive", 0, 3)
     monkeypatch.setattr(mismatch, "campaign", None)  # nothing is made again
     mismatch.main()
-    page.write_text("before\n<!-- measured: mismatch -->\nold\n<!-- end of measured -->\nafter\n")
+    rows = "| small | D3, `adaptive` | old |\n| large | D3, `adaptive` | kept |\n"
+    page.write_text(f"before\n<!-- measured: mismatch -->\n{rows}<!-- end of measured -->\nafter\n")
     monkeypatch.setattr(mismatch, "PAGE", page)
     monkeypatch.setattr(mismatch, "FEWEST", 1)
     monkeypatch.setattr(sys, "argv", ["mismatch.py", "--first", "0", "--seeds", "1", "--out", str(kept), "--write"])
@@ -148,5 +149,6 @@ def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     written = page.read_text()
     assert f"| small | D3, `adaptive` | {np.mean(run['poured']):.3f} (" in written
     assert "old" not in written
+    assert "| large | D3, `adaptive` | kept |" in written
     assert written.startswith("before")
     assert written.endswith("after\n")

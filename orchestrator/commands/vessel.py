@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -287,7 +288,7 @@ def _profile_file(name: str, outline: Outline, told: Sequence[str], doubts: Sequ
         f"# It holds {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL; its inner radius is "
         f"known to ± {1e3 * outline.radius_deviation:.2f} mm (one standard deviation).",
         *(f"# Doubtful: {doubt}." for doubt in doubts),
-        f"name: {name}",
+        f"name: {json.dumps(name, ensure_ascii=False)}",  # "12" and "no" are no texts without quotes
         "profile:",
         "  unit: mm",
         f"  inner: [{points}]",
@@ -344,5 +345,6 @@ def _written_mesh(
         )
     picture = draw_solid(name, built, out.with_suffix(".png"))
     lines = [f"# {note}." for note in (*notes, *doubts)]
-    out.write_text("\n".join([*lines, f"name: {name}", f"mesh: {path.name}", "unit: mm", f"up: {up}"]) + "\n")
+    lines += [f"name: {json.dumps(name, ensure_ascii=False)}", f"mesh: {path.name}", "unit: mm", f"up: {up}"]
+    out.write_text("\n".join(lines) + "\n")
     return Made(built.capacity, deviation, None, picture, notes, doubts)

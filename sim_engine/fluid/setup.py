@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,7 @@ class SceneSetup:
         viscosity: kinematic, of a liquid whose viscosity is simulated in SI [m²/s]; 0: θ's rate alone, walls slip.
         no_slip: whether such a liquid sticks to walls.
         tension: surface tension in place of θ's cohesion [N/m].
+        contact_angle: on both vessels [rad].
     """
 
     positions: NDArray[np.float32]
@@ -75,6 +77,7 @@ class SceneSetup:
     viscosity: float = 0.0
     no_slip: bool = True
     tension: float | None = None
+    contact_angle: float = 0.5 * math.pi
 
 
 def pose_at(poses: NDArray[np.float64], time: float) -> NDArray[np.float64]:

@@ -84,6 +84,7 @@ class FluidState:
         self.particles = ti.field(ti.i32, shape=scenes)
         self.spacing = ti.field(ti.f32, shape=scenes)
         self.cohesion = ti.field(ti.f32, shape=scenes)  # scale of its accelerations [m/s²]
+        self.adhesion = ti.field(ti.f32, shape=scenes)  # of walls, in units of cohesion's; 0: 90° of contact angle
         self.viscosity = ti.field(ti.f32, shape=scenes)
         self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over that at which a pair parts
         self.friction = ti.field(ti.f32, shape=scenes)
@@ -132,13 +133,14 @@ class FluidState:
 
 def of_parameters(setup: SceneSetup) -> dict[str, float]:
     """What θ_s of a scene is to the methods, by field."""
-    from sim_engine.fluid.tension import cohesion_acceleration, pull_interval
+    from sim_engine.fluid.tension import adhesion, cohesion_acceleration, pull_interval
     from sim_engine.fluid.viscosity import eddy_rate, relax_interval
 
     theta, density, d = setup.parameters, setup.density, setup.spacing
     tension = theta.cohesion if setup.tension is None else setup.tension
     return {
         "cohesion": cohesion_acceleration(tension, density, d),
+        "adhesion": adhesion(setup.contact_angle, theta.wall_distance),
         "pull_wait": pull_interval(tension, density, d),
         "viscosity": theta.viscosity,
         "eddies": eddy_rate(theta.eddies),

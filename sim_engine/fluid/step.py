@@ -12,6 +12,7 @@ import taichi as ti
 from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
 from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.newtonian import STIFFEST, flow
+from sim_engine.fluid.packing import yield_to_shear
 from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
@@ -326,7 +327,9 @@ class Stepper:
         self.look_at_walls(s, planes)
         self.solve_density(s, ratio)
         self.finish(s, dt, grids)
-        if ti.static(not thick):
+        if ti.static(thick):
+            yield_to_shear(f, s, dt)
+        else:
             f.waited[s] += dt
             if f.waited[s] >= f.wait[s]:
                 relax(f, s, f.waited[s])

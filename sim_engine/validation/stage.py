@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.hydrostatics import GRAVITY
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquid import NEUTRAL, SimulationParameters
 from sim_engine.vessel.corners import equivalent_distance, inside_mask
 from sim_engine.vessel.sdf import SignedDistanceGrid
 from sim_engine.vessel.vessel import Vessel
@@ -87,6 +87,7 @@ def run(
     longest_step: float | None = None,
     viscosity: float = 0.0,
     no_slip: bool = True,
+    contact_angle: float = NEUTRAL,
 ) -> Iterator[int]:
     """Load a scene and run it to each of some times.
 
@@ -103,6 +104,7 @@ def run(
         longest_step: in place of the solver's own [s].
         viscosity: kinematic [m²/s]; 0: θ's rate alone.
         no_slip: whether a liquid of such a viscosity sticks to the vessel.
+        contact_angle: on the vessel [rad].
 
     Yields:
         The index of each time when it has been reached: then the engine may be looked at.
@@ -133,6 +135,7 @@ def run(
         longest_step=longest_step,
         viscosity=viscosity,
         no_slip=no_slip,
+        contact_angle=contact_angle,
     )
     fluid.load([setup])
     for k, time in enumerate(times):

@@ -13,7 +13,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
-from sim_engine.validation import films
+from sim_engine.validation import films, wetting
 from sim_engine.validation.result import Figure, Measurement, Series, reported, within
 from sim_engine.validation.stage import run, stir
 from sim_engine.validation.tanks import block, box
@@ -25,8 +25,8 @@ THETA = SimulationParameters(cohesion=0.0, viscosity=0.0)
 
 FLOOR = (
     "Taylor and Green's vortices in a tank with slippery walls die away as exp(−2νk²t), whatever their speed. What is "
-    "found above the given viscosity is the solver's own: pressure makes of the packing of particles a weak solid, "
-    "whose stress counts the more the slower the shear."
+    "found above the given viscosity is the solver's own: under pressure the packing of particles is a weak solid, and "
+    "what is taken out of its stress inside is left beside walls and the surface."
 )
 FILM = "A film of 10 mm, ν = 1,000 mm²/s, runs down a plane of 20°: mean velocity g sin α e²/3ν (Nusselt 1916)."
 TUBE = (
@@ -204,6 +204,7 @@ CASES: tuple[tuple[str, str, str, Work], ...] = (
     ("tube", "Tube", TUBE, tube),
     ("drainage", "Drainage of a wall film", DRAINAGE, drainage),
     ("puddle", "Viscous dam break", PUDDLE, puddle),
+    ("wetting", "Contact angle", wetting.ABOUT, wetting.wetting),
     ("thick-outflow", "Outflow of thick liquids", CUP, cup),
 )
 """Name, title, what it is about, and what runs it, in short or in full."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquid import THIN, Liquid, SimulationParameters
 from sim_engine.pour import PourSimulator
 from sim_engine.task import PourTask, Scene
-from sim_engine.validation import films
+from sim_engine.validation import films, thick, wetting
 from sim_engine.vessel.spec import cylinder
 
 PLAIN = SimulationParameters(cohesion=0.0, viscosity=0.0)
@@ -33,6 +34,11 @@ def poured(viscosity: float, factor: float = 1.0) -> PourTask:
 def test_a_puddle_of_syrup_spreads_as_huppert_says(simulator: PourSimulator) -> None:
     found, _ = films.spreading(1_000, 2e-3, PLAIN)
     assert found[0].value < 0.12  # of the radius, over a second and a half
+
+
+def test_the_packing_adds_little_to_a_viscosity_however_slow_the_shear(simulator: PourSimulator) -> None:
+    value, _, _ = thick.own_viscosity(1_000, 1e-4, 0.05)
+    assert value < 6e-4  # it was 11e-4 before the packing's stress was taken out of the velocities
 
 
 def test_a_film_on_an_incline_is_slow_at_the_wall_and_as_fast_as_nusselt_s_in_the_mean(
@@ -67,6 +73,24 @@ def test_the_factor_is_that_of_the_viscosity_and_none_to_a_liquid_as_thin_as_wat
         simulator.simulate(poured(1e-3, 5.0)).outcome.curve_poured
         == simulator.simulate(poured(2e-3)).outcome.curve_poured
     )
+
+
+@pytest.mark.parametrize("degrees", [150.0, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_a_puddle_stands_as_high_as_its_contact_angle_says(simulator: PourSimulator, degrees: float) -> None:
+    angle = math.radians(degrees)
+    value, _, _ = wetting.puddle(2_000, angle)
+    assert value == pytest.approx(wetting.height(angle), rel=0.2)
+
+
+def test_a_contact_angle_that_nobody_gave_is_none(simulator: PourSimulator) -> None:
+    plain, wet = SCENE.liquid, SCENE.liquid.model_copy(update={"contact_angle": 0.5})
+    assert "contact_angle" in plain.free_fields()  # runs of before keep their fingerprint
+    assert "contact_angle" not in wet.free_fields()
+    curves = [
+        simulator.simulate(replace(poured(1e-3), scene=replace(SCENE, liquid=liquid))).outcome.curve_poured
+        for liquid in (plain, wet)
+    ]
+    assert curves[0] != curves[1]
 
 
 @pytest.mark.parametrize(("viscosity", "thick"), [(0.99 * THIN * 998.0, False), (1.01 * THIN * 998.0, True)])

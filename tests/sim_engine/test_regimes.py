@@ -194,7 +194,7 @@ def test_thick_liquids_are_simulated_and_told_only_beyond_what_was_checked() -> 
     (oil,) = of_liquid(density=915.0, dynamic_viscosity=0.0788, surface_tension=0.0335).not_covered
     assert oil.kind == "viscous"
     assert oil.share == 1.0
-    assert "(86.1 mm^2/s); the simulator adds up to 400 mm^2/s of its own" in oil.text
+    assert "(86.1 mm^2/s); the simulator adds up to 300 mm^2/s of its own" in oil.text
     (told,) = of_liquid(density=1400.0, dynamic_viscosity=9.0, surface_tension=0.08).not_covered
     assert told.kind == "viscous"
     assert told.share == 1.0

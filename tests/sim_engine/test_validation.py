@@ -281,7 +281,6 @@ NOT_MET: dict[str, str] = {
     "retention": "12.7 mL too much with 500 particles at 80°, 10.6 with 1,000 at 60°, 9.2 in the jug at 60°",
     "landing": "the spread at 30 °/s is 1.1 mm more with 1,000 particles than with 10,000",
     "convergence": "a fast pour into a bowl splashes out the more the finer the particles are",
-    "floor": "400 mm²/s are added to 2,000",
     "film": "films of two and three spacings are 16 and 22 % too fast",
     "tube": "no pressure holds a falling plug together",
     "drainage": "a vertical film runs off too early",

@@ -1,23 +1,25 @@
 """Averaging over the ways in which a simulator can be wrong, each weighed by the observations.
 
-Hypothesis j says that the bench does at action x what the simulator does at a displaced one, more or less of it, and
-something more that nobody simulated:
+Hypothesis j says that the bench does at action x what the simulator does at a displaced one, nearer to or farther from
+its best action x̂, more or less of it, and something more that nobody simulated:
 
-    f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(A_j x + s_j), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
-    v_j² = σ_j² + e^{2 g_j} s_s²(A_j x + s_j),    y = f(x) + ε,    ε ~ N(0, (n + 0.15 μ_j(x))²)
+    f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(z_j(x)), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
+    z_j(x) = x̂ + e^{h_j} (A_j x + s_j − x̂),    v_j² = σ_j² + e^{2 g_j} s_s²(z_j(x))
+    y = f(x) + ε,    ε ~ N(0, (n + 0.15 μ_j(x))²)
 
-f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. The last
+f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. h makes the
+valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. The last
 hypothesis is ignorance: the simulator says nothing of this bench, and f is a GP around 0.6, more towards corners. The
 posterior weights are prior times marginal likelihood of the observations. So nothing is forgotten: a hypothesis that
 fails fades, and the weight of ignorance says how far the simulator is to be trusted.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
-Limitations: the hypotheses are a fixed set; predictions come from at most 16 of them, the heaviest, and ignorance.
+Limitations: the hypotheses are a fixed set; predictions come from at most 32 draws of them, and ignorance.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +33,13 @@ from actors.optimizer.core.surrogate import GaussianProcess
 
 Array = NDArray[np.float64]
 
-HYPOTHESES = 512
-HEAVIEST = 16
-LIGHT = 0.005
-"""Share of the heaviest ones' weight below which a hypothesis is left out of predictions, but for the first four."""
+HYPOTHESES = 2048
+KEPT = 32
+"""Draws from the posterior weights that predictions are made from, evenly by weight: at most as many hypotheses."""
 GAIN = 0.3
 """Standard deviation of g."""
+WIDTH = 0.25
+"""Standard deviation of h."""
 RESTS = (0.02, 0.3)
 """Smallest and largest σ, in units of the largest cost; evenly by its logarithm, as ℓ."""
 LENGTHS = (0.15, 0.6)
@@ -60,25 +63,29 @@ class Hypotheses:
 
     Attributes:
         scales, shifts: (J, dimension) of the displacements.
+        widths: (J,), logarithms of the factors on distances to the centre.
         gains: (J,), logarithms.
         rests: (J,), σ.
         lengths: (J,), ℓ.
+        centre: (dimension,), the simulated best.
     """
 
     scales: Array
     shifts: Array
+    widths: Array
     gains: Array
     rests: Array
     lengths: Array
+    centre: Array
 
     @classmethod
-    def of(cls, mismatch: Mismatch) -> Hypotheses:
+    def of(cls, mismatch: Mismatch, centre: Array) -> Hypotheses:
         """Draw, the same for the same question: quasi-random, so that few cover much."""
         dimension = len(mismatch.play)
-        rows = qmc.Sobol(2 * dimension + 5, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
+        rows = qmc.Sobol(2 * dimension + 6, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
         rows = np.clip(rows, 1e-6, 1.0 - 1e-6)
         z = ndtri(rows[:, : 2 * dimension])
-        gain, rest, length, far, known = rows[:, 2 * dimension :].T
+        width, gain, rest, length, far, known = rows[:, 2 * dimension :].T
         spread = _evenly(FARTHER, far)
         scales, shifts = np.ones((HYPOTHESES, dimension)), np.zeros((HYPOTHESES, dimension))
         if mismatch.drawn:
@@ -95,18 +102,22 @@ class Hypotheses:
         return cls(
             factors * scales,
             factors * shifts + moved,
+            WIDTH * ndtri(width),
             GAIN * ndtri(gain),
             _evenly(RESTS, rest),
             _evenly(LENGTHS, length),
+            centre,
         )
 
     def only(self, kept: NDArray[np.int_]) -> Hypotheses:
         """Some of them."""
-        return Hypotheses(*(getattr(self, name)[kept] for name in ("scales", "shifts", "gains", "rests", "lengths")))
+        names = "scales", "shifts", "widths", "gains", "rests", "lengths"
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def moved(self, points: Array) -> Array:
         """(J, m, dimension): where each puts points (m, dimension) in the simulator."""
-        return self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
+        there = self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
+        return np.asarray(self.centre + np.exp(self.widths)[:, None, None] * (there - self.centre))
 
 
 @dataclass(frozen=True)
@@ -138,7 +149,7 @@ class AveragedProcess:
         """
         self.simulated, self.points, self.worst = simulated, points, mismatch.worst
         self._costs = np.clip(costs / mismatch.worst, 0.0, 1.0)
-        self._all = Hypotheses.of(mismatch)
+        self._all = Hypotheses.of(mismatch, _least(simulated))
         informed = self._evidences(self._informed(self._all, points), self._all.lengths)
         ignorant = self._evidences(self._ignorant(points, self._costs), np.array(IGNORANT_LENGTHS))
         logs = np.concatenate(
@@ -150,13 +161,9 @@ class AveragedProcess:
         weights = np.exp(logs - logs.max())
         self.weights = weights / weights.sum()
         self.ignorance = float(self.weights[len(informed) :].sum())
-        heavy = np.argsort(-self.weights[: len(informed)], kind="stable")[:HEAVIEST]
-        told = self.weights[heavy] >= LIGHT * self.weights[heavy].sum()
-        told[:4] = True
-        heavy = heavy[told]
-        self._kept = self._all.only(heavy)
-        share = self.weights[heavy] / max(self.weights[heavy].sum(), 1e-300) * (1.0 - self.ignorance)
-        self.mixture = np.concatenate([share, self.weights[len(informed) :]])
+        kept, times = np.unique(self._evenly_drawn(KEPT), return_counts=True)
+        self._kept = self._all.only(kept)
+        self.mixture = np.concatenate([times / KEPT * (1.0 - self.ignorance), self.weights[len(informed) :]])
         self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
         self._at_data = self._prior(points, self._costs)
         self._factors = self._factorised(self._at_data, self._lengths, points)
@@ -218,20 +225,23 @@ class AveragedProcess:
             variances[j] = prior.spreads[j] ** 2 - np.einsum("ij,ij->j", V, V)
         return means, np.sqrt(np.maximum(variances, 1e-10)), NOISE + NOISE_GROWTH * np.clip(means, 0.0, 1.0)
 
+    def covariances(self, first: Array, second: Array) -> Array:
+        """Posterior covariances (components, m, k) of f between points (m, dimension) and others (k, dimension)."""
+        at_first, at_second = self._prior(first), self._prior(second)
+        found = _correlation(first, second, self._lengths)
+        found *= at_first.spreads[:, :, None] * at_second.spreads[:, None, :]
+        if len(self.points):
+            crosses = self._cross(at_first, first), self._cross(at_second, second)
+            for j, L in enumerate(self._factors):
+                V, W = (solve_triangular(L, cross[j].T, lower=True, check_finite=False) for cross in crosses)
+                found[j] -= V.T @ W
+        return np.asarray(found)
+
     def differences(self, points: Array, place: Array) -> Array:
         """Posterior deviations (components, m) of f(points) − f(place), place (dimension,)."""
-        both = np.concatenate([points, place[None, :]])
-        prior = self._prior(both)
-        own = _correlation(both, both[-1:], self._lengths)[:, :, 0] * prior.spreads * prior.spreads[:, -1:]
-        variance = prior.spreads**2
-        if len(self.points):
-            cross = self._cross(prior, both)
-            for j, L in enumerate(self._factors):
-                V = solve_triangular(L, cross[j].T, lower=True, check_finite=False)
-                own[j] -= V.T @ V[:, -1]
-                variance[j] -= np.einsum("ij,ij->j", V, V)
-        doubt = variance + variance[:, -1:] - 2.0 * own
-        return np.sqrt(np.maximum(doubt[:, :-1], 1e-12))
+        own = self.covariances(points, place[None, :])[:, :, 0]
+        deviations, at_place = self.components(points)[1], self.components(place[None, :])[1]
+        return np.sqrt(np.maximum(deviations**2 + at_place**2 - 2.0 * own, 1e-12))
 
     def _cross(self, prior: _Prior, points: Array) -> Array:
         correlation = _correlation(points, self.points, self._lengths)
@@ -275,16 +285,25 @@ class AveragedProcess:
 
     def drawn(self, count: int) -> tuple[Array, Array]:
         """Scales and shifts (count, dimension) of displacements drawn from the posterior, evenly by their weight."""
+        chosen = self._evenly_drawn(count)
+        return self._all.scales[chosen], self._all.shifts[chosen]
+
+    def _evenly_drawn(self, count: int) -> NDArray[np.int_]:
+        """Hypotheses (count,), drawn from the posterior at even steps of the weight, heaviest first."""
         weights = self.weights[: len(self._all.gains)]
         order = np.argsort(-weights, kind="stable")
         levels = (np.arange(count) + 0.5) / count * weights.sum()
-        chosen = order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)]
-        return self._all.scales[chosen], self._all.shifts[chosen]
+        return np.asarray(order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)])
 
     @property
     def heaviest(self) -> tuple[Hypotheses, Array]:
         """The hypotheses that predictions come from, and their weights."""
         return self._kept, self.mixture[: len(self._kept.gains)]
+
+
+def _least(simulated: GaussianProcess) -> Array:
+    """The simulated place (dimension,) that is expected to cost least."""
+    return np.asarray(simulated.points[int(np.argmin(simulated.predict(simulated.points)[0]))])
 
 
 def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:

@@ -6,8 +6,8 @@ With H pours to follow (4 at most), b the least expected cost of an action that 
     E clip(f(x), 0, 1) − H E (b − f(x)⁺)⁺
 
 so that a corner that would spill the load is looked at only where it may be better by more than the spill, and with
-nothing in hand much is tried. With a limit only actions count whose probability of exceeding it is small enough; where
-there is none, the one with the smallest.
+nothing in hand much is tried. Its place competes with those that tell of others, too (`lookahead.py`). With a limit
+only actions count whose probability of exceeding it is small enough; where there is none, the one with the smallest.
 
 What one more pour at x would be worth looks at differences to the best poured action x̂, for knowing both better helps
 only where it changes which is better, and no cost is below 0:
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from actors.optimizer.core import acquisition
 from actors.optimizer.core.asked import Asked, tuples
 from actors.optimizer.core.averaged import AveragedProcess, clipped_moments, shortfall
+from actors.optimizer.core.lookahead import looked_ahead
 from actors.optimizer.core.mismatch import Displacement, Mismatch, MismatchFound
 from actors.optimizer.core.problem import SuggestProblem
 from actors.optimizer.core.region import Feasibility, Region
@@ -66,11 +67,22 @@ def least_loss(
     """
     best = float(process.predict(known)[0].min()) / process.worst if len(known) else 0.0
     left = min(mismatch.left, FORESIGHT) if len(known) else 0
+    allowed = _allowed(process, mismatch, feasibility)
 
     def score(points: Array) -> Array:
         means, deviations, _ = process.components(points)
         saved = shortfall(best, means, deviations) - shortfall(0.0, means, deviations)
-        value = process.mixture @ (clipped_moments(means, deviations)[0] - left * saved)
+        return allowed(process.mixture @ (clipped_moments(means, deviations)[0] - left * saved), points)
+
+    return score
+
+
+def _allowed(
+    process: AveragedProcess, mismatch: Mismatch, feasibility: Feasibility | None
+) -> Callable[[Array, Array], Array]:
+    """What values (m,) of pours at points (m, dimension) become by the limit and by what may be refused."""
+
+    def changed(value: Array, points: Array) -> Array:
         if mismatch.limit is not None:
             over = process.exceedance(points, mismatch.limit.loss) - mismatch.limit.probability
             value = value + FORBIDDEN * np.maximum(over, 0.0)
@@ -79,7 +91,7 @@ def least_loss(
             value = made * value + (1.0 - made)
         return np.asarray(value)
 
-    return score
+    return changed
 
 
 def worth(process: AveragedProcess, points: Array, known: Array) -> Array:
@@ -166,6 +178,8 @@ def proposals(
     score = least_loss(process, problem.mismatch, known, feasibility)
     candidates = np.concatenate([candidates, known])
     pour = acquisition.minimise(score, candidates, asked.region, rng)
+    left, allowed = min(problem.mismatch.left, FORESIGHT), _allowed(process, problem.mismatch, feasibility)
+    pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
     beside = instructive(process, problem.count - 1, candidates, score, pour, asked.busy, asked.region)
     return np.concatenate([pour[None, :], beside])
 

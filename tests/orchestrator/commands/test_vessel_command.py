@@ -180,3 +180,10 @@ def test_no_file_is_written_over(tmp_path: Path) -> None:
     (tmp_path / "cup.yaml").write_text("name: cup\n")
     with pytest.raises(RefusalError, match="exists already"):
         vessel(tmp_path / "cup.yaml", Sources(), name=None, as_json=False)
+
+
+@pytest.mark.parametrize("name", ["12", "no"])
+def test_a_file_that_is_called_a_number_can_be_read(tmp_path: Path, name: str) -> None:
+    out = tmp_path / f"{name}.yaml"
+    vessel(out, callipers(bench("tumbler"), tmp_path), name=None, as_json=False)
+    assert load_vessel(out).name == name
