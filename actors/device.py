@@ -15,6 +15,15 @@ from actors.cluster.nodes import PinnedNode
 from actors.protocols import BenchLostError, LaboratoryError
 from actors.ray_class import actor_class
 
+LOOK_INTERVAL = 20.0
+"""Between looks whether a process that is asked something long is there at all [s]."""
+
+LOOK_DEADLINE = 60.0
+"""A process that was there once, and says nothing for so long, is lost [s]."""
+
+START_DEADLINE = 120.0
+"""So is one that has never been there [s]: machines may be busy while it starts."""
+
 
 class DeviceLostError(LaboratoryError):
     """The device's process died during a call, or doesn't answer: nobody knows how far the call came."""
@@ -97,14 +106,18 @@ class RayDevice:
         cls: the object's class, importable by workers.
         args: arguments of its constructor.
         node: the node of a cluster that it must run on.
+        looked_after: while a call waits, look now and then whether the process is there at all, and give up sooner than
+            at the deadline if not. For objects whose answers take minutes now and then, and seconds as a rule.
     """
 
-    def __init__(self, name: str, cls: type[Any], *args: Any, node: PinnedNode | None = None) -> None:
-        self.name = name
+    def __init__(
+        self, name: str, cls: type[Any], *args: Any, node: PinnedNode | None = None, looked_after: bool = False
+    ) -> None:
+        self.name, self._looked_after = name, looked_after
         self._class: Any = cls
         self._args, self._node = args, node
         self._actor: Any = None
-        self._lost = False
+        self._lost = self._met = False
         self._abandoned = ""
         self._calls: set[asyncio.Future[Any]] = set()
         self._start()
@@ -113,7 +126,7 @@ class RayDevice:
         placement = {} if self._node is None else self._node.options
         made = actor_class(self._class, (("work", 1), ("control", 2)))
         self._actor = made.options(num_cpus=0, **placement).remote(*self._args)
-        self._lost = False
+        self._lost = self._met = False
 
     async def call(self, method: str, *args: Any, deadline: float, urgent: bool = False) -> Any:
         """See `Device.call`."""
@@ -128,15 +141,15 @@ class RayDevice:
         future.add_done_callback(_seen)
         self._calls.add(future)
         future.add_done_callback(self._calls.discard)
-        done, _ = await asyncio.wait({future}, timeout=deadline)
-        if not done or future.cancelled():
+        waited = await self._waited(future, deadline)
+        if not future.done() or future.cancelled():
             self._check_ray()
             # It may hang for good; a new one is made before the next pour.
             self._lost = True
             with contextlib.suppress(Exception):
                 ray.kill(self._actor)
             await self._check_machine(method)
-            raise DeviceLostError(f"{self.name}: no answer to '{method}' within {deadline:g} s")
+            raise DeviceLostError(f"{self.name}: no answer to '{method}' within {waited:.3g} s")
         try:
             return future.result()
         except ray.exceptions.RayActorError as error:
@@ -147,6 +160,23 @@ class RayDevice:
             if isinstance(error.cause, LaboratoryError | ValueError):
                 raise error.cause from None
             raise LaboratoryError(f"{self.name}: '{method}' failed: {error.cause!r}") from error
+
+    async def _waited(self, future: asyncio.Future[Any], deadline: float) -> float:
+        """Wait for an answer until it is there, or not to be hoped for; how long that took [s]."""
+        clock = asyncio.get_running_loop().time
+        begin = clock()
+        while not future.done() and (left := begin + deadline - clock()) > 0.0:
+            await asyncio.wait({future}, timeout=min(left, LOOK_INTERVAL) if self._looked_after else left)
+            if future.done() or not self._looked_after or clock() - begin >= deadline:
+                break
+            look = asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
+            look.add_done_callback(_seen)
+            patience = LOOK_DEADLINE if self._met else START_DEADLINE
+            await asyncio.wait({future, look}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
+            if not look.done() and not future.done():
+                break
+            self._met = True
+        return clock() - begin
 
     def abandon(self, reason: str) -> None:
         """Whoever waits for an answer, or will ask, is told that none comes: Ray itself is gone.

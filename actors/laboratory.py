@@ -276,7 +276,9 @@ class RayLaboratory(_OpenLaboratory):
     async def _open_all(self) -> None:
         here = None if self._cluster is None else self._cluster.here
         self._pool = self._kept or self._open_pool()
-        self._optimizer = self._kept_optimizer or self._own_optimizer(RayDevice("optimiser", Proposer, node=here))
+        self._optimizer = self._kept_optimizer or self._own_optimizer(
+            RayDevice("optimiser", Proposer, node=here, looked_after=True)
+        )
         if not self._needs_bench:
             return
         node = None if self._cluster is None else self._cluster.bench

@@ -68,7 +68,7 @@ class WarmSimulators:
                 self._proposer = LocalDevice("optimiser", Proposer)
             else:
                 self._pool = pool = await self._open_ray()
-                self._proposer = proposer = RayDevice("optimiser", Proposer)
+                self._proposer = proposer = RayDevice("optimiser", Proposer, looked_after=True)
 
                 def died(reason: str) -> None:
                     pool.abandon(LaboratoryError(reason))

@@ -211,12 +211,36 @@ def test_a_class_is_made_one_of_actors_once_however_many_there_are(ray_running) 
         asyncio.run(one.close())
 
 
+def test_a_process_that_hangs_is_given_up_long_before_the_deadline(
+    ray_running: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from actors import device
+
+    monkeypatch.setattr(device, "LOOK_INTERVAL", 0.2)
+    monkeypatch.setattr(device, "LOOK_DEADLINE", 1.0)
+
+    async def ask() -> None:
+        counter = device.RayDevice("counter", Counter, looked_after=True)
+        assert await counter.call("add", 1.0, deadline=PATIENCE) == 1, "what takes longer than a look is waited for"
+        os.kill(await counter.pid(), signal.SIGSTOP)
+        with pytest.raises(device.DeviceLostError, match="no answer to 'add'"):
+            await counter.call("add", deadline=PATIENCE)
+        assert await counter.revive()
+        assert await counter.call("add", deadline=PATIENCE) == 1
+        await counter.close()
+
+    begin = time.monotonic()
+    asyncio.run(ask())
+    assert time.monotonic() - begin < PATIENCE / 2
+
+
 class Counter:
     """Counts."""
 
     def __init__(self) -> None:
         self._count = 0
 
-    def add(self) -> int:
+    def add(self, seconds: float = 0.0) -> int:
+        time.sleep(seconds)
         self._count += 1
         return self._count

@@ -53,7 +53,7 @@ class PooledRig(Rig):
     async def laboratory(self, life: Life) -> AsyncIterator[Any]:
         if self._pool is None:
             self._pool = RaySimulatorPool(SIMULATORS, make=Formula)
-            self._device = RayDevice("optimiser", Proposer)
+            self._device = RayDevice("optimiser", Proposer, looked_after=True)
         while len(await self._pool.pids()) < SIMULATORS:
             await asyncio.sleep(0.05)
         with contextlib.suppress(DeviceLostError):  # struck where nobody asked it any more
