@@ -3,6 +3,7 @@
 import taichi as ti
 
 from sim_engine.fluid.setup import SceneSetup
+from sim_engine.fluid.strength import adhesion, cohesion_acceleration, eddy_rate, pull_interval, relax_interval
 from sim_engine.fluid.table import SceneTable
 
 SUPPORT = 2.2
@@ -133,9 +134,6 @@ class FluidState:
 
 def of_parameters(setup: SceneSetup) -> dict[str, float]:
     """What θ_s of a scene is to the methods, by field."""
-    from sim_engine.fluid.tension import adhesion, cohesion_acceleration, pull_interval
-    from sim_engine.fluid.viscosity import eddy_rate, relax_interval
-
     theta, density, d = setup.parameters, setup.density, setup.spacing
     tension = theta.cohesion if setup.tension is None else setup.tension
     return {

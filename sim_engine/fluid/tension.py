@@ -20,8 +20,6 @@ Range: at 2.2 d, the density's support, drops of 2,000 particles are damped seve
 Source: ours; total variation as interfacial energy: Modica 1987; forces as exact gradients: Bonet & Lok 1999.
 """
 
-import math
-
 import taichi as ti
 
 from sim_engine.fluid.kernels import (
@@ -35,10 +33,9 @@ from sim_engine.fluid.kernels import (
 )
 from sim_engine.fluid.neighbours import list_widely
 from sim_engine.fluid.state import VESSELS
+from sim_engine.fluid.strength import RANGE
 from sim_engine.fluid.vectors import dot, length
 
-RANGE = 3.0
-"""Over spacing d."""
 ALONE = 3.0
 """Weight of the bonds that are missing. At 1 drops lose their density, at 2 and range 2.8 oscillations decay faster."""
 CALM = 0.1
@@ -47,11 +44,6 @@ BLUNT = 0.3
 """Rounds the energy off towards the bulk; the sharper, the shorter the intervals at which forces must act."""
 BONDED = 0.9
 """Bonds of a particle that lacks none, over those of a continuum."""
-SURFACE = 0.66
-"""Energy of what a spacing's square of a surface has, by the sums above: scales cohesion to the tension it names. From
-the frequency of drops (`sim_engine.validation.droplet`)."""
-CAPILLARY = 0.56
-"""Cohesion acts at intervals of at most that part of the capillary time; at 0.9 of it drops heat up."""
 LARGEST_PULL = 0.1
 """Cohesion moves a particle by at most so many spacings at a time: a strong tension at fine spacing stays stable."""
 
@@ -136,47 +128,3 @@ def pull(f: ti.template(), s, dt):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         change = strength * f.dv[i]
         f.v[i] = f.v[i] + ti.min(1.0, bound / (length(change) + 1e-9)) * change
-
-
-def pull_interval(tension: float, density: float, spacing: float) -> float:
-    """Longest time after which cohesion acts again: `CAPILLARY` of √(ρ d³ / (2π σ)) (Brackbill et al. 1992) [s].
-
-    Args:
-        tension: σ [N/m].
-        density: of the liquid [kg/m³].
-        spacing: d [m].
-    """
-    return CAPILLARY * math.sqrt(density * spacing**3 / (2.0 * math.pi * max(tension, 1e-9)))
-
-
-def cohesion_acceleration(tension: float, density: float, spacing: float) -> float:
-    """What one unit of the energies' slopes accelerates a particle with, σ d² / SURFACE / (ρ d³ · RANGE d) [m/s²].
-
-    Args:
-        tension: σ [N/m].
-        density: of the liquid [kg/m³].
-        spacing: d [m].
-    """
-    return tension / (SURFACE * RANGE * density * spacing**2)
-
-
-def adhesion(contact_angle: float, wall_distance: float) -> float:
-    """What walls attract particles with, in units of the energies' slopes; negative: they repel.
-
-    Layers that rest on a wall have the energy −σ cos θ per area of it, altogether.
-
-    Args:
-        contact_angle: θ [rad].
-        wall_distance: of the first layer at rest, in spacings.
-    """
-    cosine = math.cos(contact_angle)
-    if abs(cosine) < 1e-9:
-        return 0.0
-    reach = [1.0 - (wall_distance + k) / RANGE for k in range(math.ceil(RANGE))]
-    return cosine * SURFACE / sum(_wall_bond(u) for u in reach if u > 0.0)
-
-
-def _wall_bond(u: float) -> float:
-    """As `wall_bond`, of a number."""
-    series = 1.0 / 60.0 - u * (17.0 / 420.0 - u * (11.0 / 280.0 - u * (1.0 / 56.0 - u / 315.0)))
-    return 64.0 * math.pi * u**6 * series

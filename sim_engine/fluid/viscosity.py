@@ -12,16 +12,11 @@ Both are slow, and act only every few steps.
 Source: Schechter & Bridson 2012 (XSPH); Smagorinsky 1963, Lilly 1967; with particles: Dalrymple & Rogers 2006.
 """
 
-import math
-
 import taichi as ti
 
 from sim_engine.fluid.kernels import weight
 from sim_engine.fluid.state import SUPPORT
 from sim_engine.fluid.vectors import dot, length, square
-
-LONGEST_WAIT = 0.01
-"""Viscosity acts at least that often [s]."""
 
 
 @ti.func
@@ -53,17 +48,3 @@ def relax(f: ti.template(), s, dt):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
         f.v[i] = f.v[i] + f.dx[i] / ti.max(f.squares[i], 1.0)
-
-
-def eddy_rate(constant: float) -> float:
-    """Rate of relaxation over the rate at which a pair parts, from Smagorinsky's constant C."""
-    return 5.0 * constant**2 * math.sqrt(15.0)
-
-
-def relax_interval(viscosity: float) -> float:
-    """Time after which viscosity acts again, at most `LONGEST_WAIT` and a tenth of its own time [s].
-
-    Args:
-        viscosity: XSPH rate [1/s].
-    """
-    return min(LONGEST_WAIT, 0.1 / max(viscosity, 1e-9))

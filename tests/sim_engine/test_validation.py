@@ -242,7 +242,7 @@ def test_a_drop_oscillates_at_the_frequency_of_its_tension(simulator: PourSimula
 
 
 def test_a_thousand_particles_spill_as_fine_ones_do(simulator: PourSimulator) -> None:
-    measurements, figure = convergence.convergence(simulator, convergence.QUICK, (1_000,), 1, suite.PLAIN)
+    measurements, figure = convergence.convergence(simulator, convergence.QUICK, (1_000,), 2, suite.PLAIN)
     assert failures(measurements) == []
     assert len(measurements) == len(convergence.QUICK) + 2
     assert max(figure.series[0].x) == pytest.approx(measurements[-1].value)
