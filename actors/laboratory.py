@@ -245,7 +245,6 @@ class RayLaboratory(_OpenLaboratory):
     _cluster: JoinedCluster | None = None
     _liquid: RaySimulatorPool | None = None
     _watching: asyncio.Task[None] | None = None
-    _proposer: RayDevice | None = None
 
     async def __aenter__(self) -> RayLaboratory:
         from actors.ray_runtime import keep_signals, start_ray
@@ -277,11 +276,9 @@ class RayLaboratory(_OpenLaboratory):
     async def _open_all(self) -> None:
         here = None if self._cluster is None else self._cluster.here
         self._pool = self._kept or self._open_pool()
-        if self._kept_optimizer is None:
-            self._proposer = RayDevice("optimiser", Proposer, node=here, looked_after=True)
-            self._optimizer = self._own_optimizer(self._proposer)
-        else:
-            self._optimizer = self._kept_optimizer
+        self._optimizer = self._kept_optimizer or self._own_optimizer(
+            RayDevice("optimiser", Proposer, node=here, looked_after=True)
+        )
         if not self._needs_bench:
             return
         node = None if self._cluster is None else self._cluster.bench
@@ -327,8 +324,9 @@ class RayLaboratory(_OpenLaboratory):
         self._lose_bench(reason)
         if isinstance(self._pool, RaySimulatorPool):
             self._pool.abandon(LaboratoryError(reason))
-        if self._proposer is not None:
-            self._proposer.abandon(reason)  # arm and balance may answer yet: a pour under way may still be weighed
+        for device in self._devices:
+            if isinstance(device, RayDevice):
+                device.abandon(reason)
 
     def _ray_died(self, reason: str) -> None:
         self._tell(Notice("error", reason))
