@@ -3,13 +3,13 @@
     python benchmarks/quickstart.py [--seeds 20] [--first 101] [--arms shipped ...] [--laboratory FILE]
                                     [--into build/quickstart] [--write]
 
-The shipped campaign as it is; only θ* is not held against test pours, which the deployment does not hear of. A seed is a
-process of its own that ends with this one. Every simulated pour of a seed is kept under `--into`, by what was asked and the
-solver that answered, so that the arms of a seed share their calibration and whatever else they both ask for, pour for
-pour the same; finished runs are kept there, too, and an interrupted comparison goes on. `--write` makes no runs, and puts the
-table of those that are there into docs/optimiser.md.
+The shipped campaign as it is; only θ* is not held against test pours, which the deployment does not hear of. A seed is
+a process of its own that ends with this one. Every simulated pour of a seed is kept under `--into`, by what was asked
+and the solver that answered, so that the arms of a seed share their calibration and whatever else they both ask for,
+pour for pour the same; finished runs are kept there, too, and an interrupted comparison goes on. `--write` makes no
+runs, and puts the table of those that are there into docs/optimiser.md.
 
-Arms take something away from the program, for this benchmark only: there are no such settings.
+The other arms change the program, for this benchmark only: there are no such settings.
 
 Questions, written before it was run: no pour above 10 % after the first below 1 %? Four pours or fewer until it stops,
 in the median? Seeds below 100 are for tuning, those from 101 on for answers.
@@ -34,9 +34,11 @@ from typing import Any
 from machine import ROOT, run_self, say
 from players import interval
 
-from actors.optimizer.core import averaged, least_loss
+from actors.optimizer.core import averaged
+from actors.optimizer.core.mismatch import Mismatch
 from actors.simulation.in_process import InProcessSimulatorPool
 from orchestrator.codec import digest, from_json, to_json
+from orchestrator.strategies.deployment import d3
 from sim_engine.outcome import PourOutcome
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
@@ -47,24 +49,21 @@ BEGIN, END = "<!-- measured: quickstart -->\n", "<!-- end of measured -->"
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
-def _without_lookahead() -> None:
-    least_loss.looked_ahead = lambda process, pour, *others: pour
+def _with_lookahead() -> None:
+    def mismatch(*args: Any, **changes: Any) -> Mismatch:
+        return Mismatch(*args, **{**changes, "looks_ahead": True})
+
+    d3.Mismatch = mismatch  # type: ignore[assignment,misc]
 
 
 def _without_widths() -> None:
     averaged.WIDTH = 0.0
 
 
-def _with_neither() -> None:
-    _without_lookahead()
-    _without_widths()
-
-
 ARMS: dict[str, Callable[[], None]] = {
     "shipped": lambda: None,
-    "no look-ahead": _without_lookahead,
+    "look-ahead": _with_lookahead,
     "no widths": _without_widths,
-    "neither": _with_neither,
 }
 
 
@@ -201,11 +200,12 @@ def summary(runs: list[dict[str, Any]]) -> str:
         middle, low, high = (100 * value for value in interval(values))
         return f"{middle:.2f} % ({low:.2f} … {high:.2f}; median {100 * median(values):.2f} %)"
 
+    at = f", in the median at pour {median(reached):g}" if reached else ""
     return (
-        f"{len(runs)} seeds: no pour above 10 % after the first below 1 % in {none} of them; {median(stopped):g} pours in "
-        f"the median until it stops ({min(stopped):g} to {max(stopped):g}); below 1 % in {len(reached)} of them, in the "
-        f"median at pour {median(reached) if reached else math.nan:g}. In the mean a pour loses {mean('mean')}, the first one "
-        f"{mean('first')}, a run's worst {mean('worst')}, its best {mean('best')}, the recommended action {mean('final')}. "
+        f"{len(runs)} seeds: no pour above 10 % after the first below 1 % in {none} of them; {median(stopped):g} pours "
+        f"in the median until it stops ({min(stopped):g} to {max(stopped):g}); below 1 % in {len(reached)} of them{at}."
+        f" In the mean a pour loses {mean('mean')}, the first one {mean('first')}, a run's worst {mean('worst')}, "
+        f"its best {mean('best')}, the recommended action {mean('final')}. "
         f"{inside} of {len(pours)} pours ({100 * inside / max(len(pours), 1):.0f} %) lie in their 90 % bands."
     )
 
