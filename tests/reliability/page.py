@@ -89,7 +89,11 @@ def commit() -> str:
 
 
 def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
-    """All cases of some targets, so many processes at a time; whether all of them came to their end."""
+    """All cases of some targets, so many processes at a time; whether all of them came to their end.
+
+    How long that took is written down beside them.
+    """
+    begun, before = time.monotonic(), len(found(results))
     shares = {"program": jobs}  # of those with many cases; a process of each of the others
     tasks = [(target, n, shares.get(target, 1)) for target in targets for n in range(shares.get(target, 1))]
     running: list[subprocess.Popen[bytes]] = []
@@ -102,6 +106,10 @@ def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
         time.sleep(0.2)
         good &= all(process.returncode in (None, 0) for process in running)
         running = [process for process in running if process.poll() is None]
+    if good:
+        head = {"wall_s": round(time.monotonic() - begun), "jobs": jobs, "run": len(found(results)) - before}
+        with results.open("a", encoding="utf-8") as out:
+            out.write(json.dumps(head) + "\n")
     return good
 
 
@@ -113,6 +121,15 @@ def all_cases(results: Path) -> dict[str, int]:
     lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
     heads = [head for head in map(json.loads, lines) if "target" in head]
     return {head["target"]: head["cases"] for head in heads}
+
+
+def wall(results: Path) -> str:
+    """How long all cases took where they were run in one go; else nothing."""
+    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
+    heads = [head for head in map(json.loads, lines) if "wall_s" in head]
+    if not heads or heads[-1]["run"] < len(found(results)):
+        return ""
+    return f", and {heads[-1]['wall_s'] / 60:.0f} minutes by the clock with {heads[-1]['jobs']} at a time"
 
 
 def overview(rows: Sequence[dict[str, Any]], there_are: dict[str, int]) -> str:
@@ -129,8 +146,8 @@ def overview(rows: Sequence[dict[str, Any]], there_are: dict[str, int]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """By target and fault: how they ended, what was told and asked, what was wrong."""
+def table(rows: Sequence[dict[str, Any]], took: str) -> str:
+    """By target and fault: how they ended, what was told and asked, what was wrong; what all of it took."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         groups[row["case"]["target"], row["case"]["fault"]].append(row)
@@ -138,7 +155,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     cpu = sum(row["cpu_s"] for row in rows)
     lines = [
         f"{len(rows)} cases were run, {wrong} ended otherwise than they should. They took {cpu:.0f} seconds of a core: "
-        f"{cpu / 120:.0f} minutes of two.",
+        f"{cpu / 120:.0f} minutes of two{took}.",
         "",
         "| struck | fault | cases | the first life of the program | people at the bench were asked about | "
         "unknown pours, asked about | as undisturbed |",
@@ -177,7 +194,7 @@ def write(results: Path) -> int:
     page = PAGE.read_text(encoding="utf-8")
     for name, text in (
         ("all cases", overview(rows, all_cases(results))),
-        ("kill matrix", table(rows)),
+        ("kill matrix", table(rows, wall(results))),
         ("no meaning", reasons()),
     ):
         before, marker, rest = page.partition(BEGIN.format(name))
