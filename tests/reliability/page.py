@@ -88,7 +88,7 @@ def commit() -> str:
     return " ".join(word[:10] for word in said.split())
 
 
-def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
+def run(targets: Sequence[str], jobs: int, results: Path, limit: int | None = None) -> bool:
     """All cases of some targets, so many processes at a time; whether all of them came to their end.
 
     How long that took is written down beside them.
@@ -102,6 +102,7 @@ def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
         while tasks and len(running) < jobs:
             target, number, of = tasks.pop(0)
             arguments = ["--results", str(results), "--share", target, str(number), str(of)]
+            arguments += [] if limit is None else ["--limit", str(limit)]
             running.append(subprocess.Popen([sys.executable, "-m", "tests.reliability.page", *arguments], cwd=ROOT))
         time.sleep(0.2)
         good &= all(process.returncode in (None, 0) for process in running)
@@ -243,7 +244,7 @@ def main() -> None:
     options.results.parent.mkdir(exist_ok=True)
     if options.fresh:
         options.results.unlink(missing_ok=True)
-    good = options.write or run(options.only, options.jobs, options.results)
+    good = options.write or run(options.only, options.jobs, options.results, options.limit)
     sys.exit(1 if write(options.results) or not good else 0)
 
 
