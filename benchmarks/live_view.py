@@ -87,6 +87,7 @@ def main() -> None:
         "rows": rows,
     }
     arguments.to.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    print("\n".join(table(told)))
     if not arguments.only:
         fill(PAGE, told)
 
@@ -104,21 +105,26 @@ COLUMNS = {
 }
 
 
-def fill(page: Path, told: Mapping[str, Any]) -> None:
-    """Put the table between its marks on the page."""
+def table(told: Mapping[str, Any]) -> list[str]:
+    """The table and the line below it, as on the page."""
     lines = [f"| {' | '.join(COLUMNS.values())} |", f"|---|{'--:|' * (len(COLUMNS) - 1)}"]
     lines += [f"| {' | '.join(str(row[name]) for name in COLUMNS)} |" for row in told["rows"]]
     load = told["load"][0]
-    lines += [
+    return [
+        *lines,
         "",
         f"{told['seconds']:g} s for each case after {told['warm_up']:g} s of warming up, a loop of {told['rate_hz']:g} "
         f"Hz, {told['cores']} cores; load of the machine at the end {load:.1f}.",
     ]
+
+
+def fill(page: Path, told: Mapping[str, Any]) -> None:
+    """Put the table between its marks on the page."""
     before, mark, rest = page.read_text(encoding="utf-8").partition(BEGIN)
     _, end, after = rest.partition(END)
     if not mark or not end:
         raise SystemExit(f"{page}: the marks of the table are gone")
-    page.write_text(before + BEGIN + "\n" + "\n".join(lines) + "\n" + END + after, encoding="utf-8")
+    page.write_text(before + BEGIN + "\n" + "\n".join(table(told)) + "\n" + END + after, encoding="utf-8")
 
 
 @dataclass(frozen=True)

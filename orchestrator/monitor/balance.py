@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from actors.protocols import PourProgress
 from orchestrator.monitor import shapes
-from orchestrator.monitor.outlet import Outlet
+from orchestrator.monitor.films import Track
+from orchestrator.monitor.outlet import Outlet, columns_of
 from orchestrator.report import style
 from orchestrator.requests import Pour
 from sim_engine.action import ACTION_DIMENSIONS, Action
@@ -147,35 +148,41 @@ class BalanceStage:
             for name, value in zip(("low", "middle", "high"), running.band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
         for ended in ("net", "expected"):  # no line from one pour to the next
-            self._outlet.log(f"{PLACE}/{ended}", self._rr.Clear(recursive=True))
+            self._outlet.clear(f"{PLACE}/{ended}", recursive=True)
         return running
 
-    def beside(self, running: _Running | None, time: float, spilled: float | None, *, last: bool) -> None:
-        """What the balance showed at a moment of a pour, beside what simulations foretold.
+    def beside(self, running: _Running | None, times: FloatArray, spilled: FloatArray | None) -> list[Track]:
+        """What the balance showed in a pour, beside what simulations foretold.
 
         Args:
             running: the pour, as `finish` returned it.
-            time: since it began [s of bench time].
-            spilled: by the liquid of a virtual bench, by then [kg].
-            last: whether it is the end of its film.
+            times: of the pour's film, shape (T,) [s of bench time].
+            spilled: by the liquid of a virtual bench, by then, shape (T,) [kg].
         """
         if running is None:
-            return
-        if last and running.verdict is not None:
-            self._number("pour/verdict", running.verdict)
+            return []
+        tracks = []
         if running.band is not None:
             for name, curve in zip(("low", "middle", "high"), running.band, strict=True):
-                self._number(f"pour/{name}", float(np.interp(time, running.times, curve)))
+                tracks.append(self._curve(f"pour/{name}", times, np.interp(times, running.times, curve)))
         if spilled is not None:
-            self._number("pour/liquid", 1e3 * spilled)
-        if running.tilted is not None and np.isfinite(self._scale):
-            walls, grams = np.array(running.shown).T if running.shown else (np.zeros(0), np.zeros(0))
-            wall = running.tilted + time / self._scale
-            if len(walls) and wall <= walls[-1] + 1.0:
-                net = float(np.interp(wall, walls, grams)) - (running.tared or 0.0)
-                self._number("pour/weighed", net)
-        if last:
-            self._outlet.log(f"{PLACE}/pour", self._rr.Clear(recursive=True))
+            tracks.append(self._curve("pour/liquid", times, 1e3 * spilled))
+        if running.tilted is not None and np.isfinite(self._scale) and running.shown:
+            walls, grams = np.array(running.shown).T
+            at = running.tilted + times / self._scale
+            known = at <= walls[-1] + 1.0
+            net = np.interp(at[known], walls, grams) - (running.tared or 0.0)
+            tracks.append(self._curve("pour/weighed", times[known], net))
+        if running.verdict is not None:
+            tracks.append(self._curve("pour/verdict", times[-1:], np.array([running.verdict])))
+        return tracks
+
+    def told(self) -> None:
+        """The film of a pour is over."""
+        self._outlet.clear(f"{PLACE}/pour", recursive=True)
+
+    def _curve(self, name: str, times: FloatArray, values: FloatArray) -> Track:
+        return Track(f"{PLACE}/{name}", times, columns_of(self._rr.Scalars.columns(scalars=values)))
 
     def _foretold(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
         known = self._simulated.get(pour.scene, [])
@@ -195,7 +202,7 @@ class BalanceStage:
         return times, np.stack([curves.min(axis=0), np.median(curves, axis=0), curves.max(axis=0)])
 
     def _number(self, name: str, value: float) -> None:
-        self._outlet.log(f"{PLACE}/{name}", self._rr.Scalars(float(value)))
+        self._outlet.number(f"{PLACE}/{name}", float(value))
 
 
 def _numbers(values: Mapping[str, float | None]) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from actors.arm.figure import ArmFigure
 from actors.protocols import PourProgress
 from orchestrator.monitor import shapes
-from orchestrator.monitor.films import Films
-from orchestrator.monitor.outlet import Outlet
+from orchestrator.monitor.films import Film, Films, Track
+from orchestrator.monitor.outlet import Moment, Outlet
 from orchestrator.monitor.simulated import MAXIMUM_RATE
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
@@ -58,6 +58,7 @@ class Cell:
         self.time_scale = max(scales, default=1.0) or float("inf")
         self._shown: dict[str, str] = {}
         self._trail: list[list[float]] = []
+        self._moves: list[tuple[Moment, tuple[float, ...]]] = []
         self._liquid: RecordedFrames | None = None
         self._stands: tuple[float, ...] = ()
         outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
@@ -86,7 +87,7 @@ class Cell:
             # Where it waits, until it moves; what it looks like never changes.
             self._outlet.times(wall=time.time(), step=0, sim_time=0.0)
             self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
-            self._outlet.log(f"{PLACE}/arm", shapes.stance(home))
+            self._outlet.rows(f"{PLACE}/arm", [self._outlet.now], shapes.stances(home[None]))
         self._outlet.log(
             f"{PLACE}/table",
             rr.Boxes3D(
@@ -102,12 +103,13 @@ class Cell:
 
     def begin(self, pour: Pour, scene: Scene) -> None:
         """A pour begins: its vessels stand there, and its path is planned."""
+        self.show()
         self._trail, self._liquid = [], None
         self._stand("pourer", scene.pourer)
         self._stand("receiver", scene.receiver)
-        self._outlet.log(f"{PLACE}/liquid", self._rr.Clear(recursive=False))
+        self._outlet.clear(f"{PLACE}/liquid")
         self._outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
-        self._outlet.log(f"{PLACE}/path/executed", self._rr.Clear(recursive=False))
+        self._outlet.clear(f"{PLACE}/path/executed")
         planned = planned_poses(scene, pour)
         if planned is None:
             return
@@ -125,23 +127,30 @@ class Cell:
             return
         self._stands = stands
         if told.joints and self._figure is not None:
-            self._move(np.array(told.joints))
+            self._moves.append((self._outlet.now, told.joints))
         elif told.pourer:
             self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
-            self._trail.append(list(told.pourer[:3]))
-        else:
-            return
-        if len(self._trail) % TRAILING == 2 and self.time_scale <= SLOW:
-            self._outlet.log(f"{PLACE}/path/executed", self._line(np.array(self._trail), style.MEASURED, 3e-3))
+            self._follow(told.pourer[:3], self._outlet.now)
 
-    def _move(self, joints: FloatArray) -> None:
-        figure = self._figure
-        assert figure is not None
-        self._outlet.log(f"{PLACE}/arm", shapes.stance(figure.ends(joints)))
-        tool, pourer = figure.tool(joints[None])[0], figure.pourer(joints[None])[0]
-        self._outlet.log(f"{PLACE}/tool", shapes.placed(tool))
-        self._outlet.log(f"{PLACE}/pourer", shapes.placed(pourer))
-        self._trail.append([float(value) for value in tool[:3]])
+    def show(self) -> None:
+        """Show how the arm has moved. Several stances are worked out and sent in the time of one."""
+        if not self._moves or (figure := self._figure) is None:
+            return
+        moments, joints = [at for at, _ in self._moves], np.array([where for _, where in self._moves])
+        self._moves = []
+        tools = figure.tool(joints)
+        self._outlet.rows(f"{PLACE}/arm", moments, shapes.stances(figure.ends(joints)))
+        self._outlet.rows(f"{PLACE}/tool", moments, shapes.places(tools))
+        self._outlet.rows(f"{PLACE}/pourer", moments, shapes.places(figure.pourer(joints)))
+        for at, tool in zip(moments, tools, strict=True):
+            self._follow(tool[:3], at)
+
+    def _follow(self, place: Sequence[float] | FloatArray, at: Moment) -> None:
+        """The path that was executed, as far as that [m]."""
+        self._trail.append([float(value) for value in place])
+        if len(self._trail) % TRAILING == 2 and self.time_scale <= SLOW:
+            line = self._line(np.array(self._trail), style.MEASURED, 3e-3)
+            self._outlet.log(f"{PLACE}/path/executed", line, at=at)
 
     # ---- a pour that is over
 
@@ -152,7 +161,8 @@ class Cell:
         *,
         now: float,
         step: int,
-        beside: Callable[[float, float | None, bool], object],
+        beside: Callable[[FloatArray, FloatArray | None], Sequence[Track]],
+        told: Callable[[], object],
     ) -> None:
         """Show what was done and what the liquid did.
 
@@ -161,9 +171,11 @@ class Cell:
             measured: what came of it.
             now: on the wall clock [s since 1970].
             step: of the campaign.
-            beside: logs what else there is to say of a moment of the pour [s], and of what a virtual bench's liquid has
-                spilled by then [kg], where that is known; and whether it is the last one.
+            beside: what else there is to say of moments of the pour (T,) [s], and of what a virtual bench's liquid has
+                spilled by then (T,) [kg], where that is known.
+            told: called when all that has been shown.
         """
+        self.show()
         moves = self._executed(measured)
         liquid, self._liquid = self._liquid, None
         if moves is None and liquid is None:
@@ -172,25 +184,19 @@ class Cell:
         if self.time_scale <= SLOW and liquid is None:
             return  # it was seen as it was made
         times = np.arange(0.0, max(ends) + 0.5 / MAXIMUM_RATE, 1.0 / MAXIMUM_RATE)
-        radius = 0.0 if liquid is None else 0.5 * shapes.spacing(liquid.positions[0], scene.liquid.volume)
         path = self._path(moves, liquid)
+        tracks = [] if moves is None else self._moved(times, *moves)
+        spilled = None
+        if liquid is not None:
+            shown, share = self._poured(times, liquid, scene.liquid.volume, posed=moves is None)
+            tracks, spilled = [*tracks, *shown], share * measured.loaded
+        tracks += beside(times, spilled)
 
-        def frame(moment: float, *, first: bool, last: bool) -> Callable[[], None]:
-            def log() -> None:
-                if first and len(path) > 1:
-                    self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
-                if moves is not None:
-                    self._move(np.array([np.interp(moment, moves[0], column) for column in moves[1].T]))
-                spilled = None
-                if liquid is not None:
-                    share = self._pour(liquid, moment, radius, posed=moves is None)
-                    spilled = share * measured.loaded
-                beside(moment, spilled, last)
+        def begin() -> None:
+            if len(path) > 1:
+                self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
 
-            return log
-
-        moments = [frame(float(t), first=t == times[0], last=t == times[-1]) for t in times]
-        self._films.add(now, step, [float(moment) for moment in times], moments)
+        self._films.add(now, step, Film(float(times[-1]), tracks, begin, told))
 
     def _executed(self, measured: PourMeasurement) -> tuple[FloatArray, FloatArray] | None:
         record = measured.notes.get("executed")
@@ -201,14 +207,35 @@ class Cell:
             return self._figure.tool(moves[1][::5])[:, :3]
         return np.zeros((0, 3)) if liquid is None else np.asarray(liquid.pourer_poses, float)[:, :3]
 
-    def _pour(self, liquid: RecordedFrames, moment: float, radius: float, *, posed: bool) -> float:
-        """Show the liquid at a moment; returns the share of it that is spilled."""
-        index = int(np.clip(np.searchsorted(liquid.times, moment + 1e-6) - 1, 0, len(liquid.times) - 1))
-        states = np.asarray(liquid.states[index])
-        self._outlet.log(f"{PLACE}/liquid", shapes.particles(liquid.positions[index], states, radius))
+    def _moved(self, times: FloatArray, known: FloatArray, joints: FloatArray) -> list[Track]:
+        """The arm at moments (T,) [s] of a pour, whose joints (K, n) [rad] are known at others (K,) [s]."""
+        figure = self._figure
+        assert figure is not None
+        stands = np.column_stack([np.interp(times, known, column) for column in joints.T])
+        some = shapes.changes(stands)
+        when, stands = times[some], stands[some]
+        return [
+            Track(f"{PLACE}/arm", when, shapes.stances(figure.ends(stands))),
+            Track(f"{PLACE}/tool", when, shapes.places(figure.tool(stands))),
+            Track(f"{PLACE}/pourer", when, shapes.places(figure.pourer(stands))),
+        ]
+
+    def _poured(
+        self, times: FloatArray, liquid: RecordedFrames, volume: float, *, posed: bool
+    ) -> tuple[list[Track], FloatArray]:
+        """The liquid at moments (T,) [s]; and the share of it that is spilled by then, shape (T,)."""
+        radius = 0.5 * shapes.spacing(liquid.positions[0], volume)
+        kept = np.asarray(liquid.times, dtype=float)
+        at = np.clip(np.searchsorted(kept, times + 1e-6, side="left") - 1, 0, len(kept) - 1)
+        some = shapes.changes(at[:, None].astype(float))  # it is kept less often, or not as long
+        states = {int(index): np.asarray(liquid.states[index]) for index in at}
+        swarms = shapes.swarms([liquid.positions[i] for i in at[some]], [states[int(i)] for i in at[some]], radius)
+        tracks = [Track(f"{PLACE}/liquid", times[some], swarms)]
         if posed:
-            self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.asarray(liquid.pourer_poses[index], float)))
-        return float(np.mean(states == ParticleState.SPILLED))
+            poses = np.asarray(liquid.pourer_poses, float)[at]
+            tracks.append(shapes.moving(f"{PLACE}/pourer", times, poses))
+        spilled = {index: float(np.mean(each == ParticleState.SPILLED)) for index, each in states.items()}
+        return tracks, np.array([spilled[int(index)] for index in at])
 
     # ---- how
 

@@ -38,7 +38,7 @@ SLICING_INTERVAL = 180.0
 """As `DRAWING_INTERVAL`, for pictures whose surrogate has to be fitted once more [s]."""
 
 DRAWING_INTERVAL = 45.0
-"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.4 s of a
+"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.25 s of a
 core, which has to stay about a hundredth of it."""
 
 
@@ -194,4 +194,4 @@ class LearningStage:
                 else self._rr.SeriesLines(names=name, colors=shapes.rgb(colour), widths=width)
             )
             self._outlet.log(entity, looks, static=True)
-        self._outlet.log(entity, self._rr.Scalars(float(value)))
+        self._outlet.number(entity, float(value))

@@ -124,4 +124,4 @@ class Machine:
         self._number("load/queue", max(running - self._simulators, 0))
 
     def _number(self, name: str, value: float) -> None:
-        self._outlet.log(f"{PLACE}/{name}", self._rr.Scalars(float(value)))
+        self._outlet.number(f"{PLACE}/{name}", float(value))

@@ -25,8 +25,12 @@ _DPI = 80
 
 def png(figure: Figure) -> bytes:
     """A figure as the bytes of a PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI, facecolor="white")
+    figure.set_dpi(_DPI)
+    # `savefig` would draw it twice, the first time for what only other formats need.
+    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
     return buffer.getvalue()
 
 
@@ -45,7 +49,8 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
     columns = [space.names.index(name) for name in plane.names]
     mean, deviation = (unit.factor * np.asarray(grid, float) for grid in (surrogate.mean, surrogate.deviation))
     bound = mean - problem.kappa * deviation
-    figure, axes = style.new_figure(1, 3, size=(15.0, 5.2))
+    figure, axes = style.new_figure(1, 3, size=(15.0, 5.2), layout=None)
+    figure.subplots_adjust(left=0.065, right=0.955, bottom=0.13, top=0.85, wspace=0.18)
     held = style.display_values(dict(surrogate.held(space)))
     figure.suptitle(f"{title}{f'   (held: {held})' if held else ''}", fontsize=17, color=style.INK, x=0.01, ha="left")
     panels = (
@@ -60,7 +65,7 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
     grid = [[axis.decode(u) / scale for u in places] for axis, scale in zip((across, up), scales, strict=True)]
     for panel, (name, values, colours) in zip(axes, panels, strict=True):
         picture = panel.pcolormesh(*grid, values, shading="nearest", cmap=colours, zorder=0, rasterized=True)
-        bar = figure.colorbar(picture, ax=panel, pad=0.02)
+        bar = figure.colorbar(picture, ax=panel, pad=0.03, fraction=0.06)
         bar.ax.tick_params(labelsize=13)
         for points, look in (
             (simulated, {"marker": "o", "s": 14, "facecolor": "none", "edgecolor": style.INK}),
@@ -74,7 +79,7 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
         panel.set_xlabel(style.label(across.name), fontsize=14)
         style.frame(panel, across, "x")
         style.frame(panel, up, "y")
-        panel.tick_params(labelsize=13)
+        panel.tick_params(labelsize=13, labelleft=panel is axes[0])
     axes[0].set_ylabel(style.label(up.name), fontsize=14)
     axes[1].set_xlabel(f"{style.label(across.name)}      {_key(problem, suggestion)}", fontsize=14)
     return figure

@@ -6,6 +6,7 @@ films of simulations and pours lie one behind the other.
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -78,17 +79,22 @@ class CampaignRecording:
         self._decided = ""
 
     @property
-    def next_due(self) -> float | None:
-        """When `play` has something to do next [s since 1970]; None: nothing is planned."""
-        return self._films.next_due
+    def wait(self) -> float | None:
+        """How long `play` has nothing to do [s]; None: until there are events."""
+        film = self._films.next_due
+        waits = (None if film is None else max(film - time.time(), 0.0), self._outlet.wait)
+        return min((each for each in waits if each is not None), default=None)
 
-    def play(self, now: float) -> None:
-        """Write what is due by now."""
-        self._films.play(now)
+    def play(self) -> None:
+        """Write what is due by now. Best not after each event, but after what has come in half a second."""
+        self._films.play(time.time())
+        self._cell.show()
+        self._outlet.send()
 
     def close(self, dropped: int = 0) -> None:
         """Complete the recording; `dropped` events never came."""
         self._films.play(float("inf"))
+        self._cell.show()
         if dropped:
             self.missed(dropped)
             self._machine.line(f"{dropped} events are missing: the recording could not keep up", "warning", "recording")
@@ -202,7 +208,8 @@ class CampaignRecording:
                     measured,
                     now=event.time,
                     step=self._step,
-                    beside=lambda time, spilled, last: self._balance.beside(shown, time, spilled, last=last),
+                    beside=lambda times, spilled: self._balance.beside(shown, times, spilled),
+                    told=self._balance.told,
                 )
             case Suggest() as request, Suggested() as outcome:
                 self._learning.suggested(event, request, outcome)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orchestrator.monitor.films import Track
+from orchestrator.monitor.outlet import Columns, columns_of
 from orchestrator.report import style
 
 if TYPE_CHECKING:
@@ -62,6 +65,25 @@ def placed(pose: FloatArray) -> Any:
     return rr.Transform3D(translation=pose[:3], quaternion=turn)
 
 
+def places(poses: FloatArray) -> Columns:
+    """Poses (T, 7) as transforms at T moments."""
+    import rerun as rr
+
+    return columns_of(rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]]))
+
+
+def moving(entity: str, times: FloatArray, poses: FloatArray) -> Track:
+    """What moves along poses (T, 7) at times (T,) [s]; while it rests nothing is said."""
+    some = changes(poses)
+    return Track(entity, times[some], places(poses[some]))
+
+
+def changes(rows: FloatArray) -> NDArray[np.intp]:
+    """Which rows (T, n) differ from the one before; the first does, and the last is taken for one that does."""
+    differs = np.any(np.abs(np.diff(rows, axis=0)) > 1e-6, axis=1)
+    return np.flatnonzero([True, *differs[:-1], True] if len(differs) else [True])
+
+
 def bars(figure: ArmFigure, ends: FloatArray) -> Any:
     """What an arm's links look like, however they stand: capsules as long as they always are.
 
@@ -81,22 +103,23 @@ def bars(figure: ArmFigure, ends: FloatArray) -> Any:
     )
 
 
-def stance(ends: FloatArray) -> Any:
-    """Where an arm's links are; what they look like is `bars`.
+def stances(ends: FloatArray) -> Columns:
+    """Where an arm's links are at some moments; what they look like is `bars`.
 
     Args:
-        ends: of its bars, shape (bars, 2, 3) [m].
+        ends: of its bars, shape (T, bars, 2, 3) [m].
     """
     import rerun as rr
 
-    along = ends[:, 1] - ends[:, 0]
-    axes = along / np.maximum(np.linalg.norm(along, axis=-1), 1e-9)[:, None]
+    along = ends[..., 1, :] - ends[..., 0, :]
+    axes = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
     # A capsule lies along z; how it is turned about itself nobody sees. The turn from z to an axis a is the quaternion
     # (z × a, 1 + z · a), but for an axis straight down, where any half turn will do.
-    turns = np.column_stack([-axes[:, 1], axes[:, 0], np.zeros(len(axes)), 1.0 + axes[:, 2]])
-    turns[turns[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
+    turns = np.stack([-axes[..., 1], axes[..., 0], np.zeros(axes.shape[:-1]), 1.0 + axes[..., 2]], axis=-1)
+    turns[turns[..., 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
     turns /= np.linalg.norm(turns, axis=-1, keepdims=True)
-    return rr.Capsules3D.from_fields(translations=ends[:, 0], quaternions=turns)
+    columns = rr.Capsules3D.columns(translations=ends[..., 0, :].reshape(-1, 3), quaternions=turns.reshape(-1, 4))
+    return columns_of(columns.partition([ends.shape[1]] * len(ends)))
 
 
 def fates() -> Any:
@@ -111,13 +134,14 @@ def fates() -> Any:
     )
 
 
-def particles(positions: NDArray[np.float32], states: NDArray[np.uint8], radius: float) -> Any:
-    """Particles by their fate, positions (N, 3) [m]."""
+def swarms(positions: Sequence[NDArray[np.float32]], states: Sequence[NDArray[np.uint8]], radius: float) -> Columns:
+    """Particles by their fate at some moments, positions (N, 3) [m] and states (N,) for each."""
     import rerun as rr
 
-    return rr.Points3D(
-        np.asarray(positions, dtype=np.float32), radii=radius, class_ids=np.asarray(states, dtype=np.uint16)
-    )
+    places = np.concatenate([np.asarray(each, np.float32) for each in positions])
+    fate = np.concatenate([np.asarray(each, np.uint16) for each in states])
+    points = rr.Points3D.columns(positions=places, class_ids=fate).partition([len(each) for each in positions])
+    return columns_of(points, rr.Points3D.columns(radii=np.full(len(positions), radius, np.float32)))
 
 
 def spacing(positions: NDArray[np.float32], volume: float) -> float:

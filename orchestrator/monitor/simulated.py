@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from orchestrator.monitor import shapes
-from orchestrator.monitor.films import Films
-from orchestrator.monitor.outlet import Outlet
+from orchestrator.monitor.films import Film, Films, Track
+from orchestrator.monitor.outlet import Outlet, columns_of
 from orchestrator.report import style
 from sim_engine.simulated import RecordedFrames
 from sim_engine.task import Scene
@@ -55,24 +53,22 @@ class SimulatedStage:
             return
         radius = 0.5 * shapes.spacing(frames.positions[0], scene.liquid.volume)
         kept = thinned(times)
-
-        def frame(index: int, *, first: bool, last: bool) -> Callable[[], None]:
-            def log() -> None:
-                if first:
-                    self._set(scene, title)
-                self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.asarray(frames.pourer_poses[index], float)))
-                states = np.asarray(frames.states[index])
-                self._outlet.log(f"{PLACE}/liquid", shapes.particles(frames.positions[index], states, radius))
-                shares = 100.0 * np.bincount(states, minlength=5) / max(len(states), 1)
-                for state in range(len(SHARES)):
-                    self._outlet.log(f"{PLACE}/share/{state}", self._rr.Scalars(float(shares[state])))
-                if last:
-                    self._outlet.log(f"{PLACE}/share", self._rr.Clear(recursive=True))  # no line to the next film
-
-            return log
-
-        moments = [frame(i, first=i == kept[0], last=i == kept[-1]) for i in kept]
-        self._films.add(now, step, [float(times[index]) for index in kept], moments)
+        moments = times[kept] - times[kept[0]]
+        states = [np.asarray(frames.states[index]) for index in kept]
+        shares = [100.0 * np.bincount(each, minlength=5) / max(len(each), 1) for each in states]
+        poses = np.asarray([frames.pourer_poses[index] for index in kept], float)
+        liquid = shapes.swarms([frames.positions[index] for index in kept], states, radius)
+        tracks = [shapes.moving(f"{PLACE}/pourer", moments, poses), Track(f"{PLACE}/liquid", moments, liquid)]
+        for state, share in enumerate(np.transpose(shares)[: len(SHARES)]):
+            curve = columns_of(self._rr.Scalars.columns(scalars=share))
+            tracks.append(Track(f"{PLACE}/share/{state}", moments, curve))
+        film = Film(
+            float(moments[-1]),
+            tracks,
+            begin=lambda: self._set(scene, title),
+            end=lambda: self._outlet.clear(f"{PLACE}/share", recursive=True),  # no line to the next film
+        )
+        self._films.add(now, step, film)
 
     def _set(self, scene: Scene, title: str) -> None:
         self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from orchestrator.monitor.outlet import SENDING
+
 if TYPE_CHECKING:
     from orchestrator.monitor.recording import CampaignRecording
     from orchestrator.plan import CampaignPlan
@@ -79,6 +81,9 @@ def main() -> None:
 class Writing:
     """Hands events to a recording, and what it has planned for later at its time.
 
+    It does so in rounds, each at least `SENDING` after the one before: whoever watches is shown nothing sooner, and to
+    wake up for each event costs as much as to draw it.
+
     Args:
         recording: that takes them.
     """
@@ -86,6 +91,8 @@ class Writing:
     def __init__(self, recording: CampaignRecording) -> None:
         self._recording = recording
         self._queue: queue.Queue[Any] = queue.Queue(maxsize=WAITING)
+        self._hurry = threading.Event()
+        self._next_round = 0.0
         self.failed = 0
         self.problem = ""
 
@@ -96,23 +103,39 @@ class Writing:
             'failed': events that could not be drawn; 'problem': the first reason.
         """
         threading.Thread(target=self._read, args=(source,), daemon=True).start()
-        while not isinstance(item := self._next(), Closing):
-            if isinstance(item, Missed):
-                self._recording.missed(item.dropped)
-            elif item is not None:
-                self._guard(lambda item=item: self._recording.handle(item))  # type: ignore[misc]
-            self._guard(lambda: self._recording.play(time.time()))
-        self._guard(lambda: self._recording.close(item.dropped))
-        self._guard(lambda: optimise(self._recording.path))
-        return {"failed": self.failed, "problem": self.problem}
+        while True:
+            for item in self._round():
+                if isinstance(item, Closing):
+                    self._guard(lambda item=item: self._recording.close(item.dropped))  # type: ignore[misc]
+                    self._guard(lambda: optimise(self._recording.path))
+                    return {"failed": self.failed, "problem": self.problem}
+                if isinstance(item, Missed):
+                    self._recording.missed(item.dropped)
+                else:
+                    self._guard(lambda item=item: self._recording.handle(item))  # type: ignore[misc]
+                if not self._pause:  # much has come, or there was much to draw
+                    self._guard(self._recording.play)
+                    self._next_round = time.monotonic() + SENDING
+            self._guard(self._recording.play)
 
-    def _next(self) -> Any:
-        """The next message; None when something planned is due before."""
-        due = self._recording.next_due
-        try:
-            return self._queue.get(timeout=None if due is None else max(due - time.time(), 0.0))
-        except queue.Empty:
-            return None
+    def _round(self) -> list[Any]:
+        """What has come since the round before, once there is something to do."""
+        items, wait = [], self._recording.wait
+        with contextlib.suppress(queue.Empty):
+            items.append(self._queue.get(timeout=None if wait is None else max(wait, self._pause)))
+        if not items or not isinstance(items[0], Closing):
+            self._hurry.wait(self._pause)
+        self._hurry.clear()
+        with contextlib.suppress(queue.Empty):
+            while len(items) < WAITING:
+                items.append(self._queue.get_nowait())
+        self._next_round = time.monotonic() + SENDING
+        return items
+
+    @property
+    def _pause(self) -> float:
+        """Until the next round [s]."""
+        return max(self._next_round - time.monotonic(), 0.0)
 
     def _read(self, source: IO[bytes]) -> None:
         last: Any = Closing(0)
@@ -122,13 +145,17 @@ class Writing:
                 if isinstance(item, Closing):
                     last = item
                     return
+                if self._queue.full():
+                    self._hurry.set()
                 self._queue.put(item)
         except (EOFError, OSError):
             return  # whoever sent is dead
         except Exception as error:  # half a message, or one that can't be read here
             self._note(error)
         finally:
+            self._hurry.set()
             self._queue.put(last)
+            self._hurry.set()
 
     def _guard(self, action: Callable[[], object]) -> None:
         try:

@@ -90,11 +90,17 @@ def safe_name(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "_"
 
 
-def new_figure(rows: int = 1, columns: int = 1, *, size: tuple[float, float], **kwargs: Any) -> tuple[Figure, Any]:
+Layout = Literal["constrained"] | None
+
+
+def new_figure(
+    rows: int = 1, columns: int = 1, *, size: tuple[float, float], layout: Layout = "constrained", **kwargs: Any
+) -> tuple[Figure, Any]:
     """A figure of our look, without a window system.
 
     Args:
         size: width and height [inch].
+        layout: who finds room for labels; None: the caller, since Matplotlib takes longer for it than for the drawing.
 
     Returns:
         The figure and what `Figure.subplots` returns (axes, or an array of them).
@@ -103,7 +109,7 @@ def new_figure(rows: int = 1, columns: int = 1, *, size: tuple[float, float], **
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained", facecolor="white")
+    figure = Figure(figsize=size, dpi=DPI, layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, **kwargs)
 

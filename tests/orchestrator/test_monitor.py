@@ -15,20 +15,24 @@ from matplotlib.collections import PathCollection, QuadMesh
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.optimizer.core.propose import propose
 from actors.optimizer.core.slices import slices
-from orchestrator.events import LogLine, RequestFinished
+from actors.protocols import PourProgress
+from orchestrator.config.load import load_campaign
+from orchestrator.events import LogLine, PourProgressed, RequestFinished, RequestStarted
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.monitor.pictures import slices_picture, surrogate_picture
 from orchestrator.monitor.recording import CampaignRecording
 from orchestrator.monitor.simulation import simulation_rrd
 from orchestrator.monitor.worker import QueueThread
 from orchestrator.report.units import DISCREPANCY
-from orchestrator.requests import Simulate, Simulated, Suggest, Suggested
+from orchestrator.requests import Pour, Simulate, Simulated, Suggest, Suggested
 from sim_engine.liquid import SimulationParameters
 from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.space import Axis, Space
 from tests.orchestrator import watched
 from tests.orchestrator.recorded import Contents
 from tests.patience import PATIENCE
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +177,46 @@ def test_vessels_are_there_on_the_wall_clock_even_if_their_first_film_was_not(tm
     contents = Contents(recording.path)
     assert contents.rows("/simulation/pourer/mesh", "sim_time") == 2
     assert contents.rows("/simulation/pourer/mesh", "wall") == 1
+
+
+def test_curves_of_a_film_end_with_it(recorded: Contents) -> None:
+    def rows(entity: str) -> list[tuple[int, object]]:
+        columns = recorded.columns[entity]
+        times, sent = sorted(columns["sim_time"]), sorted(columns["rerun.controls.RowId"])  # type: ignore[type-var]
+        return list(zip(times, sent[-len(times) :], strict=True))  # type: ignore[arg-type]
+
+    (ended, _) = rows("/simulation/share")
+    # Of rows with the same time that counts which was sent last.
+    assert rows("/simulation/share/0")[30][0] == ended[0]
+    assert rows("/simulation/share/0")[30][1] < ended[1] < rows("/simulation/share/0")[31][1]  # type: ignore[operator]
+
+
+def test_arm_stands_at_each_moment_where_its_joints_put_it(tmp_path: Path) -> None:
+    plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml")
+    assert plan.laboratory.arm is not None
+    assert plan.deployment is not None
+    recording, figure = CampaignRecording(tmp_path / "campaign.rrd", plan), plan.laboratory.arm.figure()
+    scene = plan.deployment.scenes[0]
+    pour = Pour(scene.name, scene.action({"angular_velocity": 1.5, "x_offset": 0.1}), 1, 1)
+    recording.handle(RequestStarted(time=1e6, stage="deployment", id=1, request=pour))
+    joints = [tuple(value + 0.1 * turned for value in figure.home) for turned in (0, 1, 1, 1, 2)]
+    for tenth, stand in enumerate(joints):
+        progress = PourProgress("tilt", 0.5, 0.1 * tenth, 1e-3 * tenth, stable=False, joints=stand)
+        recording.handle(PourProgressed(time=1e6 + 0.1 * tenth, stage="deployment", id=1, number=1, progress=progress))
+    recording.close()
+    contents = Contents(recording.path)
+    feet = dict(
+        zip(
+            (int(1e-8 * ns) for ns in contents.columns["/cell/arm"]["wall"]),  # type: ignore[operator]
+            contents.values("/cell/arm", "Capsules3D:translations"),
+            strict=True,
+        )
+    )
+    for tenth, stand in ((0, joints[0]), (1, joints[1]), (4, joints[4])):
+        assert np.allclose(feet.pop(10_000_000 + tenth), figure.ends(np.array(stand))[:, 0], atol=1e-6)
+    assert 10_000_002 not in feet, "while it rests nothing is said"
+    shown = contents.values("/balance/shown", "Scalars:scalars")
+    assert [row[0] for row in shown] == pytest.approx([0.0, 1.0, 2.0, 3.0, 4.0])  # type: ignore[index]
 
 
 def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> None:
