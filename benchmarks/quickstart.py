@@ -53,7 +53,7 @@ def _with_lookahead() -> None:
     def mismatch(*args: Any, **changes: Any) -> Mismatch:
         return Mismatch(*args, **{**changes, "looks_ahead": True})
 
-    d3.Mismatch = mismatch  # type: ignore[assignment,misc]
+    vars(d3).update(Mismatch=mismatch)
 
 
 def _without_widths() -> None:
