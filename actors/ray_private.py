@@ -234,3 +234,15 @@ def dead_processes() -> list[str]:
 
     node = worker._global_node
     return [] if node is None else [str(name) for name, _ in node.dead_processes()]
+
+
+def is_forgotten() -> bool:
+    """Whether Ray takes this program for dead, since its connection was cut: it has then ended all that it ran for it.
+
+    Asks Ray's directory: a millisecond, and a minute where that doesn't answer.
+    """
+    import ray
+    from ray._private.state import state
+
+    this = ray.get_runtime_context().get_job_id()
+    return any(job["JobID"] == this and job["IsDead"] for job in state.job_table())

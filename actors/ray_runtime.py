@@ -9,6 +9,7 @@ actors of a program that leaves it or dies.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import logging
 import signal
 import sys
@@ -19,12 +20,23 @@ from types import FrameType
 
 from actors.cluster.last_word import dismiss, speaker
 from actors.protocols import LaboratoryError
-from actors.ray_private import PrivateRay, close_private, dead_processes, forget_logs, open_private, start_private
+from actors.ray_private import (
+    PrivateRay,
+    close_private,
+    dead_processes,
+    forget_logs,
+    is_forgotten,
+    open_private,
+    start_private,
+)
 from actors.ray_settings import ray_settings
 from actors.spec import LaboratorySpec
 
 START_DEADLINE = 120.0
 """Longest time that Ray may take to start [s]; a busy machine with a cold disk needs twenty."""
+
+LOOK_INTERVAL = 2.0
+"""Between looks whether a private Ray still takes this program for alive [s]."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -39,6 +51,7 @@ class _Cluster:
     stop: threading.Event = field(default_factory=threading.Event)
     ready: threading.Event = field(default_factory=threading.Event)
     failure: BaseException | None = None
+    forgotten: bool = False
     keeper: threading.Thread | None = None
 
 
@@ -104,9 +117,11 @@ def forget_ray_logs() -> None:
 
 
 def ray_lost() -> str:
-    """Which of a private Ray's own processes has died; empty while all of them live."""
+    """What a private Ray has lost, one of its own processes or the way to this one; empty while all is well."""
     cluster = _cluster
-    return ", ".join(dead_processes()) if cluster is not None and cluster.private is not None else ""
+    if cluster is None or cluster.private is None:
+        return ""
+    return ", ".join(dead_processes()) or ("connection to this program" if cluster.forgotten else "")
 
 
 def keep_signals() -> None:
@@ -187,12 +202,21 @@ def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
             cluster.failure.__cause__ = error
         cluster.ready.set()
         if cluster.failure is None:
-            cluster.stop.wait()
+            _watch(cluster)
         import ray
 
         ray.shutdown()
         if speaks is not None:
             dismiss(speaks)
+
+
+def _watch(cluster: _Cluster) -> None:
+    """Until it is to be ended; whoever waits for an answer meanwhile learns by `ray_lost` whether one can come."""
+    while not cluster.stop.wait(LOOK_INTERVAL):
+        if cluster.private is None or cluster.forgotten or dead_processes():
+            continue
+        with contextlib.suppress(Exception):  # its directory is just dying: the next look finds that
+            cluster.forgotten = is_forgotten()
 
 
 def _join(cluster: _Cluster) -> None:

@@ -114,7 +114,7 @@ class WarmSimulators:
 
     @property
     def lost(self) -> str:
-        """Why they can't be used any more: which process of Ray's own has died; empty while all is well."""
+        """Why they can't be used any more: what Ray has lost; empty while all is well."""
         if self._pool is None or self._spec.in_process:
             return ""
         from actors.ray_runtime import ray_lost

@@ -2,7 +2,8 @@
 
 A pour and a simulation are priced apart. What has not been seen yet in this run is priced by the plan: a pour by the
 times of operator and motion, a simulation by its particles. What a stage has done itself counts more than what others
-have. Simulations beside a pour cost nothing while they take no longer than it does.
+have. Simulations beside a pour cost nothing while they take no longer than it does; so do those that are made for later
+stages while a stage of nothing but pours keeps the arm busy.
 
 Limitations: a person's pace is not known before the first pour; other programs' load is taken to stay as it is.
 """
@@ -47,6 +48,7 @@ class Work:
         beside: of the simulations, that run beside each pour.
         particles: of a simulation in the mean; 0: those of θ*.
         pour_time: of one pour, as planned [s of the clock].
+        ahead: of the simulations, those that are made while an earlier stage pours, if the simulators are free then.
     """
 
     simulations: int = 0
@@ -54,6 +56,7 @@ class Work:
     beside: int = 0
     particles: float = 0.0
     pour_time: float = 0.0
+    ahead: int = 0
 
 
 @dataclass
@@ -64,6 +67,7 @@ class _Stage:
         waits: from each simulation's answer to the next one's, where no pour has been made yet; the first from the
             stage's opening.
         particles: of these simulations.
+        made_before: simulations whose answers were there when they were asked for.
         answered: when the last one was answered.
         cycles: from each pour's begin (the first) or the one before's end to its end.
     """
@@ -73,6 +77,7 @@ class _Stage:
     closed: bool = False
     waits: list[float] = field(default_factory=list)
     particles: list[int] = field(default_factory=list)
+    made_before: int = 0
     answered: float = 0.0
     cycles: list[float] = field(default_factory=list)
     cycle_from: float | None = None
@@ -82,7 +87,10 @@ class _Stage:
         """Simulations that still have to be waited for before the next pour, or in a stage without pours."""
         if self.cycle_from is not None:
             return 0
-        return max(self.progress.simulations_left - self.work.beside * self.progress.pours_left, 0)
+        ahead = self.work.ahead - self.made_before
+        if len(self.waits) > self.progress.of_simulations - self.work.ahead:
+            ahead = 0  # more were waited for than would have been, had any been made ahead
+        return max(self.progress.simulations_left - self.work.beside * self.progress.pours_left - max(ahead, 0), 0)
 
 
 class Forecast:
@@ -137,7 +145,9 @@ class Forecast:
                     self._pours.append(event.seconds)
                     stage.cycle_from = event.time
             case Simulate() as request if stage is not None and stage.cycle_from is None:
-                if not _made_before(event):
+                if _made_before(event):
+                    stage.made_before += 1
+                else:
                     stage.waits.append(event.time - stage.answered)
                     stage.particles.append(request.parameters.particles)
                 stage.answered = event.time

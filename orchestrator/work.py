@@ -35,7 +35,8 @@ def _work(plan: CampaignPlan, name: str) -> Work:
         if name == CALIBRATION:
             return Work(calibration.simulations, particles=particles_of(plan))
         if name == EVALUATION:
-            return Work(_scored(calibration))
+            rivals = _scored(calibration) - _weighed(calibration)  # which need no θ*: see `orchestrator.rehearsal`
+            return Work(_scored(calibration), ahead=rivals if calibration.pour_count else 0)
     if deployment is not None and name.startswith((DEPLOYMENT, CONFIRMATION)):
         pour = pour_time(plan.laboratory, deployment.scenes[0], deployment.actions)
         confirming = name.startswith(CONFIRMATION)
@@ -43,12 +44,18 @@ def _work(plan: CampaignPlan, name: str) -> Work:
     return Work()
 
 
+def _weighed(plan: CalibrationPlan) -> int:
+    """Pours that θ* is scored on: made by then, or recorded."""
+    records = 0 if plan.records is None else len(plan.records.pours)
+    return plan.pour_count + records + (0 if plan.transfer is None else len(plan.transfer.pours))
+
+
 def _scored(plan: CalibrationPlan) -> int:
     """θ* and the uncalibrated θ on all pours, random rivals on those that calibration has not seen."""
     records = [] if plan.records is None else list(plan.records.pours)
     transfer = 0 if plan.transfer is None else len(plan.transfer.pours)
     unseen = plan.holdout + sum(pour.split != "train" for pour in records) + transfer
-    return 2 * (plan.pour_count + len(records) + transfer) + plan.random_baseline * unseen
+    return 2 * _weighed(plan) + plan.random_baseline * unseen
 
 
 def particles_of(plan: CampaignPlan) -> float:

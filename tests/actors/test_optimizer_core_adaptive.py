@@ -35,6 +35,12 @@ def displaced(points):
     return cup(np.atleast_2d(points) - MOVED)
 
 
+def shelf(points):
+    """Next to nothing lost on half of the box, and nearly the same all over it; all beyond an edge."""
+    y = np.atleast_2d(points)[:, 1]
+    return 0.066 + 0.9 * np.clip(0.35 - y, 0.0, 0.35) / 0.35
+
+
 def asked(simulator, poured, mean="adaptive", **changes):
     """A question after 60 simulations and some pours."""
     simulated = np.random.default_rng(1).random((60, 2))
@@ -105,6 +111,17 @@ def test_with_pours_to_follow_the_first_one_goes_where_it_tells_more():
     model, everywhere = averaged(question), np.random.default_rng(0).random((200, 2))
     after_first, after_last = foreseen(model, np.array([first.points[0], last.points[0]]), everywhere)
     assert after_first < after_last
+
+
+def test_a_pour_that_is_not_to_look_ahead_goes_where_least_is_lost():
+    question = asked(shelf, [], acquisition="least_loss")
+    ahead, here = (
+        propose(replace(question, mismatch=replace(question.mismatch, looks_ahead=looks))) for looks in (True, False)
+    )
+    assert here.means[0] < ahead.means[0]
+    everywhere = tuple((x, y) for x in np.linspace(0, 1, 21) for y in np.linspace(0, 1, 21))
+    grid = replace(question, count=0, predict_at=everywhere)
+    assert here.means[0] < min(propose(grid).predictions) + 0.001
 
 
 def test_with_something_good_in_hand_no_unknown_corner_is_tried():

@@ -1,4 +1,4 @@
-"""Ray's own processes die under a daemon: it begins anew by itself, and what ran goes on."""
+"""Ray's own processes die under a daemon, or are cut off: it begins anew by itself, and what ran goes on."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tests.end_to_end.command import pour_under_way, started_after_they_were_fin
 from tests.end_to_end.small import write_campaign
 from tests.end_to_end.test_daemon_killed import SLOW_POURS, Laboratory, opened
 from tests.patience import PATIENCE
+from tests.reliability import strikes
 
 pytestmark = pytest.mark.slow
 
@@ -26,8 +27,8 @@ def of_ray(laboratory: Laboratory, name: str) -> list[int]:
     return [child.pid for child in children if child.is_running() and child.name() == name]
 
 
-@pytest.mark.parametrize("name", ["raylet", "gcs_server"])
-def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(("name", "fault"), [("raylet", "killed"), ("gcs_server", "killed"), ("raylet", "cut")])
+def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name: str, fault: str) -> None:
     write_campaign(tmp_path, SLOW_POURS)
     with opened(tmp_path) as laboratory:
         laboratory.in_process = False
@@ -37,7 +38,10 @@ def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name
         key = laboratory.decant("submit", "small.yaml").stdout.strip()
         laboratory.until(lambda: pour_under_way(laboratory.entries()))
         (former,) = of_ray(laboratory, name)
-        os.kill(former, signal.SIGKILL)
+        if fault == "killed":
+            os.kill(former, signal.SIGKILL)
+        else:
+            assert strikes.cut([former]) > 2
         laboratory.until(lambda: of_ray(laboratory, name) not in ([former], []))
         assert (laboratory.state / "url").read_text() == url
 

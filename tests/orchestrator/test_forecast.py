@@ -98,6 +98,24 @@ def test_the_end_that_is_foretold_comes_true_within_a_fifth_from_the_beginning_o
     assert whole == pytest.approx(sum((*POURS, *CALIBRATION, *EVALUATION, *PRIOR, *CYCLES)))
 
 
+@pytest.mark.parametrize("made", [True, False])
+@pytest.mark.parametrize("last", [True, False])
+def test_simulations_made_while_the_arm_pours_are_not_waited_for(made: bool, last: bool) -> None:
+    """Unless they weren't: then the forecast is right again once that is seen."""
+    forecast, timeline = Forecast(slots=2, particles=1000.0), Timeline()
+    forecast.begin(2, {"pours": Work(pours=4, pour_time=8.0), "evaluation": Work(35, ahead=25)})
+    assert forecast.left(timeline.now) == pytest.approx(4 * 8.2 + 10 * 0.6)
+    answered = (*(0.6 for _ in range(10)), *((0.0 if made else 0.6) for _ in range(25)))
+    for event in timeline.stage("pours", pours=(8.0,) * 4):
+        forecast(event)
+    ends = []
+    for event in timeline.stage("evaluation", answered if last else answered[::-1]):
+        forecast(event)
+        ends.append(event.time + (forecast.left(event.time) or 0.0))
+    assert [end for end in ends if made] == pytest.approx([timeline.now for _ in ends if made], abs=0.7)
+    assert ends[-25:] == pytest.approx([timeline.now] * 25, abs=0.7 if made or last else 6.5)
+
+
 def test_the_time_left_falls_while_a_pour_or_a_simulation_takes_its_time() -> None:
     timeline, forecast = Timeline(), begun()
     events = timeline.campaign()

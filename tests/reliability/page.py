@@ -88,8 +88,12 @@ def commit() -> str:
     return " ".join(word[:10] for word in said.split())
 
 
-def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
-    """All cases of some targets, so many processes at a time; whether all of them came to their end."""
+def run(targets: Sequence[str], jobs: int, results: Path, limit: int | None = None) -> bool:
+    """All cases of some targets, so many processes at a time; whether all of them came to their end.
+
+    How long that took is written down beside them.
+    """
+    begun, before = time.monotonic(), len(found(results))
     shares = {"program": jobs}  # of those with many cases; a process of each of the others
     tasks = [(target, n, shares.get(target, 1)) for target in targets for n in range(shares.get(target, 1))]
     running: list[subprocess.Popen[bytes]] = []
@@ -98,10 +102,15 @@ def run(targets: Sequence[str], jobs: int, results: Path) -> bool:
         while tasks and len(running) < jobs:
             target, number, of = tasks.pop(0)
             arguments = ["--results", str(results), "--share", target, str(number), str(of)]
+            arguments += [] if limit is None else ["--limit", str(limit)]
             running.append(subprocess.Popen([sys.executable, "-m", "tests.reliability.page", *arguments], cwd=ROOT))
         time.sleep(0.2)
         good &= all(process.returncode in (None, 0) for process in running)
         running = [process for process in running if process.poll() is None]
+    if good:
+        head = {"wall_s": round(time.monotonic() - begun), "jobs": jobs, "run": len(found(results)) - before}
+        with results.open("a", encoding="utf-8") as out:
+            out.write(json.dumps(head) + "\n")
     return good
 
 
@@ -113,6 +122,15 @@ def all_cases(results: Path) -> dict[str, int]:
     lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
     heads = [head for head in map(json.loads, lines) if "target" in head]
     return {head["target"]: head["cases"] for head in heads}
+
+
+def wall(results: Path) -> str:
+    """How long all cases took where they were run in one go; else nothing."""
+    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
+    heads = [head for head in map(json.loads, lines) if "wall_s" in head]
+    if not heads or heads[-1]["run"] < len(found(results)):
+        return ""
+    return f", and {heads[-1]['wall_s'] / 60:.0f} minutes by the clock with {heads[-1]['jobs']} at a time"
 
 
 def overview(rows: Sequence[dict[str, Any]], there_are: dict[str, int]) -> str:
@@ -129,8 +147,8 @@ def overview(rows: Sequence[dict[str, Any]], there_are: dict[str, int]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """By target and fault: how they ended, what was told and asked, what was wrong."""
+def table(rows: Sequence[dict[str, Any]], took: str) -> str:
+    """By target and fault: how they ended, what was told and asked, what was wrong; what all of it took."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         groups[row["case"]["target"], row["case"]["fault"]].append(row)
@@ -138,7 +156,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     cpu = sum(row["cpu_s"] for row in rows)
     lines = [
         f"{len(rows)} cases were run, {wrong} ended otherwise than they should. They took {cpu:.0f} seconds of a core: "
-        f"{cpu / 120:.0f} minutes of two.",
+        f"{cpu / 120:.0f} minutes of two{took}.",
         "",
         "| struck | fault | cases | the first life of the program | people at the bench were asked about | "
         "unknown pours, asked about | as undisturbed |",
@@ -177,7 +195,7 @@ def write(results: Path) -> int:
     page = PAGE.read_text(encoding="utf-8")
     for name, text in (
         ("all cases", overview(rows, all_cases(results))),
-        ("kill matrix", table(rows)),
+        ("kill matrix", table(rows, wall(results))),
         ("no meaning", reasons()),
     ):
         before, marker, rest = page.partition(BEGIN.format(name))
@@ -226,7 +244,7 @@ def main() -> None:
     options.results.parent.mkdir(exist_ok=True)
     if options.fresh:
         options.results.unlink(missing_ok=True)
-    good = options.write or run(options.only, options.jobs, options.results)
+    good = options.write or run(options.only, options.jobs, options.results, options.limit)
     sys.exit(1 if write(options.results) or not good else 0)
 
 

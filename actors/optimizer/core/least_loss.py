@@ -179,7 +179,8 @@ def proposals(
     candidates = np.concatenate([candidates, known])
     pour = acquisition.minimise(score, candidates, asked.region, rng)
     left, allowed = min(problem.mismatch.left, FORESIGHT), _allowed(process, problem.mismatch, feasibility)
-    pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
+    if problem.mismatch.looks_ahead:
+        pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
     beside = instructive(process, problem.count - 1, candidates, score, pour, asked.busy, asked.region)
     return np.concatenate([pour[None, :], beside])
 

@@ -50,6 +50,7 @@ class Mismatch:
         worst: largest cost.
         left: real observations that follow the one that is proposed.
         limit: that proposals keep, if any action does.
+        looks_ahead: whether the next observation may be made for what it tells of other places.
     """
 
     play: tuple[Play, ...]
@@ -58,6 +59,7 @@ class Mismatch:
     worst: float = 1.0
     left: int = 0
     limit: Limit | None = None
+    looks_ahead: bool = True
 
 
 @dataclass(frozen=True)

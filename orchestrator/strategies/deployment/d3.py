@@ -239,7 +239,12 @@ class Hybrid(Deployment[D3Settings]):
         if limit is not None and not any(p.cost is not None and p.cost <= limit.loss for p in self._pours):
             limit = None  # nothing good is in hand that could be poured again
         return Mismatch(
-            play_of(self._plan.actions), self._plan.bench, worst=self._costing.worst, left=left, limit=limit
+            play_of(self._plan.actions),
+            self._plan.bench,
+            worst=self._costing.worst,
+            left=left,
+            limit=limit,
+            looks_ahead=self._rules.limit is None,  # what follows has to stay where it is known to be safe
         )
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:

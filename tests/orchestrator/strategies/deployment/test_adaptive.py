@@ -136,6 +136,13 @@ def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> No
     assert max(found[good:]) <= 0.15
 
 
+@pytest.mark.parametrize("limit", [None, RiskLimitSettings()])
+def test_with_a_limit_no_pour_is_made_for_what_it_tells_of_places_that_must_not_be_poured(limit: Any) -> None:
+    play = Play(narrow_cup)(adaptive(pours=3, risk_limit=limit))
+    problems = [one.problem.mismatch for one in play.asked if isinstance(one, Suggest) and one.purpose == "pour"]
+    assert [one is not None and one.looks_ahead for one in problems] == [limit is None] * 3
+
+
 @pytest.mark.parametrize("otherwise", ["stop", "go on"])
 def test_a_limit_that_can_not_be_kept_is_said_before_the_pour(otherwise: Any) -> None:
     limit = RiskLimitSettings(loss=0.02, probability=0.001, otherwise=otherwise)
