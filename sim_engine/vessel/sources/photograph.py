@@ -101,10 +101,10 @@ def _lean(grey: Floats) -> float:
         return float(np.abs(middles - np.median(middles)).mean())
 
     angles = np.linspace(-MOST_LEAN, MOST_LEAN, 13)
-    step = angles[1] - angles[0]
+    step = float(angles[1] - angles[0])
     near = float(angles[int(np.argmin([crooked(angle) for angle in angles]))])
-    around, exact = (near - step, near + step), {"xatol": UPRIGHT / 4.0}
-    found = minimize_scalar(crooked, bounds=around, method="bounded", options=exact)
+    around = (near - step, near + step)
+    found = minimize_scalar(crooked, bounds=around, method="bounded", options={"xatol": UPRIGHT / 4.0})
     return float(found.x)
 
 
