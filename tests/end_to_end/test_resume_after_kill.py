@@ -82,7 +82,9 @@ def test_a_campaign_learns_from_calibration_to_its_last_pour(undisturbed: Finish
     assert 0.0 <= summary["theta"]["cohesion"] <= 0.1
     learnt = summary.pop("results")
     assert {"calibration", "deployment:narrow"} <= learnt.keys()
-    assert {**undisturbed.summary, "run": None} == {**summary, "run": None}
+    told = dict(undisturbed.summary)
+    assert Path(told.pop("report")).read_text(encoding="utf-8").lower().startswith("<!doctype html>")
+    assert {**told, "run": None} == {**summary, "run": None}
     assert json.loads((undisturbed.directory / "theta.json").read_text())["theta"] == summary["theta"]
     for figure in summary["figures"].values():
         assert Path(figure).read_bytes().startswith(b"\x89PNG")
@@ -140,7 +142,7 @@ def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undistu
     attempts = [e.body["attempt"] for e in workplace.entries() if e.kind == Kind.POUR_STARTED]
     assert attempts == [1, 1, 2, 1, 1, 2, 1]
     assert result["receivers"] == undisturbed.summary["receivers"]
-    assert recording(Path(result["recording"]))["/pours/deployment-narrow/measured"] >= 2
+    assert recording(Path(result["recording"]))["/learning/deployment-narrow/loss/measured"] >= 2
     workplace.assert_nothing_is_left()
 
 
