@@ -61,7 +61,7 @@ class Cell:
         self._moves: list[tuple[Moment, tuple[float, ...]]] = []
         self._liquid: RecordedFrames | None = None
         self._stands: tuple[float, ...] = ()
-        outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
+        outlet.log(PLACE, shapes.fates(), static=True)  # not of the liquid, with which it would be cleared
         outlet.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
         self._furnish()
 
@@ -108,7 +108,6 @@ class Cell:
         self._stand("pourer", scene.pourer)
         self._stand("receiver", scene.receiver)
         self._outlet.clear(f"{PLACE}/liquid")
-        self._outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
         self._outlet.clear(f"{PLACE}/path/executed")
         planned = planned_poses(scene, pour)
         if planned is None:

@@ -95,7 +95,7 @@ def _jobs(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Ca
         unit = deployment_unit(plan.deployment)
         if series := pour_series(plan, results, unit):
             jobs["spillage against pours"] = lambda: draw_spillage(
-                directory / "spillage.png", series, cost=unit.label, title=f"Spillage against pours: {plan.name}"
+                directory / "spillage.png", series, cost=unit.label, title=f"What every pour came to: {plan.name}"
             )
         for scene, result in deployments_of(results).items():
             if (picture := deployment_picture(plan, result)) is not None:

@@ -71,7 +71,7 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
     for place, one in enumerate(series):
         panel = axes[place // columns, place % columns]
         top = max(top, _pour_panel(panel, one))
-        style.dress(panel, title=_pour_title(one), x="pour", y=cost if place % columns == 0 else "")
+        style.dress(panel, title=_pour_title(one, cost), x="pour", y=cost if place % columns == 0 else "")
     for extra in range(len(series), rows * columns):
         axes[extra // columns, extra % columns].set_visible(False)
     axes[0, 0].set_ylim(0.0, TOP * top or 1.0)
@@ -80,13 +80,14 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
     return style.save(figure, path)
 
 
-def _pour_title(series: PourSeries) -> str:
-    """Receiver, and the best pour: the number that the reader came for."""
+def _pour_title(series: PourSeries, cost: str) -> str:
+    """Receiver, and the best pour: the number that the reader came for, with the unit of the cost's label."""
     worked = [(loss, number) for number, loss in enumerate(series.losses, start=1) if loss is not None]
     if not worked:
         return f"{series.receiver}: every pour failed"
     loss, number = min(worked)
-    return f"{series.receiver}: best {loss:.3g} (pour {number})"
+    unit = cost.partition("[")[2].rstrip("]")
+    return f"{series.receiver}: best {loss:.3g} {unit} (pour {number})"
 
 
 def _pour_panel(axes: Axes, series: PourSeries) -> float:

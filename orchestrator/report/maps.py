@@ -153,7 +153,15 @@ def _map_panel(
     if picture.simulated:
         places = (_column(picture.simulated, x_axis), _column(picture.simulated, y_axis))
         axes.scatter(
-            *places, marker="x", s=18, linewidths=1.0, color=style.GREY, clip_on=False, zorder=3, label="simulation"
+            *places,
+            marker="X",
+            s=26,
+            linewidths=0.6,
+            facecolor="white",  # grey lines are lost in the middle of a colour map
+            edgecolor=style.INK,
+            clip_on=False,
+            zorder=3,
+            label="simulation",
         )
     # Observations are filled with their own cost on the same scale: where one stands out, the surrogate disagrees.
     filled: dict[str, Any] = {"c": "white"}

@@ -52,14 +52,14 @@ def cost_table(plan: CampaignPlan, summary: RunSummary, record: Record) -> Table
                 f"{loaded:.0f} g: {delivered:.0f} g delivered, {spilled:.1f} g spilled, {retained:.1f} g retained",
             )
         )
-    rows.append(("program at work", _minutes(record.at_work_s)))
+    rows.append(("program at work", minutes(record.at_work_s)))
     arm = [pour.seconds for pour in begun if pour.seconds]
     if arm:
-        rows.append(("of it pouring", f"{_minutes(sum(arm))}, {sum(arm) / len(arm):.1f} s a pour{_pace(plan)}"))
+        rows.append(("of it pouring", f"{minutes(sum(arm))}, {sum(arm) / len(arm):.1f} s a pour{_pace(plan)}"))
     simulations = sum(stage.simulations for stage in record.stages.values())
     if simulations:
         each = f", {summary.cpu_s / simulations:.1f} s each" if summary.cpu_s else ""
-        rows.append(("simulations", f"{simulations}, {_minutes(summary.cpu_s)} of CPU time{each}"))
+        rows.append(("simulations", f"{simulations}, {minutes(summary.cpu_s)} of CPU time{each}"))
     for stage, use in summary.occupancy.items():
         if use.pool_busy is not None:
             rows.append((f"pool beside the arm, {stage.rpartition(':')[2]}", f"{100 * use.pool_busy:.0f} % busy"))
@@ -82,7 +82,8 @@ def _pace(plan: CampaignPlan) -> str:
     )
 
 
-def _minutes(seconds: float) -> str:
+def minutes(seconds: float) -> str:
+    """A time in the unit that people would take."""
     if seconds < 90.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.1f} min" if seconds < 5400.0 else f"{seconds / 3600:.1f} h"

@@ -14,6 +14,7 @@ from orchestrator.report.summary import ReceiverSummary, RunSummary
 from orchestrator.report.trust import trust_line
 from orchestrator.report.units import DISCREPANCY, LossUnit, deployment_unit
 from orchestrator.states import State
+from orchestrator.strategies.deployment.adaptive import DOUBT, Believed
 from orchestrator.strategies.deployment.trust import Compared
 from sim_engine.task import Scene
 
@@ -97,12 +98,20 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
+    if _borne_out(row) and (trust := trust_line(row.trust)) is not None:
+        said.append(_sentence(trust))
     return said
+
+
+def _borne_out(row: ReceiverSummary) -> bool:
+    """Whether what is said of the simulator is something that the pours have shown, and no doubt."""
+    trust = row.trust
+    return isinstance(trust, Believed) and bool(trust.after) and trust.after[-1].ignorance < DOUBT
 
 
 def _open(row: ReceiverSummary, unit: LossUnit) -> list[str]:
     said = []
-    if (alarm := trust_line(row.trust)) is not None:
+    if not _borne_out(row) and (alarm := trust_line(row.trust)) is not None:
         said.append(_sentence(alarm))
     if isinstance(row.trust, Compared) and row.trust.better:
         said.append(

@@ -23,7 +23,10 @@ GO_ON: Final = "go on"
 STOP: Final = "stop"
 OPTIONS = (GO_ON, STOP)
 
-WORDS = ((0.05, "is borne out"), (0.3, "is borne out so far"), (0.7, "is in doubt"), (0.95, "is probably wrong here"))
+DOUBT = 0.3
+"""From this ignorance on a simulator is in doubt."""
+
+WORDS = ((0.05, "is borne out"), (DOUBT, "is borne out so far"), (0.7, "is in doubt"), (0.95, "is probably wrong here"))
 """The words for a simulator whose ignorance is below each of these; above all of them it is wrong here."""
 
 

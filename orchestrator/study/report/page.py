@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from orchestrator.report import page
+from orchestrator.report.run_tables import minutes
 from orchestrator.report.units import deployment_unit
 from orchestrator.study.cells import cells_of
 from orchestrator.study.code import told
@@ -123,8 +124,8 @@ def _summary(study: StudyPlan, found: Gathered) -> str:
         "" if not study.deployments else f" Deployments minimise: {deployment_unit(study.deployments[0].plan).label}."
     )
     return (
-        f"{found.simulations:,} simulations and {found.pours:,} pours on virtual benches, {found.cpu_s / 3600:.1f} CPU "
-        f"hours of simulation, {found.seconds / 3600:.1f} hours of all cells one after the other. Nothing of this was "
+        f"{found.simulations:,} simulations and {found.pours:,} pours on virtual benches, {minutes(found.cpu_s)} of "
+        f"CPU time of simulation, {minutes(found.seconds)} of all cells one after the other. Nothing of this was "
         f"poured by a physical robot.{losses}"
     )
 

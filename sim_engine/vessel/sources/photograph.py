@@ -1,7 +1,8 @@
 """The outline of a turned vessel from one photograph of its side.
 
 The vessel stands out from a plain background. Its silhouette is cut out at Otsu's threshold, the axis is the line
-through the middles of its rows, and one known length gives the scale. The wall is taken off normal to the outline.
+about which it is most alike on both sides, and one known length gives the scale. The wall is taken off normal to the
+outline.
 
 Source: Otsu, A threshold selection method from gray-level histograms, IEEE Trans. Syst. Man Cybern. 9 (1979).
 Limitations: no perspective: taken from ten vessel's widths away it is below one per cent; the rim seen as an ellipse,
@@ -26,7 +27,10 @@ LOPSIDED = 0.02
 """Largest difference of a row's two halves from those of the mean row, as a share of the width: more is a handle."""
 
 UPRIGHT = 5e-4
-"""Slope of an axis that passes for upright."""
+"""Lean of an axis that passes for upright [rad]."""
+
+MOST_LEAN = 0.06
+"""Largest lean that is looked for [rad]: a camera held by hand."""
 
 LEAST_ROWS = 60
 """Rows that a silhouette needs."""
@@ -71,23 +75,44 @@ def silhouette(grey: Floats, known: Literal["height", "width"], length: float) -
     Raises:
         VesselError: there is no single turned vessel that stands out.
     """
-    from scipy import ndimage
-
-    left, right = _cut_out(grey)
+    lean = _lean(grey)
+    left, right = _cut_out(grey if abs(lean) <= UPRIGHT else _turned(grey, lean))
     rows = np.arange(len(left))
-    within = slice(len(rows) // 8, -(len(rows) // 8))
-    lean = float(np.polyfit(rows[within], ((left + right) / 2.0)[within], 1)[0])
-    if abs(lean) > UPRIGHT:  # corners of a leaning silhouette belong to rows that they should not be in
-        turned = ndimage.rotate(grey, -np.degrees(np.arctan(lean)), reshape=False, order=1, mode="nearest")
-        left, right = _cut_out(turned)
-        rows = np.arange(len(left))
     middle = float(np.median((left + right) / 2.0))
     halves = np.column_stack([middle - left, right - middle])
     _check_turned(halves)
     radii: Floats = np.asarray(halves.mean(axis=1)[::-1], dtype=np.float64)
     heights: Floats = np.asarray(rows + 0.5, dtype=np.float64)
     pixel = length / (len(rows) if known == "height" else 2.0 * radii.max())
-    return Silhouette(heights * pixel, radii * pixel, len(rows) * pixel, float(pixel), float(np.arctan(lean)))
+    return Silhouette(heights * pixel, radii * pixel, len(rows) * pixel, float(pixel), lean)
+
+
+def _lean(grey: Floats) -> float:
+    """By how much the axis leans [rad]: turned upright, the vessel is the same on both sides.
+
+    The line through the middles of the rows would do for a cup, but not for a bowl: its sides are so far apart that a
+    row meets them at different heights.
+    """
+    from scipy.optimize import minimize_scalar
+
+    def crooked(angle: float) -> float:
+        left, right = _cut_out(_turned(grey, angle))
+        middles = (left + right)[len(left) // 8 : -(len(left) // 8)] / 2.0
+        return float(np.abs(middles - np.median(middles)).mean())
+
+    angles = np.linspace(-MOST_LEAN, MOST_LEAN, 13)
+    step = float(angles[1] - angles[0])
+    near = float(angles[int(np.argmin([crooked(angle) for angle in angles]))])
+    around = (near - step, near + step)
+    found = minimize_scalar(crooked, bounds=around, method="bounded", options={"xatol": UPRIGHT / 4.0})
+    return float(found.x)
+
+
+def _turned(grey: Floats, lean: float) -> Floats:
+    """The picture with a leaning axis upright."""
+    from scipy import ndimage
+
+    return np.asarray(ndimage.rotate(grey, -np.degrees(lean), reshape=False, order=1, mode="nearest"))
 
 
 def _check_turned(halves: Floats) -> None:

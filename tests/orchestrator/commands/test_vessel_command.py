@@ -67,6 +67,11 @@ def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, 
     assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
+def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_level(tmp_path: Path) -> None:
+    of = bench("bowl")
+    assert made(tmp_path, photo(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
+
+
 @pytest.mark.slow
 def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import json

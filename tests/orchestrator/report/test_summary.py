@@ -20,7 +20,9 @@ from orchestrator.report.summary import (
     write_summary,
 )
 from orchestrator.report.table import print_summary, summary_table
+from orchestrator.report.words import advice
 from orchestrator.results import decode_results
+from orchestrator.strategies.deployment.adaptive import Belief, Believed
 from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.repeats import Foreseen
 from sim_engine.spread import Spread
@@ -101,6 +103,27 @@ def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_ev
         "pour 3: pour_unknown: declared lost by the operator"
     ) in " ".join(text.split())
     assert "lacks 12 events" in text
+
+
+@pytest.mark.parametrize(("ignorance", "known"), [(0.01, True), (0.5, False)])
+def test_what_pours_say_of_the_simulator_is_known_where_it_is_borne_out_and_open_where_it_is_in_doubt(
+    results: dict[str, Any], ignorance: float, known: bool
+) -> None:
+    trust = Believed(
+        after=(Belief(pour=1, ignorance=ignorance, gain=None),),
+        displaced={},
+        factor=1.0,
+        limit=0.9,
+        policy="go on",
+        followed=None,
+        alarm=False,
+        text="the simulator is as it is",
+    )
+    plan = watched.campaign()
+    poured = changed(results["narrow cup"], trust=trust)
+    (said,) = advice(plan, summarise(plan, {"narrow cup": poured}))
+    assert ("The simulator is as it is." in said.sentences) == known
+    assert ("The simulator is as it is." in said.open) != known
 
 
 def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(results: dict[str, Any]) -> None:

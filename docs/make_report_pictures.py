@@ -1,0 +1,88 @@
+"""Reports of the docs and their pictures: `python docs/make_report_pictures.py RUN STUDY`.
+
+RUN and STUDY are folders of a quickstart and of the quick study that have ended. Copies both pages to docs/reports and
+draws what docs/from-yaml-to-report.md shows of them. Needs Playwright and a Chromium (`--chromium`), and pypdfium2 for
+the pages as they are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from orchestrator.report.run_page import REPORT_NAME
+from orchestrator.study.report.page import PAGE, REPORT
+
+DOCS = Path(__file__).parent
+
+WIDTH = 900
+"""Of a page on the screen [pixels]."""
+
+PRINTED = 4
+"""Pages that are shown as they are printed."""
+
+SHEET = (366, 522)
+"""Each [pixels]."""
+
+GAP = 10
+
+
+def main() -> None:
+    """Both pages and all pictures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, help="folder of a quickstart")
+    parser.add_argument("study", type=Path, nargs="?", help="folder of the quick study; without one its page stays")
+    parser.add_argument("--chromium", default=shutil.which("chromium") or shutil.which("chromium-browser"))
+    arguments = parser.parse_args()
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=arguments.chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": WIDTH, "height": 1000}, color_scheme="light")
+        for made, name, picture in (
+            (arguments.run / REPORT_NAME, "quickstart", "report"),
+            (arguments.study and arguments.study / REPORT / PAGE, "study-quick", "report-study"),
+        ):
+            if made is not None:
+                kept = DOCS / "reports" / f"{name}.html"
+                shutil.copyfile(made, kept)
+                page.goto(kept.absolute().as_uri())
+                first(page, DOCS / "images" / f"{picture}.png")
+                if name == "quickstart":
+                    printed(page, DOCS / "images" / "report-printed.png")
+        browser.close()
+
+
+def first(page: Any, to: Path) -> None:
+    """Keep a page down to the end of its first section."""
+    below = page.locator("section").first.bounding_box()
+    page.screenshot(
+        path=str(to),
+        clip={"x": 0, "y": 0, "width": WIDTH, "height": below["y"] + below["height"] + 8},
+        full_page=True,
+    )
+
+
+def printed(page: Any, to: Path) -> None:
+    """Keep the first sheets of a page, side by side."""
+    import pypdfium2
+
+    with tempfile.TemporaryDirectory() as folder:
+        sheets = Path(folder) / "sheets.pdf"
+        page.pdf(path=str(sheets), format="A4", print_background=True)
+        document = pypdfium2.PdfDocument(sheets)
+        drawn = [document[n].render(scale=2.0).to_pil() for n in range(min(PRINTED, len(document)))]
+        strip = Image.new("RGB", (len(drawn) * (SHEET[0] + GAP) - GAP, SHEET[1]), (200, 200, 200))
+        for number, sheet in enumerate(drawn):
+            strip.paste(sheet.convert("RGB").resize(SHEET, Image.Resampling.LANCZOS), (number * (SHEET[0] + GAP), 0))
+        document.close()
+    strip.save(to, optimize=True)
+
+
+if __name__ == "__main__":
+    main()
