@@ -37,6 +37,7 @@ from players import interval
 from actors.optimizer.core import averaged
 from actors.optimizer.core.mismatch import Mismatch
 from actors.simulation.in_process import InProcessSimulatorPool
+from actors.simulation.job_runner import Simulator, pour_simulator
 from orchestrator.codec import digest, from_json, to_json
 from orchestrator.strategies.deployment import d3
 from sim_engine.outcome import PourOutcome
@@ -70,8 +71,8 @@ ARMS: dict[str, Callable[[], None]] = {
 class KeptPours(InProcessSimulatorPool):
     """A pool that answers from a file what it has simulated before; the file's name tells the solver."""
 
-    def __init__(self, file: Path) -> None:
-        super().__init__()
+    def __init__(self, file: Path, *, make: Callable[[], Simulator] = pour_simulator) -> None:
+        super().__init__(make=make)
         self._file, self._known = file, dict[str, Any]()
         self.simulated = 0
         if file.exists():

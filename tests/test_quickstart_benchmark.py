@@ -1,0 +1,63 @@
+"""`benchmarks/quickstart.py` simulates nothing twice, and counts what it says it counts."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from sim_engine.liquid import SimulationParameters
+from sim_engine.task import PourTask
+from tests.actors.conftest import make_fake
+from tests.orchestrator.play import SCENE
+
+
+@pytest.fixture
+def quickstart(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    import quickstart
+
+    return quickstart
+
+
+def run_of(*losses: float, recommended: int, ended: str | None = None) -> dict[str, Any]:
+    pours = [{"at": [i, i], "loss": loss, "predicted": 0.02, "deviation": 0.01} for i, loss in enumerate(losses)]
+    return {"seed": 7, "pours": pours, "recommended": [recommended, recommended], "ended": ended}
+
+
+def test_a_pour_that_was_simulated_once_is_answered_from_its_file(quickstart: ModuleType, tmp_path: Path) -> None:
+    action = SCENE.action({"angular_velocity": 1.0, "x_offset": 0.1})
+    tasks = [PourTask(SCENE, action, SimulationParameters(), seed) for seed in (1, 2, 1)]
+
+    async def answers() -> tuple[list[Any], int]:
+        pool = quickstart.KeptPours(tmp_path / "pours.jsonl", make=make_fake())
+        found = [(await pool.simulate(task)).outcome for task in tasks]
+        await pool.close()
+        return found, pool.simulated
+
+    first, made = asyncio.run(answers())
+    again, made_again = asyncio.run(answers())
+    assert (made, made_again) == (2, 0)
+    assert first == again
+    assert first[0] == first[2] != first[1]
+
+
+def test_only_pours_after_the_first_good_one_count_as_bad(quickstart: ModuleType) -> None:
+    found = quickstart.figures(run_of(0.4, 0.005, 0.2, 0.02, recommended=1))
+    assert (found["good"], found["bad"], found["after"], found["final"]) == (2, 1, 0.2, 0.005)
+    never = quickstart.figures(run_of(0.4, 0.2, recommended=1))
+    assert (never["good"], never["bad"]) == (3, 0)
+    assert math.isnan(never["after"])
+
+
+def test_the_table_says_what_was_asked(quickstart: ModuleType) -> None:
+    good = run_of(0.02, 0.005, recommended=1, ended="good enough: the best action is expected to lose 0.8 %")
+    text = quickstart.table([good, run_of(0.03, 0.02, 0.02, recommended=1)])
+    assert "| 7 | 2.0, 0.5 % | 2 | 2 |  | 0.5 % | 0.5 % | good enough |" in text
+    assert "| 7 | 3.0, 2.0, 2.0 % | 3 | none |  | 2.0 % | 2.0 % | all pours made |" in text
+    assert "no pour above 10 % after the first below 1 % in 2 of them; 2.5 pours in the median" in text
+    assert "below 1 % in 1 of them, in the median at pour 2" in text
