@@ -39,7 +39,7 @@ lint: $(READY)
 unit: $(READY)
 	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile
 
-# What takes long, and every property on four times as many examples.
+# What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
 slow: $(READY)
 	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 --dist loadfile
 

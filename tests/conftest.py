@@ -23,7 +23,12 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     atexit.register(shutil.rmtree, os.environ[VARIABLE], ignore_errors=True)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+PART = "DECANT_TESTS_PART"
+"""Variable '2/4': of the files with tests that were chosen, each fourth one, from the second on."""
+
+
+@pytest.hookimpl(trylast=True)  # after those that were not chosen have gone
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """A starved machine misses deadlines, and no arm should move on then: what is `realtime` is tried thrice.
 
     Reruns are counted in the last line. A test that needs one on an idle machine has a fault.
@@ -31,3 +36,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("realtime") is not None:
             item.add_marker(pytest.mark.flaky(reruns=2))
+    if part := os.environ.get(PART):
+        number, parts = (int(word) for word in part.split("/"))
+        files = sorted({item.path for item in items})[number - 1 :: parts]
+        left_out = [item for item in items if item.path not in files]
+        items[:] = [item for item in items if item.path in files]
+        config.hook.pytest_deselected(items=left_out)
