@@ -37,7 +37,7 @@ MAPPED = 2
 SLICING_INTERVAL = 180.0
 """As `DRAWING_INTERVAL`, for pictures whose surrogate has to be fitted once more [s]."""
 
-DRAWING_INTERVAL = 45.0
+DRAWING_INTERVAL = 60.0
 """Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.25 s of a
 core, which has to stay about a hundredth of it."""
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FILING = 2.0
 """Rows of the file are kept together for so long [s]: packing each few of them costs more than making them."""
 
-SENDING = 0.5
+SENDING = 0.75
 """Rows for those who watch, likewise: `Outlet.send` is called so often [s]."""
 
 LAST_WORDS = 5.0
