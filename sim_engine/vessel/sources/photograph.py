@@ -32,6 +32,9 @@ UPRIGHT = 5e-4
 MOST_LEAN = 0.06
 """Largest lean that is looked for [rad]: a camera held by hand."""
 
+ENOUGH = 300
+"""Pixels of a vessel's height and width that its lean is found with: pictures of a telephone have ten times as many."""
+
 LEAST_ROWS = 60
 """Rows that a silhouette needs."""
 
@@ -95,8 +98,15 @@ def _lean(grey: Floats) -> float:
     """
     from scipy.optimize import minimize_scalar
 
+    left, right = _cut_out(grey)
+    every = max(min(len(left), int((right - left).max())) // ENOUGH, 1)
+    small = grey[::every, ::every]
+
     def crooked(angle: float) -> float:
-        left, right = _cut_out(_turned(grey, angle))
+        try:
+            left, right = _cut_out(_turned(small, angle))
+        except VesselError:  # turned so far it leaves the picture
+            return float(len(small))
         middles = (left + right)[len(left) // 8 : -(len(left) // 8)] / 2.0
         return float(np.abs(middles - np.median(middles)).mean())
 

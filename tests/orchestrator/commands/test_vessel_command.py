@@ -72,6 +72,22 @@ def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_leve
     assert made(tmp_path, photo(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
+def test_a_large_photograph_with_little_room_beside_the_vessel_will_do(tmp_path: Path) -> None:
+    from PIL import Image, ImageChops
+
+    of = bench("tumbler")
+    sources = photo(of, tmp_path)
+    assert sources.photo is not None
+    with Image.open(sources.photo) as whole:
+        seen = ImageChops.difference(whole, Image.new(whole.mode, whole.size, whole.getpixel((0, 0))))
+        box = seen.point(lambda value: 255 * (value > 60)).getbbox()
+        assert box is not None
+        left, top, right, bottom = box
+        close = whole.crop((left - 8, top - 8, right + 8, bottom + 8))
+        close.resize((4 * close.width, 4 * close.height)).save(sources.photo)
+    assert made(tmp_path, sources) == pytest.approx(of.vessel.capacity, rel=0.015)
+
+
 @pytest.mark.slow
 def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import json
