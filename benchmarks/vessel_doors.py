@@ -22,7 +22,7 @@ from sim_engine.task import PourTask, Scene
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import VesselSpec
 from sim_engine.vessel.vessel import Vessel
-from tests.measured import Bench
+from tests.measured import FOCAL, Bench
 
 NAMES = ("beaker", "tumbler", "cone", "bowl", "narrow")
 PAGE = Path("docs/vessels.md")
@@ -57,6 +57,7 @@ def doors(of: Bench, folder: Path) -> dict[str, Sources]:
         "photograph": Sources(photo=photo, known_height=outside, wall=wall, floor=floor),
         "points": Sources(points=of.save_cloud(folder / "cloud.csv"), unit="mm", wall=wall, floor=floor),
         "points of one side, a hole": Sources(points=half, unit="mm", wall=wall, floor=floor),
+        "depth image": Sources(depth=of.depth(folder / "depth.png"), focal=FOCAL, wall=wall, floor=floor),
         "fill table": Sources(height=tall, fill=fill, wall=wall, floor=floor),
         "tilt table": Sources(height=tall, tilt=tilt, wall=wall, floor=floor),
         "all tables and callipers": Sources(
