@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -257,7 +257,10 @@ def _points(sources: Sources, wall: float | None, floor: float | None, notes: li
             BAD_INPUT,
         )
     below = thick if floor is None else floor
-    return _Seen(radii_of(scan, thick, below), scan.height - (0.0 if scan.seen == "inner" else below), between, pixel)
+    radii = radii_of(scan, thick, below)
+    if sources.depth is not None:
+        radii = replace(radii, name="depth image")
+    return _Seen(radii, scan.height - (0.0 if scan.seen == "inner" else below), between, pixel)
 
 
 def _scanned(sources: Sources) -> tuple[Scan, float]:
