@@ -19,7 +19,7 @@ from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.draws import drawn_benches
 from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
-from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.calibration.scorecard import DRAWS, Scorecard
 from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed
@@ -126,7 +126,8 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
         measured = {prior.name: prior.mean for prior in plan.parameter_prior}
         plain = SimulationParameters.from_values(plan.fixed_parameters | measured) if rivals else None
-        return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain)
+        drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
+        return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain, drawn=drawn)
 
     found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
     return [*stages, found, StageDefinition(EVALUATION, evaluation)]
@@ -222,10 +223,15 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     found = calibrated_theta(results) if CALIBRATION in results else None
     if found is None or found.posterior is None or not found.posterior.thetas:
         raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
-    rows = found.posterior.thetas
-    kept = rows[:: max(len(rows) // POSTERIOR_DRAWS, 1)]
-    thetas = tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
-    return replace(deployment, thetas=thetas)
+    return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
+
+
+def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:
+    """So many draws of θ's posterior, or all that there are; none where it has none."""
+    rows = () if found.posterior is None else found.posterior.thetas
+    count = min(count, len(rows))
+    kept = [rows[i * len(rows) // count] for i in range(count)]
+    return tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
 
 
 def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:

@@ -128,6 +128,7 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
     evaluation = learnt_by(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
     rivals = {
+        "posterior": evaluation.posterior_mean,
         "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,

@@ -32,6 +32,7 @@ RECEIVED = "#009e73"
 FALLING = "#56b4e9"
 POURER = "#0072b2"
 ESCAPED = "#cc79a7"
+POSTERIOR = "#cc79a7"
 
 PARTICLE_STATES: tuple[tuple[str, str], ...] = (
     ("in the pourer", POURER),
