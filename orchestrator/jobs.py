@@ -76,6 +76,7 @@ def planned(
     receiver: VesselSpec | None = None,
     iterations: int | None = None,
     thetas: tuple[SimulationParameters, ...] = (),
+    left_over: float | None = None,
 ) -> CampaignPlan:
     """A campaign turned into D1 without pours, and its record.
 
@@ -85,6 +86,7 @@ def planned(
         receiver: in place of the campaign's.
         iterations: as the campaign says unless given.
         thetas: draws of a posterior, where its risk is to bear them.
+        left_over: shift that the calibration of θ left (`sim_engine.bands`); None: nobody knows.
 
     Raises:
         JobError: it has nothing to plan with.
@@ -112,6 +114,6 @@ def planned(
         name=f"{plan.name.removesuffix(PLANNED)}{PLANNED}",
         parameters=plan.parameters if theta is None else theta,
         calibration=None,
-        deployment=replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0),
+        deployment=replace(deployment, settings=settings, scenes=scenes, thetas=thetas, left_over=left_over, confirm=0),
     )
     return replace(found, resolved=record_of(plan.resolved, found))
