@@ -80,6 +80,9 @@ def planned(
 ) -> CampaignPlan:
     """A campaign turned into D1 without pours, and its record.
 
+    Unless the campaign has D1's own settings, each action is simulated once: simulations of other actions tell about
+    it, too, and its prediction is made with fresh seeds.
+
     Args:
         plan: of the campaign.
         theta: to plan with; the campaign's unless given.
@@ -108,6 +111,8 @@ def planned(
     if receiver is not None:
         scenes = (replace(scenes[0], name=f"plan:{receiver.name}", receiver=receiver),)
     changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
+    if not isinstance(deployment.settings, D1Settings):
+        changes["simulations_per_iteration"] = 1
     settings = D1Settings.like(deployment.settings, **changes)
     found = replace(
         plan,
