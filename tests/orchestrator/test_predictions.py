@@ -14,6 +14,8 @@ import pytest
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
+from orchestrator.config.load import load_campaign
+from orchestrator.jobs import planned
 from orchestrator.lanes import Deadlines, Lanes
 from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
@@ -36,6 +38,7 @@ from tests.orchestrator.reported import changed, shown
 from tests.orchestrator.toy import ToyLaboratory, run_toy, toy_plan
 from tests.orchestrator.toys import narrow_cup
 
+CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 ACTION = SCENE.action({"angular_velocity": 1.0, "x_offset": 0.1})
 
 
@@ -242,3 +245,10 @@ def test_what_is_asked_for_is_simulations_of_the_slots_that_are_free() -> None:
     assert len(strategy.ask(Slots(2))) == 1
     with pytest.raises(ValueError, match="not asked for"):
         strategy.tell(replace(first[0], seed=-1), Failed("simulation", ""))  # type: ignore[type-var]
+
+
+def test_a_plan_simulates_each_action_once_unless_the_campaign_says_how() -> None:
+    for name, simulations in ("quickstart", 15), ("recorded", 30):
+        deployment = planned(load_campaign(CAMPAIGNS / f"{name}.yaml")).deployment
+        assert deployment is not None
+        assert deployment.settings.simulations == simulations, name
