@@ -8,8 +8,8 @@ its best action x̂, more or less of it, and something more that nobody simulate
     y = f(x) + ε,    ε ~ N(0, (n_j + 0.15 μ_j(x))²)
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. h makes the
-valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. n, by which pours of one
-action differ, belongs to the hypothesis, too: a few pours nearby tell it. The last hypothesis is ignorance: the
+valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. n, by which pours of
+one action differ, belongs to the hypothesis, too: a few pours nearby tell it. The last hypothesis is ignorance: the
 simulator says nothing of this bench, and f is a GP around 0.6, more towards corners. The posterior weights are prior
 times marginal likelihood of the observations. So nothing is forgotten: a hypothesis that fails fades, and the weight of
 ignorance says how far the simulator is to be trusted.
@@ -47,16 +47,14 @@ LENGTHS = (0.15, 0.6)
 FARTHER = (0.4, 3.0)
 """Factors on a displacement's deviations, evenly by their logarithm: tails for a bench that is far off."""
 NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
-"""Smallest and largest deviation of one observation where nothing is lost, evenly by its logarithm; and what it grows by
-where everything is lost."""
+"""Smallest and largest deviation of one observation where nothing is lost, evenly by its logarithm; and what it grows
+by where everything is lost."""
 IGNORANT_MEAN, IGNORANT_SIGNAL = 0.6, 0.4
 IGNORANT_EDGE = 0.3
 """How much more ignorance expects in the corners than in the middle: a box is drawn around what may be good."""
-IGNORANT_LENGTHS, IGNORANT_NOISES = (
-    np.repeat((0.15, 0.3, 0.6), 3),
-    np.tile(NOISES[0] * (NOISES[1] / NOISES[0]) ** ((np.arange(3) + 0.5) / 3), 3),
-)
-"""ℓ and n of what ignorance consists of: three of each."""
+IGNORANT_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
+IGNORANT_NOISES = np.tile((0.003, 0.01, 0.03), 3)
+"""ℓ and n of what ignorance consists of: were its scatter fixed, pours that hardly scatter would speak against it."""
 KNOWN_SHARE = 0.75
 """Share of the hypotheses around displacements that were found before, where some were."""
 KNOWN_SPREAD = 0.25
