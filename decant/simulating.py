@@ -60,7 +60,7 @@ def simulate(
     seed: int = 0,
     seeds: int = 1,
 ) -> Simulation:
-    """Simulate an action in a campaign's scene.
+    """Simulate an action in a campaign's scene. Vessels whose shape may be off have another one with each seed.
 
     Args:
         campaign: whose vessels, liquid and motion these are: its first deployment's scene, else calibration's.
@@ -87,7 +87,10 @@ def simulate(
     if problems := check_vessels(scene, campaign.source):
         raise ValueError("\n".join(map(str, problems)))
     parameters = campaign.parameters if theta is None else theta
-    tasks = [PourTask(scene, chosen, parameters, seed + i, FRAME_RATE if i == 0 else 0.0) for i in range(seeds)]
+    tasks = [
+        PourTask(scene.drawn(seed + i), chosen, parameters, seed + i, FRAME_RATE if i == 0 else 0.0)
+        for i in range(seeds)
+    ]
     simulator = PourSimulator()
     try:
         return Simulation(tasks[0], tuple(simulator.simulate(task) for task in tasks))

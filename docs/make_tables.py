@@ -379,6 +379,8 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         inner = typing.get_args(annotation)
         if isinstance(inner[0], type) and issubclass(inner[0], Section):
             return f"list of: {_value(inner[0])}"
+        if typing.get_args(inner[0])[-1:] == (...,):
+            return "list of rows of numbers"
         return "`[x, y, z]`" if len(inner) == 3 else "list of `[r, z]`"
     if origin is dict:
         return "mapping"

@@ -171,10 +171,11 @@ def _dataclass_from_json(data: Any, hint: type[Any]) -> Any:
         raise CodecError(
             f"{hint.__name__} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"
         )
-    if missing := hints.keys() - data.keys():
+    defaults = {field.name for field in dataclasses.fields(hint) if field.default is not dataclasses.MISSING}
+    if missing := hints.keys() - data.keys() - defaults:  # what a later version added means what it meant before
         raise CodecError(f"{hint.__name__} lacks {', '.join(sorted(missing))}; was it written by an older version?")
     values = {}
-    for name in hints:
+    for name in (name for name in hints if name in data):
         try:
             values[name] = from_json(data[name], hints[name])
         except (CodecError, ValueError, TypeError) as error:

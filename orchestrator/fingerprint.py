@@ -17,6 +17,7 @@ from orchestrator.plan import CampaignPlan
 from sim_engine.liquid import Liquid
 from sim_engine.marks import BY_CONTENT, FREE, marks_of
 from sim_engine.task import Scene
+from sim_engine.vessel.spec import ProfileShape
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
@@ -45,7 +46,7 @@ def deciding(value: Any) -> Any:
         CodecError: it holds something that JSON can't.
     """
     if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
-        free = value.free_fields() if isinstance(value, Liquid) else frozenset()
+        free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else frozenset()
         fields = {
             name: (getattr(value, name), mark)
             for name, mark in marks_of(type(value)).items()

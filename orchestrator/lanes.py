@@ -116,8 +116,9 @@ class Lanes:
 
     async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
         rate = self._record_rate if record else 0.0
+        scene = self._scene(request.scene)
         task = PourTask(
-            self._scene(request.scene),
+            scene.drawn(request.seed) if request.drawn_shapes else scene,
             request.action,
             request.parameters,
             request.seed,

@@ -33,6 +33,8 @@ class Simulate:
     Attributes:
         purpose: one word for journal and monitor: 'calibrate', 'prior', 'refine', 'evaluate' …
         pose_error: with which it is executed; None: as intended.
+        drawn_shapes: whether vessels have shapes that they may as well have, drawn by `seed`; else those that were
+            measured.
     """
 
     scene: str
@@ -41,6 +43,7 @@ class Simulate:
     seed: int
     purpose: str = "simulate"
     pose_error: PoseError | None = None
+    drawn_shapes: bool = False
 
 
 @dataclass(frozen=True)

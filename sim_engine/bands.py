@@ -1,4 +1,4 @@
-"""How far a pour may come out from what was simulated of it: seeds, θ, what calibration left over, and resolution.
+"""How far a pour may come out from what was simulated of it: seeds, θ, shapes, what calibration left over, resolution.
 
 What lands beyond the rim is the tail of a stream whose landing places scatter about their median, to a good
 approximation normally: r = Φ(z), where z is the median's distance past the rim in the stream's own width. A simulator
@@ -45,7 +45,7 @@ class Band:
     Attributes:
         low, high: ends of the interval of r = spilled / poured; less than half a particle is nothing.
         level: probability that a pour lies in it.
-        simulations: standard deviation of r over the seeds, and the θ if they took turns.
+        simulations: standard deviation of r over the seeds, with the θ and the vessels' shapes if they took turns.
         discrepancy: that of what the best θ lacks beside weighed pours; None where nothing was calibrated.
         resolution: that of the number of particles.
     """
@@ -115,7 +115,8 @@ def band(spillages: Sequence[float], particles: int, discrepancy: float | None =
     """Where a single pour lies, given its simulations.
 
     Args:
-        spillages: r of simulations of the pour with fresh seeds, which may take turns with θ of a posterior; ≥ 1.
+        spillages: r of simulations of the pour with fresh seeds, which may take turns with θ of a posterior and with
+            shapes that the vessels may have; ≥ 1.
         particles: of a simulation.
         discrepancy: shift that the calibration left (standard deviation); None where nothing was calibrated.
         level: probability that a pour lies in it.
@@ -151,7 +152,7 @@ def band_of(outcomes: Sequence[PourOutcome], discrepancy: float | None = None) -
     """The band of one pour's simulations; None where none of them has a spillage.
 
     Args:
-        outcomes: of the same action, with fresh seeds, perhaps of several θ.
+        outcomes: of the same action, with fresh seeds, perhaps of several θ and shapes.
         discrepancy: as in `band`.
     """
     usable = [outcome for outcome in outcomes if outcome.invalid is None]

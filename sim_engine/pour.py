@@ -44,6 +44,8 @@ SETTLING = 0.15
 """The lattice may settle so long before the motion begins [s]."""
 
 PLANES_KEPT = 16
+VESSELS_KEPT = 32
+"""About 3 MB each; a prediction draws the shapes of uncertain vessels anew for each of its simulations."""
 
 
 def check_motion(
@@ -75,12 +77,16 @@ class PourSimulator:
         self._planes: dict[tuple[VesselSpec, float], NDArray[np.float32]] = {}
 
     def vessel(self, spec: VesselSpec) -> Vessel:
-        """A vessel, built once.
+        """A vessel, built once; the last few are kept.
 
         Raises:
             VesselError: it can't be built.
         """
         if spec not in self._vessels:
+            if len(self._vessels) >= VESSELS_KEPT:
+                oldest = next(iter(self._vessels))
+                del self._vessels[oldest]
+                self._masks.pop(oldest, None)
             self._vessels[spec] = build_vessel(spec)
         return self._vessels[spec]
 

@@ -47,6 +47,15 @@ class Scene:
         """The complete action of a searched point. Raises ValueError as `Action.compose` does."""
         return Action.compose(self.fixed, chosen)
 
+    @property
+    def uncertain(self) -> bool:
+        """Whether it is known how far the shape of one of its vessels may be off."""
+        return self.pourer.uncertain or self.receiver.uncertain
+
+    def drawn(self, seed: int) -> Scene:
+        """The scene with vessels as they may as well be, see `VesselSpec.drawn`."""
+        return replace(self, pourer=self.pourer.drawn(seed), receiver=self.receiver.drawn(seed))
+
 
 @dataclass(frozen=True)
 class PoseError:

@@ -10,8 +10,10 @@ from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
+    from sim_engine.action import Action
     from sim_engine.backend import Backend
     from sim_engine.liquid import SimulationParameters
+    from sim_engine.task import PourTask, Scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +60,28 @@ class Foretelling:
         """What simulations take turns with."""
         return self.drawn or (self.theta,)
 
-    @property
-    def said(self) -> str:
-        """What the bands hold, for people."""
+    def tasks(self, scene: Scene, action: Action, seed: int, seeds: int, record_rate: float = 0.0) -> list[PourTask]:
+        """The simulations of one pour: θ take turns, and vessels whose shape may be off have another each time.
+
+        Args:
+            seed: of the first one.
+            seeds: how many; as many as θ where those are more.
+            record_rate: frames of the first one [1/s].
+        """
+        from sim_engine.task import PourTask
+
+        turns, count = self.thetas, max(seeds, len(self.thetas))
+        return [
+            PourTask(scene.drawn(seed + i), action, turns[i % len(turns)], seed + i, 0.0 if i else record_rate)
+            for i in range(count)
+        ]
+
+    def said(self, scene: Scene) -> str:
+        """What the bands of a scene's pours hold, for people."""
         among = f"{len(self.drawn)} θ of the posterior" if self.drawn else "one θ"
         parts = ["seeds", among, f"{self.theta.particles} particles' resolution"]
+        if scene.uncertain:
+            parts.insert(1, "shapes that the vessels may have")
         if self.discrepancy is not None:
             parts.append("what calibration left over")
             return f"bands of {', '.join(parts[:-1])} and {parts[-1]}"

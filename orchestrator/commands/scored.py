@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from orchestrator.config.campaign.records import Table
     from orchestrator.plan import CampaignPlan, RecordedPour, RecordSet
     from orchestrator.scoring import ScoredRow
-    from sim_engine.liquid import SimulationParameters
     from sim_engine.outcome import PourOutcome
     from sim_engine.pour import PourSimulator
     from sim_engine.task import PourTask, Scene
@@ -48,10 +47,10 @@ def predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     with Refused(BackendError, at="--backend: "):
         require_backend(options.backend)
     simulator = PourSimulator(options.backend)
-    count = max(options.seeds, len(known.thetas))
-    tasks = [_tasks(scene, pour, known.thetas, options.seed, count) for pour in pours]
-    _check(simulator, table, source, [some[0] for some in tasks])
-    mention(f"{scene.name}: {len(pours)} pours, {count} simulations each, {known.said}")
+    tasks = [known.tasks(scene, pour.action, options.seed, options.seeds) for pour in pours]
+    _check(simulator, table, source, [some if scene.uncertain else some[:1] for some in tasks])
+    said = known.said(scene)
+    mention(f"{scene.name}: {len(pours)} pours, {len(tasks[0])} simulations each, {said}")
     outcomes = _simulated(simulator, tasks)
     rows = [
         _row(row.line, pour, some, known.discrepancy)
@@ -67,7 +66,7 @@ def predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
         from orchestrator.report.scored import draw_scored
 
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
-        mention(f"picture: {draw_scored(options.png, rows, title=title, note=known.said)}")
+        mention(f"picture: {draw_scored(options.png, rows, title=title, note=said)}")
     if options.as_json:
         print_json(
             {
@@ -152,15 +151,7 @@ def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[Table
     return table, pours
 
 
-def _tasks(
-    scene: Scene, pour: RecordedPour, thetas: Sequence[SimulationParameters], seed: int, count: int
-) -> list[PourTask]:
-    from sim_engine.task import PourTask
-
-    return [PourTask(scene, pour.action, thetas[i % len(thetas)], seed + i) for i in range(count)]
-
-
-def _check(simulator: PourSimulator, table: Table, source: Path, tasks: Sequence[PourTask]) -> None:
+def _check(simulator: PourSimulator, table: Table, source: Path, tasks: Sequence[Sequence[PourTask]]) -> None:
     """Refuse what can't be poured before Taichi starts.
 
     Raises:
@@ -175,9 +166,10 @@ def _check(simulator: PourSimulator, table: Table, source: Path, tasks: Sequence
         return f"checking motions, {done} of {len(tasks)}, {time.monotonic() - begin:.0f} s so far"
 
     with waiting_for(doing):
-        for row, task in zip(table.rows, tasks, strict=True):
+        for row, some in zip(table.rows, tasks, strict=True):
             try:
-                simulator.prepare(task)
+                for task in some:
+                    simulator.prepare(task)
             except InvalidSceneError as error:
                 problems.append(Problem(source, row.line, 1, "", str(error)))
             done += 1

@@ -44,7 +44,6 @@ def simulate(path: Path, options: SimulateOptions) -> None:
     from sim_engine.bands import band_of
     from sim_engine.pour import InvalidSceneError, PourSimulator
     from sim_engine.spread import spreads
-    from sim_engine.task import PourTask
 
     plan = read_campaign(path)
     known = foretelling(plan, options.parameters, options.thetas, options.seeds)
@@ -61,16 +60,13 @@ def simulate(path: Path, options: SimulateOptions) -> None:
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     record_rate = 20.0 if options.rrd or options.png else 0.0
-    turns = known.thetas
-    tasks = [
-        PourTask(scene, action, turns[i % len(turns)], options.seed + i, record_rate if i == 0 else 0.0)
-        for i in range(max(options.seeds, len(turns)))
-    ]
+    tasks = known.tasks(scene, action, options.seed, options.seeds, record_rate)
     with Refused(BackendError, at="--backend: "):
         require_backend(options.backend)
     simulator = PourSimulator(options.backend)
-    with Refused(InvalidSceneError):
-        simulator.prepare(tasks[0])  # refused before Taichi starts
+    with Refused(InvalidSceneError, at="with shapes that the vessels may have, " if scene.uncertain else ""):
+        for task in tasks if scene.uncertain else tasks[:1]:  # refused before Taichi starts
+            simulator.prepare(task)
     regime = _regimes(tasks[0])
     runs = _simulated(simulator, tasks)
     outcomes = [run.outcome for run in runs]
@@ -103,7 +99,8 @@ def simulate(path: Path, options: SimulateOptions) -> None:
         amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
         print(told(outcomes, over_seeds, amount))
         if where is not None:
-            print(f"spilled / poured {over_seeds['spillage'].percent()}, a pour: {where.percent()}   ({known.said})")
+            spilled = over_seeds["spillage"].percent()
+            print(f"spilled / poured {spilled}, a pour: {where.percent()}   ({known.said(scene)})")
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)

@@ -294,6 +294,9 @@ def _profile_file(name: str, outline: Outline, told: Sequence[str], doubts: Sequ
         f"  inner: [{points}]",
         f"  wall: {1e3 * shape.wall:.4g} mm",
         f"  floor: {1e3 * shape.floor:.4g} mm",
+        f"  height_deviation: {1e3 * shape.height_deviation:.3g} mm",
+        "  radius_deviations:",
+        *(f"    - [{', '.join(f'{1e3 * x:.3g}' for x in row)}]" for row in shape.radius_deviations),
     ]
     return "\n".join(lines) + "\n"
 

@@ -96,7 +96,10 @@ def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
     match shape:
         case ProfileShape():
             inner, thickness = [list(point) for point in shape.inner], {"wall": shape.wall, "floor": shape.floor}
-            profile = {"unit": "m", "inner": inner, **{key: f"{value!r} m" for key, value in thickness.items()}}
+            lengths = {**thickness, **({"height_deviation": shape.height_deviation} if shape.height_deviation else {})}
+            profile = {"unit": "m", "inner": inner, **{key: f"{value!r} m" for key, value in lengths.items()}}
+            if shape.radius_deviations:
+                profile["radius_deviations"] = [list(row) for row in shape.radius_deviations]
             return {"name": vessel.name, "profile": profile}
         case MeshShape():
             unit = {} if shape.unit is None else {"unit": shape.unit}

@@ -46,6 +46,13 @@ class ProfileSection(Section):
     floor: Thickness | None = None
     """Thickness of the floor, downwards."""
 
+    radius_deviations: tuple[tuple[Number, ...], ...] | None = None
+    """How well it is known: a row for each independent way in which the shape may be off, with how far outwards each
+    point of `inner` then is, one standard deviation. Predicted spillages are of shapes drawn by it."""
+
+    height_deviation: Annotated[float, Quantity("m", "0.3 mm", lower=0.0, upper=0.02)] | None = None
+    """Likewise the height of the rim, one standard deviation; all points move in proportion."""
+
 
 class VesselBase(Section):
     """A vessel: a profile of [r, z] points, a mesh of its solid, or what an installed package knows."""
@@ -177,8 +184,22 @@ def _profile(section: ProfileSection, place: Place, report: Report) -> ProfileSh
             place.at("unit"),
             f"in {section.unit} the vessel would be {largest * 1e3:g} mm large; vessels are 5 mm … 1 m. Is it right?",
         )
-    return (
-        ProfileShape(inner=points, wall=section.wall, floor=section.floor) if len(report.problems) == before else None
+    scale = parse_quantity(f"1 {section.unit}", "m", "1 mm")
+    rows = section.radius_deviations or ()
+    for i, row in enumerate(rows):
+        if len(row) != len(points):
+            report.add(
+                place.at("radius_deviations").at(i),
+                f"has {len(row)} number(s); should have one for each of the {len(points)} points of 'inner'",
+            )
+    if len(report.problems) > before:
+        return None
+    return ProfileShape(
+        inner=points,
+        wall=section.wall,
+        floor=section.floor,
+        radius_deviations=tuple(tuple(scale * x for x in row) for row in rows),
+        height_deviation=section.height_deviation or 0.0,
     )
 
 

@@ -40,7 +40,7 @@ class Foreseen(Learnt):
     """Different θ of a posterior that the seeds took turns with; 0 where θ is one."""
 
     touching: int
-    """Simulations whose cups touched because of an error."""
+    """Simulations whose cups touched because of an error, of the pose or of a shape."""
 
     over_seeds: dict[str, Spread]
     """Mean and standard deviation of every fraction, of 'spillage' r = spilled / poured, and of the 'loss'."""
@@ -51,6 +51,8 @@ class Foreseen(Learnt):
 
 class RepeatedSimulation:
     """Simulate an action again, for a prediction with its spread.
+
+    Vessels of which a file says how far their shape may be off have another one in each simulation.
 
     An action was chosen because its simulations spilled little: part of that was luck. Seeds that took no part in the
     choice tell what to expect, and how much a single pour differs from it.
@@ -89,13 +91,14 @@ class RepeatedSimulation:
         self.decisions: list[Decision] = []
         if action is not None:
             seeds_of_all = [seeds.next() for _ in range(count)]
-            turns, missed = thetas or (parameters,), errors or (None,)
+            turns, missed, drawn = thetas or (parameters,), errors or (None,), scene.uncertain
             self._unissued = [
-                Simulate(scene.name, action, turns[i % len(turns)], s, "predict", missed[i % len(missed)])
+                Simulate(scene.name, action, turns[i % len(turns)], s, "predict", missed[i % len(missed)], drawn)
                 for i, s in enumerate(seeds_of_all)
             ]
             among = f" and {len(set(thetas))} θ of the posterior" if thetas else ""
             among += f" under {len(errors)} draws of the pose error" if any(errors) else ""
+            among += ", each with shapes that the vessels may have" if drawn else ""
             self.decisions.append(Decision(f"simulate the planned action with {count} fresh seeds{among}"))
         self._thetas = len(set(thetas))
         self._touching = 0
@@ -125,7 +128,7 @@ class RepeatedSimulation:
         if isinstance(outcome, Simulated) and cost is not None:
             self._outcomes.append(outcome.outcome)
             self._losses.append(costing.total(cost))
-        elif cost is not None and request.pose_error is not None:
+        elif cost is not None and (request.pose_error is not None or request.drawn_shapes):
             self._touching += 1
             self._losses.append(costing.total(cost))
         else:

@@ -6,6 +6,7 @@ Small, hashable values that travel to any process.
 from __future__ import annotations
 
 import hashlib
+import random
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +16,9 @@ from sim_engine.doors import Door, DoorError
 from sim_engine.marks import BY_CONTENT
 
 LengthUnit = Literal["m", "cm", "mm", "in"]
+
+NARROWEST = 2e-4
+"""Radii of drawn profiles are kept above this [m]: a cup has no inside out."""
 
 
 class Shape(BaseModel):
@@ -49,16 +53,43 @@ class Shape(BaseModel):
 
 class ProfileShape(Shape):
     """Surface of revolution. `inner` runs from the axis at the inner floor to the rim, as (r, z) points [m], z measured
-    from the inner floor's lowest point; the wall is `wall` thick outwards and `floor` thick below."""
+    from the inner floor's lowest point; the wall is `wall` thick outwards and `floor` thick below.
+
+    `radius_deviations` has a row for each independent way in which it may be off: how far outwards each point then is,
+    one standard deviation [m]. `height_deviation` is that of the rim's height, all points moving in proportion [m]."""
 
     kind: Literal["profile"] = "profile"
     inner: tuple[tuple[float, float], ...]
     wall: float
     floor: float
+    radius_deviations: tuple[tuple[float, ...], ...] = ()
+    height_deviation: float = 0.0
 
     def outline(self) -> ProfileShape:
         """See `Shape.outline`."""
         return self
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether it is known how far it may be off."""
+        return bool(self.radius_deviations) or self.height_deviation > 0.0
+
+    def drawn(self, rng: random.Random) -> ProfileShape:
+        """A shape that it may as well have, certain itself: a normal number for each way in which it may be off."""
+        moved = [0.0] * len(self.inner)
+        for row in self.radius_deviations:
+            by = rng.gauss(0.0, 1.0)
+            moved = [m + by * d for m, d in zip(moved, row, strict=True)]
+        stretch = 1.0 + rng.gauss(0.0, 1.0) * self.height_deviation / self.inner[-1][1]
+        # only the floor's centre lies on the axis
+        inner = (
+            (max(r + m, NARROWEST) if r > 0.0 else r, z * stretch) for (r, z), m in zip(self.inner, moved, strict=True)
+        )
+        return ProfileShape(inner=tuple(inner), wall=self.wall, floor=self.floor)
+
+    def free_fields(self) -> frozenset[str]:
+        """Fields that decide no request: how far it may be off, where nobody said so."""
+        return frozenset() if self.uncertain else frozenset({"radius_deviations", "height_deviation"})
 
 
 class MeshShape(Shape):
@@ -120,6 +151,23 @@ class VesselSpec(BaseModel):
 
     name: str
     shape: Annotated[SerializeAsAny[Shape], BeforeValidator(_of_its_kind)]
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether it is known how far its shape may be off."""
+        outline = self.shape.outline()
+        return outline is not None and outline.uncertain
+
+    def drawn(self, seed: int) -> VesselSpec:
+        """The vessel with a shape that it may as well have; itself where nobody said how far it may be off.
+
+        Args:
+            seed: the same one gives a vessel the same shape, in whatever scene it stands.
+        """
+        outline = self.shape.outline()
+        if outline is None or not outline.uncertain:
+            return self
+        return VesselSpec(name=self.name, shape=outline.drawn(random.Random(f"{seed} {self.name}")))
 
     def content_hash(self) -> str:
         """Hash of everything that determines the geometry (the mesh file's bytes, not its path): the cache key.

@@ -183,3 +183,10 @@ def test_the_first_difference_is_named() -> None:
     assert first_difference(old, {**old, "points": [1.0, 2.5]}) == "points[1]: 2.0 became 2.5"
     assert first_difference(old, {**old, "action": {"x_offset": 0.2}}) == "action.x_offset: 0.1 became 0.2"
     assert first_difference(old, {**old, "new": 1}) == "new: nothing became 1"
+
+
+def test_a_request_of_a_version_without_drawn_shapes_is_read() -> None:
+    request = Simulate("cup", Action(angular_velocity=1.0, x_offset=0.1, height=0.05), SimulationParameters(), 1)
+    written = encode_request(request)
+    del written["drawn_shapes"]
+    assert decode_request(written) == request

@@ -12,6 +12,7 @@ import pytest
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
+from orchestrator.lanes import Deadlines, Lanes
 from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
 from orchestrator.report.units import loss_unit
@@ -25,6 +26,7 @@ from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from orchestrator.tally import Tally
 from sim_engine.losses import Loss
+from sim_engine.vessel.spec import VesselSpec
 from tests.orchestrator import watched
 from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan
 from tests.orchestrator.reported import changed, shown
@@ -64,6 +66,40 @@ def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> Non
     assert strategy.progress() == Progress(5, 5)
     assert Play(narrow_cup)(repeated()).simulations == Play(narrow_cup)(repeated()).simulations
     assert Play(narrow_cup)(repeated(seed=4)).simulations != played.simulations
+
+
+def measured_cup() -> VesselSpec:
+    """The scene's receiver, known to half a millimetre."""
+    shape = SCENE.receiver.shape.model_copy(update={"radius_deviations": ((0.0, 5e-4, 5e-4),)})
+    return SCENE.receiver.model_copy(update={"shape": shape})
+
+
+def test_a_prediction_simulates_a_measured_vessel_with_another_shape_each_time() -> None:
+    scene = replace(SCENE, receiver=measured_cup())
+    strategy = RepeatedSimulation(Costing(Loss(), scene, THETA), ACTION, 4, 3)
+    requests = Play(narrow_cup)(strategy).simulations
+    laboratory = ToyLaboratory()
+
+    async def run() -> None:
+        lanes = Lanes(laboratory, {scene.name: scene}, Deadlines(), 0.0)
+        for request in (*requests, replace(requests[0], purpose="plan", drawn_shapes=False)):
+            await lanes.simulate(request, record=False, started=lambda: None)
+
+    asyncio.run(run())
+    *predicted, planned = (task.scene for task in laboratory.simulators.tasks)
+    radii = {shape.inner[-1][0] for one in predicted if (shape := one.receiver.shape.outline()) is not None}
+    assert len(radii) == 4
+    assert {one.pourer for one in predicted} == {SCENE.pourer}
+    assert planned == scene
+
+
+def test_a_shape_in_which_the_cups_would_touch_is_the_worst_and_not_lost() -> None:
+    scene = replace(SCENE, receiver=measured_cup())
+    answers = iter([Failed("invalid_action", "cups touch")])
+    strategy = RepeatedSimulation(Costing(Loss(), scene, THETA), ACTION, 4, 3)
+    Play(narrow_cup, answer=lambda request: next(answers, None))(strategy)
+    result: Any = strategy.result()
+    assert (result.touching, result.simulations_lost, result.over_seeds["loss"].count) == (1, 0, 4)
 
 
 def test_simulations_that_failed_are_counted_and_left_out_of_the_prediction() -> None:

@@ -50,6 +50,26 @@ def test_cylinder_has_the_dimensions_of_its_spec() -> None:
     assert mesh_volume(BEAKER) == pytest.approx(solid, rel=2e-3)  # a circle of 96 corners lacks 0.07 % of its area
 
 
+def test_shapes_that_a_measured_vessel_may_have_scatter_as_it_was_measured() -> None:
+    rows = ((0.0, 3e-4, 3e-4, 0.0), (0.0, 0.0, 2e-4, 4e-4))
+    inner = ((0.0, 0.0), (0.03, 0.0), (0.03, 0.05), (0.03, 0.1))
+    shape = ProfileShape(inner=inner, wall=0.003, floor=0.003, radius_deviations=rows, height_deviation=5e-4)
+    cup = VesselSpec(name="cup", shape=shape)
+    drawn = [cup.drawn(seed) for seed in range(2_000)]
+    points = np.array([one.shape.outline().inner for one in drawn])  # type: ignore[union-attr]
+    np.testing.assert_allclose(points.mean(axis=0), inner, atol=5e-5)
+    np.testing.assert_allclose(points[:, 1:, 0].std(axis=0), np.hypot(*rows)[1:], rtol=0.05)
+    assert np.corrcoef(points[:, 1, 0], points[:, 3, 0])[0, 1] == pytest.approx(0.0, abs=0.06), "rows are independent"
+    assert points[:, 3, 1].std() == pytest.approx(5e-4, rel=0.05)
+    assert cup.drawn(7) == drawn[7], "a seed is a shape"
+    assert not drawn[7].uncertain
+    assert build_vessel(drawn[7]).capacity != build_vessel(cup).capacity
+
+
+def test_a_vessel_of_which_nobody_says_how_far_it_may_be_off_is_drawn_as_it_is() -> None:
+    assert BEAKER.spec.drawn(3) is BEAKER.spec
+
+
 def test_lip_lies_on_the_inner_edge_in_the_direction_of_the_pour() -> None:
     for direction in (0.0, 0.4, 3.0, -1.3, 7.0):
         expected = [0.04 * math.cos(direction), 0.04 * math.sin(direction), 0.104]

@@ -39,6 +39,9 @@ BENDS = (0.01, 0.06, 0.3)
 LEVEL = 0.5
 """Standard deviation of that mean before anything is known, as a share of the first guess."""
 
+KEPT = 0.9
+"""Share of the radii's variance that a vessel's file keeps."""
+
 SMALLEST = 2e-4
 """Radii are kept above this [m]: a cup has no inside out."""
 
@@ -132,12 +135,34 @@ class Outline:
         return float(np.sqrt(np.trapezoid(self.deviations**2, self.heights) / self.heights[-1]))
 
     def shape(self, tolerance: float = 5e-5) -> ProfileShape:
-        """As a vessel's file has it: as few points as stay within a tolerance [m] of the curve."""
+        """As a vessel's file has it: as few points as stay within a tolerance [m] of the curve and of its deviations.
+
+        Those are the covariance's leading eigenvectors, so many that `KEPT` of the variance is in them at each height.
+        """
         from sim_engine.vessel.profile import simplified
 
+        variances, ways = np.linalg.eigh(self.covariance)
+        variances, ways = variances[::-1], ways[:, ::-1]
+        rows = np.sqrt(np.maximum(variances, 0.0))[:, None] * ways.T
+        held = np.cumsum(rows**2, axis=0) >= KEPT * self.deviations**2 - tolerance**2
+        rows = rows[: 1 + int(np.argmax(held.all(axis=1)))]
         curve = np.vstack([[0.0, 0.0], np.column_stack([self.radii, self.heights])])
-        points = np.round(simplified(curve, tolerance), 5)
-        return ProfileShape(inner=tuple((float(r), float(z)) for r, z in points), wall=self.wall, floor=self.floor)
+        z = simplified(curve, tolerance)[1:, 1]
+        for row in rows:
+            z = np.union1d(z, simplified(np.column_stack([row, self.heights]), tolerance)[:, 1])
+
+        def at(values: Floats) -> list[float]:
+            return [float(x) for x in np.round(np.interp(z, self.heights, values), 5)]
+
+        points = [(0.0, 0.0), *zip(at(self.radii), at(self.heights), strict=True)]
+        deviations = tuple((0.0, *at(row)) for row in rows)
+        return ProfileShape(
+            inner=tuple(points),
+            wall=self.wall,
+            floor=self.floor,
+            radius_deviations=tuple(row for row in deviations if any(row)),
+            height_deviation=self.height_deviation,
+        )
 
 
 def find_outline(

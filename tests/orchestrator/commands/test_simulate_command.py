@@ -130,3 +130,21 @@ def test_simulate_takes_units_parameters_and_another_receiver(
     assert outcome["particles"] == 350
     assert (outcome["action"]["angular_velocity"], outcome["action"]["x_offset"]) == pytest.approx((1.5, 0.08))
     assert outcome["scene"] == "beaker into tumbler"
+
+
+def test_a_cup_whose_shape_may_be_off_has_a_wider_band(inputs: Path) -> None:
+    cup = "name: tumbler\nprofile: {unit: mm, inner: [[0, 0], [32, 0], [32, 100]], wall: 4 mm, floor: 4 mm"
+    (inputs / "known.yaml").write_text(cup + "}\n", encoding="utf-8")
+    (inputs / "off.yaml").write_text(cup + ", radius_deviations: [[0, 3, 3]]}\n", encoding="utf-8")
+    printed = {}
+    for name in ("known", "off"):
+        done = process(f"{SIMULATE.replace('70', '120')} --seed 6 --seeds 4 --receiver {name}.yaml", inputs)
+        assert done.returncode == 0, done.stderr
+        printed[name] = done.stdout
+    low, high = ([float(end) for end in _BAND.findall(text)[0]] for text in printed.values())
+    assert high[1] - high[0] > 1.5 * (low[1] - low[0])
+    assert "shapes that the vessels may have" in printed["off"]
+    assert "shapes" not in printed["known"]
+
+
+_BAND = re.compile(r"a pour: (\d+\.\d) … (\d+\.\d) %")

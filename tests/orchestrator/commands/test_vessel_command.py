@@ -13,6 +13,7 @@ from orchestrator.commands.speaking import RefusalError
 from orchestrator.commands.vessel import Sources, vessel
 from orchestrator.config.load import load_vessel
 from sim_engine.vessel.build import build_vessel
+from sim_engine.vessel.profile import volume
 from tests.measured import Bench
 
 VESSELS = Path("configs/vessels")
@@ -111,6 +112,15 @@ def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsy
         deviations.append(told["capacity_deviation_mL"])
         assert abs(told["capacity_mL"] - 1e6 * of.vessel.capacity) < 3.0 * told["capacity_deviation_mL"]
     assert deviations[2] < min(deviations[:2])
+
+
+@pytest.mark.parametrize("door", [callipers, fill, photo])
+def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) -> None:
+    made(tmp_path, door(bench("cone"), tmp_path))
+    told = float((tmp_path / "made.yaml").read_text().partition("±")[2].split()[0])
+    found = load_vessel(tmp_path / "made.yaml")
+    capacities = [volume(np.array(found.drawn(seed).shape.inner)) for seed in range(200)]  # type: ignore[attr-defined]
+    assert 1e6 * np.std(capacities) == pytest.approx(told, rel=0.25)
 
 
 def test_a_brimful_cup_that_weighs_otherwise_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,6 +29,10 @@ BAD_VESSELS = {
     "mesh of another kind": ("name: mug\nmesh: mug.step\n", "2:7: mesh: .step is not a mesh; use STL, OBJ, PLY or GLB"),
     "mesh that is not there": ("name: mug\nmesh: mug.stl\n", "2:7: mesh: no such file: "),
     "two shapes": (VESSEL + "mesh: mug.stl\n", "7:1: mesh: the vessel has a profile already"),
+    "too few deviations": (
+        VESSEL.rstrip() + "\n  radius_deviations: [[0, 1, 1], [0, 1]]\n",
+        "7:34: profile.radius_deviations[1]: has 2 number(s); should have one for each of the 3 points of 'inner'",
+    ),
     "unknown unit": (VESSEL.replace("unit: mm", "unit: feet"), "profile.unit: 'feet' is not known here; should be"),
 }
 

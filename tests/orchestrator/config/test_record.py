@@ -68,12 +68,22 @@ def test_cells_of_a_study_are_kept_in_the_language_of_campaigns(name: str, tmp_p
     assert len(kinds) > 4
 
 
-@pytest.mark.parametrize("vessel", ["tumbler.yaml", "mug.yaml"])
+MEASURED = """
+name: cup
+profile: {unit: mm, inner: [[0, 0], [32, 0], [33, 99]], wall: 3 mm, floor: 4 mm,
+          radius_deviations: [[0, 0.21, 0.13], [0, 0.1, -0.1]], height_deviation: 0.3 mm}
+"""
+
+
+@pytest.mark.parametrize("vessel", ["tumbler.yaml", "mug.yaml", "measured.yaml"])
 def test_a_planning_run_keeps_the_theta_and_the_vessel_that_it_planned_with(vessel: str, tmp_path: Path) -> None:
     campaign = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
+    (tmp_path / "measured.yaml").write_text(MEASURED)
     theta = tmp_path / "theta.json"
     theta.write_text(json.dumps({"theta": {"cohesion": 0.0123456789}}))
-    planned = planning_plan(campaign, theta, CONFIGS / "vessels" / vessel, 3)
+    planned = planning_plan(
+        campaign, theta, (tmp_path if vessel.startswith("measured") else CONFIGS / "vessels") / vessel, 3
+    )
     again = reloaded(planned, tmp_path)
     assert again.parameters.cohesion == 0.0123456789
     assert [scene.receiver for scene in again.deployment.scenes] == [s.receiver for s in planned.deployment.scenes]  # type: ignore[union-attr]
