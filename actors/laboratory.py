@@ -24,19 +24,21 @@ from actors.ray_watch import watch_ray
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
-from actors.spec import LaboratorySpec
+from actors.simulation.processes import ProcessSimulatorPool
+from actors.spec import LaboratorySpec, simulator_count
 from sim_engine.extras import installed
 
 if TYPE_CHECKING:
     from actors.cluster.joined import JoinedCluster
 
 
-def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
+def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = False) -> None:
     """Whether what a laboratory needs, on this machine and from others, is there. Starts nothing that stays.
 
     Args:
         spec: where to run.
         need_bench: whether pours will be asked for.
+        brief: see `open_laboratory`.
 
     Raises:
         LaboratoryError: with what is wrong and what would be right.
@@ -46,7 +48,7 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
             "(--laboratory configs/laboratories/twin.yaml)"
         )
-    if not spec.in_process and not installed("ray"):
+    if not _without_ray(spec, need_bench=need_bench, brief=brief) and not installed("ray"):
         raise LaboratoryError(
             f"laboratory {spec.name}: simulators side by side need Ray, which is not installed: pip install "
             "'decant[lab]', or run with --in-process, one simulation after the other"
@@ -57,10 +59,15 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool) -> None:
         check_cluster(spec.ray, need_bench=need_bench)
 
 
+def _without_ray(spec: LaboratorySpec, *, need_bench: bool, brief: bool) -> bool:
+    return spec.in_process or (brief and spec.ray is None and not need_bench)
+
+
 def open_laboratory(
     spec: LaboratorySpec,
     *,
     need_bench: bool,
+    brief: bool = False,
     make: Callable[[], Simulator] = pour_simulator,
     operator: Operator | None = None,
     kept: ClosablePool | None = None,
@@ -71,6 +78,8 @@ def open_laboratory(
     Args:
         spec: where to run.
         need_bench: whether pours will be asked for.
+        brief: for work of seconds that a person waits for: simulators in plain processes, which are there before a
+            private Ray would be. Where a bench is needed, or a cluster named, it is as ever.
         make: makes simulators, where they run.
         operator: who answers questions, where a person does.
         kept: simulators that outlive the laboratory, in place of its own (`actors.warm`). Not on a cluster, whose
@@ -88,8 +97,9 @@ def open_laboratory(
         raise LaboratoryError(
             f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
         )
-    if spec.in_process:
-        kind: type[InProcessLaboratory | RayLaboratory] = InProcessLaboratory
+    kind: Callable[..., InProcessLaboratory | RayLaboratory]
+    if _without_ray(spec, need_bench=need_bench, brief=brief):
+        kind = partial(InProcessLaboratory, processes=0 if spec.in_process else simulator_count(spec))
     else:
         kind = RayLaboratory
         if spec.ray is not None:
@@ -215,14 +225,22 @@ def _local(name: str, cls: type[Any], *args: Any) -> Device:
 
 
 class InProcessLaboratory(_OpenLaboratory):
-    """Everything in threads of this process: for fast tests and single commands.
+    """Everything in threads of this process, or with simulators in plain processes beside it: for fast tests and single
+    commands.
 
-    The hidden liquid shares the one simulator with the pool (a process has one Taichi), so that nothing is simulated
-    while the bench computes its liquid. Outcomes are those of `RayLaboratory`.
+    Without those the hidden liquid shares the one simulator with the pool (a process has one Taichi), so that nothing
+    is simulated while the bench computes its liquid. Outcomes are those of `RayLaboratory`.
     """
 
+    def __init__(self, *args: Any, processes: int = 0, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._processes = processes
+
     async def __aenter__(self) -> InProcessLaboratory:
-        self._pool = self._kept or InProcessSimulatorPool(make=self._make)
+        if self._kept is None and self._processes:
+            self._pool = ProcessSimulatorPool(self._processes, make=self._make)
+        else:
+            self._pool = self._kept or InProcessSimulatorPool(make=self._make)
         self._optimizer = self._kept_optimizer or self._own_optimizer(LocalDevice("optimiser", Proposer))
         try:
             if self._needs_bench:
@@ -289,7 +307,6 @@ class RayLaboratory(_OpenLaboratory):
 
     def _open_pool(self) -> RaySimulatorPool:
         from actors.cluster.versions import versions
-        from actors.ray_private import simulator_count
 
         def tell(text: str) -> None:
             self._tell(Notice("warning", text))

@@ -26,7 +26,7 @@ import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a p
 
 from actors.protocols import LaboratoryError
 from actors.ray_warden import MARK, end_cluster
-from actors.spec import LaboratorySpec
+from actors.spec import LaboratorySpec, simulator_count
 
 _LONGEST_FOLDER = 40
 """Ray puts sockets some 65 characters below its folder, and a socket's path may have 107."""
@@ -39,11 +39,6 @@ _NEEDLESS = ("start_api_server", "start_monitor", "start_log_monitor")
 
 _TOKEN = secrets.token_hex(32)
 """Without it nobody else on this machine may talk to our Ray. One per process, since Ray reads it only once."""
-
-
-def simulator_count(spec: LaboratorySpec) -> int:
-    """Size of the pool: as stated, or one per core."""
-    return spec.simulators or os.cpu_count() or 1
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -61,3 +62,8 @@ class LaboratorySpec:
     def pours(self) -> bool:
         """Whether there is a bench."""
         return self.arm is not None or self.bench is not None
+
+
+def simulator_count(spec: LaboratorySpec) -> int:
+    """Size of the pool on this machine: as stated, or one per core."""
+    return spec.simulators or os.cpu_count() or 1

@@ -15,7 +15,7 @@ from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
 from actors.simulation.shared import FairPool, Share
-from actors.spec import LaboratorySpec
+from actors.spec import LaboratorySpec, simulator_count
 
 
 class WarmSimulators:
@@ -78,7 +78,6 @@ class WarmSimulators:
             self._fair = FairPool(self._pool)
 
     async def _open_ray(self) -> RaySimulatorPool:
-        from actors.ray_private import simulator_count
         from actors.ray_runtime import keep_signals, start_ray, stop_ray
 
         starting = asyncio.ensure_future(asyncio.to_thread(start_ray, self._spec))

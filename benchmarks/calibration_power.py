@@ -8,9 +8,9 @@
 Sets: the campaign's own calibration (C4), again and again with one more parameter to search and the same budget. What
 is not searched has the campaign's fixed value, or Decant's default; the number of particles, where the campaign doesn't
 fix it, that of `--particles`. θ* is then simulated on each recorded pour: mean |measured − simulated| of the normalised
-spillage on training, test and transfer pours. The first row calibrates nothing. With `--known` a last row searches all
-but these, which have the values given: what somebody knows of the walls, say. With `--as-it-is` the only row is what
-the campaign itself searches.
+spillage on training, test and transfer pours; beside it the same of the mean over draws of θ's posterior. The first row
+calibrates nothing. With `--known` a last row searches all but these, which have the values given: what somebody knows
+of the walls, say. With `--as-it-is` the only row is what the campaign itself searches.
 
 Folds: all pours of the campaign's scene, by angular velocity, are dealt to the folds in turn, so that each has slow and
 fast ones. θ*, of what the campaign searches, comes of all other folds; the fold's pours judge it. Beside it what needs
@@ -42,11 +42,20 @@ from orchestrator.fingerprint import fingerprint
 from orchestrator.flights import Flight, free_slots, next_to_tell
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
-from orchestrator.stages import CALIBRATION, calibrated_theta, calibration_stages, measured_pours, scenes_of, stage_seed
+from orchestrator.stages import (
+    CALIBRATION,
+    calibrated_theta,
+    calibration_stages,
+    measured_pours,
+    posterior_draws,
+    scenes_of,
+    stage_seed,
+)
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
+from orchestrator.strategies.calibration.scorecard import DRAWS
 from orchestrator.strategies.protocol import Strategy
 from sim_engine.cache import cache_directory
 from sim_engine.errors import InvalidSceneError
@@ -172,18 +181,24 @@ def calibrate(plan: CampaignPlan, seed: int, label: str, splits: Sequence[str]) 
     assert calibration is not None
     answers, begun = Answers(plan), time.process_time()
     theta = SimulationParameters.from_values(calibration.fixed_parameters)
+    drawn: Sequence[SimulationParameters] = ()
     if calibration.simulations > 0:
         (stage,) = (stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION)
         strategy = stage.build({}, stage_seed(seed, stage.name))
         play(strategy, answers, plan.parallel_simulations, label)
-        theta = calibrated_theta({CALIBRATION: strategy.result()}).theta
+        found = calibrated_theta({CALIBRATION: strategy.result()})
+        theta, drawn = found.theta, posterior_draws(found, DRAWS)
     pours = [scored for scored in recorded(calibration) if scored.pour.split in splits]
     judge = Evaluation({"theta": theta}, pours, stage_seed(seed, "evaluation"))
     play(judge, answers, plan.parallel_simulations, f"{label}, θ*")
+    draws = {f"posterior {k}": one for k, one in enumerate(drawn, 1)}
+    among = Evaluation(draws, pours, stage_seed(seed, "evaluation") + 1)
+    play(among, answers, plan.parallel_simulations, f"{label}, posterior")
     answers.close()
     return {
         "theta": theta.model_dump(),
         "discrepancy": {split: judge.discrepancy("theta", split) for split in splits},
+        "posterior": {split: among.posterior_mean(split) for split in splits},
         "errors": [
             abs(pair.measured - pair.simulated)
             for pair in judge.result().pairs
@@ -263,6 +278,8 @@ def set_row(name: str, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         values = [one["discrepancy"][split] for one in found if one["discrepancy"].get(split) is not None]
         row[split] = round(statistics.mean(values), 4) if values else None
         row[f"{split}_seeds"] = [round(value, 4) for value in values]
+        means = [one["posterior"][split] for one in found if one["posterior"].get(split) is not None]
+        row[f"{split}_posterior_seeds"] = [round(value, 4) for value in means]
     row["thetas"] = [_rounded(one["theta"]) for one in found]
     row["cpu_s"] = round(sum(one["cpu_s"] for one in found), 1)
     return row

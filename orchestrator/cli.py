@@ -133,7 +133,8 @@ def plan(
 ) -> None:
     """Plan a pour in simulation (D1), for the campaign's receivers or one that it never saw.
 
-    Nothing is poured. Actions are shown in deg, deg/s, mm and s.
+    Fifteen actions are simulated, as many at a time as there are cores, and the planned one again with fresh seeds: its
+    prediction and band are made of these. Nothing is poured. Actions are shown in deg, deg/s, mm and s.
     """
     options = given(locals(), "campaign")
     from orchestrator.commands import campaigns

@@ -32,8 +32,8 @@ THOUGHT = 0.2
 """Time between two pours beside them: a question to the optimiser, the journal [s]."""
 
 ENOUGH = 4
-"""Simulations of a stage after which its pace counts; what is expected of it still counts as so many."""
-
+"""Simulations, or pours, of a stage after which its pace counts; what is expected of it still counts as so many
+simulations, and as one pour."""
 
 RECENT = 5
 """Pours that count for the next ones: a person finds a pace, and other programs come and go."""
@@ -198,11 +198,12 @@ class Forecast:
 
     def _cycle(self, stage: _Stage) -> float:
         """Seconds from the end of a pour to the end of the next."""
-        if len(stage.cycles) >= 2:
-            return _usual(stage.cycles[-RECENT:])
-        # the plan's own time counts as a pour that was seen: the first one may have started the simulator of a bench
-        pour = median_low([stage.work.pour_time, *self._pours[-RECENT:]])
-        return max(pour, stage.work.beside * self._price(stage)) + THOUGHT
+        seen = self._pours[-RECENT:] if len(self._pours) >= ENOUGH else ()
+        pour = median_low([stage.work.pour_time, *seen])
+        expected = max(pour, stage.work.beside * self._price(stage)) + THOUGHT
+        cycles = [*stage.cycles[-RECENT:], *[expected] * max(ENOUGH - len(stage.cycles), 1)]
+        unusual = 2 if len(stage.cycles) <= RECENT else 1  # the first two start a bench, and what is made beside them
+        return _mean(sorted(cycles)[:-unusual])
 
 
 def _made_before(event: RequestFinished) -> bool:

@@ -76,8 +76,12 @@ def planned(
     receiver: VesselSpec | None = None,
     iterations: int | None = None,
     thetas: tuple[SimulationParameters, ...] = (),
+    left_over: float | None = None,
 ) -> CampaignPlan:
     """A campaign turned into D1 without pours, and its record.
+
+    Unless the campaign has D1's own settings, each action is simulated once: simulations of other actions tell about
+    it, too, and its prediction is made with fresh seeds.
 
     Args:
         plan: of the campaign.
@@ -85,6 +89,7 @@ def planned(
         receiver: in place of the campaign's.
         iterations: as the campaign says unless given.
         thetas: draws of a posterior, where its risk is to bear them.
+        left_over: shift that the calibration of θ left (`sim_engine.bands`); None: nobody knows.
 
     Raises:
         JobError: it has nothing to plan with.
@@ -106,12 +111,14 @@ def planned(
     if receiver is not None:
         scenes = (replace(scenes[0], name=f"plan:{receiver.name}", receiver=receiver),)
     changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
+    if not isinstance(deployment.settings, D1Settings):
+        changes["simulations_per_iteration"] = 1
     settings = D1Settings.like(deployment.settings, **changes)
     found = replace(
         plan,
         name=f"{plan.name.removesuffix(PLANNED)}{PLANNED}",
         parameters=plan.parameters if theta is None else theta,
         calibration=None,
-        deployment=replace(deployment, settings=settings, scenes=scenes, thetas=thetas, confirm=0),
+        deployment=replace(deployment, settings=settings, scenes=scenes, thetas=thetas, left_over=left_over, confirm=0),
     )
     return replace(found, resolved=record_of(plan.resolved, found))

@@ -216,6 +216,7 @@ class DeploymentPlan(StagePlan):
         thetas: draws of a posterior, equally likely, for settings that need them, where no calibration of the same
             campaign makes them.
         bench: how the bench may differ from the simulator, equally likely, as far as anything is known of it.
+        left_over: shift that a calibration left (`sim_engine.bands`), likewise; None where nobody knows.
     """
 
     settings: DeploymentSettings
@@ -228,6 +229,7 @@ class DeploymentPlan(StagePlan):
     confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
     bench: tuple[Displacement, ...] = ()
+    left_over: float | None = None
 
     @property
     def pours(self) -> int:

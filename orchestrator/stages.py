@@ -18,8 +18,8 @@ from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
 from orchestrator.strategies.calibration.draws import drawn_benches
-from orchestrator.strategies.calibration.evaluation import ScoredPour, random_parameters
-from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.calibration.evaluation import ScoredPour, Scores, random_parameters
+from orchestrator.strategies.calibration.scorecard import DRAWS, Scorecard, shift_left_over
 from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed
@@ -126,7 +126,8 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
         measured = {prior.name: prior.mean for prior in plan.parameter_prior}
         plain = SimulationParameters.from_values(plan.fixed_parameters | measured) if rivals else None
-        return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain)
+        drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
+        return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain, drawn=drawn)
 
     found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
     return [*stages, found, StageDefinition(EVALUATION, evaluation)]
@@ -156,7 +157,8 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            known = with_bench(with_posterior(deployment, results), results, _theta(plan, results))
+            known = with_left_over(with_posterior(deployment, results), results)
+            known = with_bench(known, results, _theta(plan, results))
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
         return build
@@ -183,14 +185,12 @@ def prediction_stages(
     deployment: DeploymentPlan,
     seeds: int,
     thetas: Sequence[SimulationParameters] = (),
-    discrepancy: float | None = None,
 ) -> list[StageDefinition]:
     """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
 
     Args:
         seeds: how many, each.
         thetas: draws of a posterior that the seeds take turns with; none: the θ that was planned with.
-        discrepancy: shift that the calibration left over (`sim_engine.bands`); None: nobody knows.
     """
 
     def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
@@ -202,7 +202,7 @@ def prediction_stages(
             draws = known.settings.draws(known, theta, seeds, seed)
             drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
             errors = [draw.error for draw in draws]
-            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, discrepancy)
+            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, deployment.left_over)
 
         return build
 
@@ -222,10 +222,23 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     found = calibrated_theta(results) if CALIBRATION in results else None
     if found is None or found.posterior is None or not found.posterior.thetas:
         raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
-    rows = found.posterior.thetas
-    kept = rows[:: max(len(rows) // POSTERIOR_DRAWS, 1)]
-    thetas = tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
-    return replace(deployment, thetas=thetas)
+    return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
+
+
+def with_left_over(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
+    """The deployment with what the calibration before it left over of its pours, where that was scored."""
+    if deployment.left_over is not None or CALIBRATION not in results or EVALUATION not in results:
+        return deployment
+    scores = learnt_by(results, EVALUATION, Scores)
+    return replace(deployment, left_over=shift_left_over(scores, len(calibrated_theta(results).searched)))
+
+
+def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:
+    """So many draws of θ's posterior, or all that there are; none where it has none."""
+    rows = () if found.posterior is None else found.posterior.thetas
+    count = min(count, len(rows))
+    kept = [rows[i * len(rows) // count] for i in range(count)]
+    return tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
 
 
 def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:

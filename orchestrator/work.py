@@ -9,6 +9,7 @@ from actors.spec import LaboratorySpec
 from orchestrator.forecast import PRICE, Work
 from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, EVALUATION, POURS
+from orchestrator.strategies.calibration.scorecard import DRAWS
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.space import Space
 from sim_engine.task import Scene
@@ -35,7 +36,8 @@ def _work(plan: CampaignPlan, name: str) -> Work:
         if name == CALIBRATION:
             return Work(calibration.simulations, particles=particles_of(plan))
         if name == EVALUATION:
-            rivals = _scored(calibration) - _weighed(calibration)  # which need no θ*: see `orchestrator.rehearsal`
+            # Random θ and the uncalibrated one need no θ*: see `orchestrator.rehearsal`.
+            rivals = _weighed(calibration) + calibration.random_baseline * _unseen(calibration)
             return Work(_scored(calibration), ahead=rivals if calibration.pour_count else 0)
     if deployment is not None and name.startswith((DEPLOYMENT, CONFIRMATION)):
         pour = pour_time(plan.laboratory, deployment.scenes[0], deployment.actions)
@@ -50,12 +52,17 @@ def _weighed(plan: CalibrationPlan) -> int:
     return plan.pour_count + records + (0 if plan.transfer is None else len(plan.transfer.pours))
 
 
-def _scored(plan: CalibrationPlan) -> int:
-    """θ* and the uncalibrated θ on all pours, random rivals on those that calibration has not seen."""
+def _unseen(plan: CalibrationPlan) -> int:
+    """Those of them that calibration has not seen."""
     records = [] if plan.records is None else list(plan.records.pours)
     transfer = 0 if plan.transfer is None else len(plan.transfer.pours)
-    unseen = plan.holdout + sum(pour.split != "train" for pour in records) + transfer
-    return 2 * _weighed(plan) + plan.random_baseline * unseen
+    return plan.holdout + sum(pour.split != "train" for pour in records) + transfer
+
+
+def _scored(plan: CalibrationPlan) -> int:
+    """θ* and the uncalibrated θ on all pours; draws of θ and random rivals on those that calibration has not seen."""
+    drawn = DRAWS if plan.random_baseline and plan.settings.makes_posterior else 0
+    return 2 * _weighed(plan) + (plan.random_baseline + drawn) * _unseen(plan)
 
 
 def particles_of(plan: CampaignPlan) -> float:

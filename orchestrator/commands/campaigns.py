@@ -128,6 +128,7 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
     evaluation = learnt_by(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
     rivals = {
+        "posterior": evaluation.posterior_mean,
         "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,
@@ -176,8 +177,8 @@ def plan_pour(
     planning = deployment_stages(plan, plan.deployment)
     known = foretelling(plan, parameters, thetas, seeds)
     count = max(seeds, len(known.drawn))
-    stages = [*planning, *prediction_stages(plan, plan.deployment, count, known.drawn, known.discrepancy)]
-    check_laboratory_answers(plan, stages, in_process=in_process)
+    stages = [*planning, *prediction_stages(plan, plan.deployment, count, known.drawn)]
+    check_laboratory_answers(plan, stages, in_process=in_process, brief=True)
     directory = run_directory(plan, resume=False, run_id=None)
     if parameters is None:
         mention(
@@ -189,6 +190,7 @@ def plan_pour(
         resume=False,
         stages=stages,
         in_process=in_process,
+        brief=True,
         again=f"Plan anew: decant plan {path}",
         not_resumed="this planning is not resumed; what was simulated",
     )
@@ -238,20 +240,21 @@ def planning_plan(
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
-    from orchestrator.config.load import load_parameters, load_posterior, load_vessel
+    from orchestrator.config.load import load_discrepancy, load_parameters, load_posterior, load_vessel
     from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.jobs import JobError, planned
     from orchestrator.stages import POSTERIOR_DRAWS
 
     theta = None if isinstance(parameters, Path) else parameters
     thetas: tuple[SimulationParameters, ...] = ()
+    left_over = None
     with Refused(ConfigError, JobError):
         if isinstance(parameters, Path):
-            theta = load_parameters(parameters, plan.parameters)
+            theta, left_over = load_parameters(parameters, plan.parameters), load_discrepancy(parameters)
             if plan.deployment is not None and plan.deployment.settings.needs_posterior:
                 thetas = load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters)
         vessel = load_vessel(receiver) if isinstance(receiver, Path) else receiver
-        return planned(plan, theta, vessel, iterations, thetas)
+        return planned(plan, theta, vessel, iterations, thetas, left_over)
 
 
 def _run(

@@ -63,13 +63,16 @@ def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> No
         raise RefusalError("\n".join(str(problem) for problem in problems), BAD_INPUT)
 
 
-def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool) -> None:
+def check_laboratory_answers(
+    plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool, brief: bool = False
+) -> None:
     """What the laboratory needs, here and from other machines, before anything starts.
 
     Args:
         plan: with its laboratory.
         stages: that are to run.
         in_process: everything in this process: no other machine is needed.
+        brief: see `actors.laboratory.open_laboratory`.
 
     Raises:
         RefusalError: with what is missing, exit code 2.
@@ -81,7 +84,7 @@ def check_laboratory_answers(plan: CampaignPlan, stages: Sequence[StageDefinitio
     if laboratory.ray is not None and not laboratory.in_process:
         mention(f"looking at the Ray cluster at {laboratory.ray.address} …")
     with Refused(LaboratoryError):
-        check_laboratory(laboratory, need_bench=any(stage.pours for stage in stages))
+        check_laboratory(laboratory, need_bench=any(stage.pours for stage in stages), brief=brief)
 
 
 def check_output(path: Path | None, option: str, suffix: str) -> None:
@@ -138,6 +141,7 @@ def run_in_front_of_people(
     resume: bool,
     stages: Sequence[StageDefinition] | None = None,
     in_process: bool = False,
+    brief: bool = False,
     again: str,
     not_resumed: str = "",
     answer: str | None = None,
@@ -150,6 +154,7 @@ def run_in_front_of_people(
         directory: of the run.
         stages: in place of the plan's.
         in_process: everything in this process, without Ray (slower; for debugging).
+        brief: see `actors.laboratory.open_laboratory`.
         again: the command that resumes, for the message after an interruption; or that begins anew …
         not_resumed: … where nothing resumes: what is not, and what of it is kept.
         answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
@@ -191,7 +196,7 @@ def run_in_front_of_people(
     try:
         display = ProgressDisplay(plan, quiet=is_quiet())
         operator = person_at_the_terminal(spec, display.paused) if pouring else None
-        laboratory = open_laboratory(spec, need_bench=pouring, operator=operator)
+        laboratory = open_laboratory(spec, need_bench=pouring, brief=brief, operator=operator)
         if plan.outputs.rrd and not installed("rerun"):
             say("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
         elif plan.outputs.rrd:

@@ -156,6 +156,7 @@ class DiscrepancyGroup:
         name: 'training pours', 'test pours', 'another receiver'.
         pours: how many.
         calibrated: of the calibrated simulator θ*.
+        posterior: of the mean of its simulations over draws of θ's posterior; None if there is none.
         uncalibrated: of the simulator as it is without calibration; None if not scored.
         random: of the simulator with θ drawn at random, one number each; empty if not scored.
         mean_predictor: of 'what the training pours spilled on average'; None if not scored.
@@ -169,10 +170,12 @@ class DiscrepancyGroup:
     random: Sequence[float] = ()
     mean_predictor: float | None = None
     regression: float | None = None
+    posterior: float | None = None
 
 
 def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: str) -> Path:
-    """Mean |Δ| of θ* beside its rivals: uncalibrated, random θ (median, quartiles), mean of training pours, regression.
+    """Mean |Δ| of θ* and its posterior beside their rivals: uncalibrated, random θ (median, quartiles), mean of
+    training pours, regression.
 
     Args:
         path: PNG to write.
@@ -194,6 +197,7 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
     for group in groups:
         every: list[tuple[str, float | None, str, tuple[float, float] | None]] = [
             ("calibrated simulator θ*", group.calibrated, style.BEST, None),
+            ("mean over θ's posterior", group.posterior, style.POSTERIOR, None),
             ("uncalibrated simulator", group.uncalibrated, style.PREDICTED, None),
             (*_random(group.random),),
             ("mean of training pours", group.mean_predictor, style.PALE, None),

@@ -68,7 +68,7 @@ def predictions_of(results: Results) -> dict[str, Foreseen]:
 
 def calibrated_label(evaluation: Scores) -> str | None:
     """Under which label an evaluation scored θ*: the one that is not a rival's."""
-    rivals = ("random ", UNCALIBRATED)
+    rivals = ("random ", "posterior ", UNCALIBRATED)
     return next((label for label in evaluation.discrepancy if not label.startswith(rivals)), None)
 
 
@@ -92,6 +92,7 @@ def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
                 [value for value in rivals if value is not None],
                 evaluation.mean_predictor.get(split),
                 evaluation.regression.get(split),
+                evaluation.posterior_mean.get(split),
             )
         )
     return groups

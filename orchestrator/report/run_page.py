@@ -199,6 +199,7 @@ def _theta_lines(plan: CampaignPlan, summary: RunSummary) -> list[str]:
 def _score_table(summary: RunSummary) -> Table:
     columns = {
         "calibrated": "θ*",
+        "posterior": "mean over θ's posterior",
         "uncalibrated": "uncalibrated θ",
         "random_theta": "random θ (median)",
         "mean_predictor": "mean of training pours",
@@ -210,7 +211,7 @@ def _score_table(summary: RunSummary) -> Table:
         if any(value is not None for value in row.values())
     ]
     caption = "Mean |measured − predicted| spillage [% of what was poured]: less is better"
-    return Table(caption, ["pours", *columns.values()], rows, frozenset(range(1, 6))).filled()
+    return Table(caption, ["pours", *columns.values()], rows, frozenset(range(1, len(columns) + 1))).filled()
 
 
 def _not_simulated(summary: RunSummary, names: Mapping[str, str]) -> Table:

@@ -32,6 +32,7 @@ RECEIVED = "#009e73"
 FALLING = "#56b4e9"
 POURER = "#0072b2"
 ESCAPED = "#cc79a7"
+POSTERIOR = "#cc79a7"
 
 PARTICLE_STATES: tuple[tuple[str, str], ...] = (
     ("in the pourer", POURER),
@@ -254,4 +255,5 @@ def save(figure: Figure, path: Path) -> Path:
         for suffix in (path.suffix, *_ALSO.get()):
             undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
             figure.savefig(path.with_suffix(suffix), dpi=DPI, facecolor="white", metadata=undated)
+            figure.set_layout_engine("none")  # the room that was found for the first one
     return path

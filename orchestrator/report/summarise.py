@@ -98,6 +98,7 @@ def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | Non
         return {}
     table: dict[str, dict[str, float | None]] = {}
     rivals = {
+        "posterior": evaluation.posterior_mean,
         "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,

@@ -81,6 +81,7 @@ def _discrepancy_table(rows: Mapping[str, Mapping[str, float | None]]) -> Render
 
     columns = {
         "calibrated": "θ*",
+        "posterior": "posterior (mean)",
         "uncalibrated": "uncalibrated",
         "random_theta": "random θ (median)",
         "mean_predictor": "mean of training pours",

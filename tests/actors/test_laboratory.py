@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from actors.device import DeviceLostError
-from actors.laboratory import open_laboratory
+from actors.laboratory import check_laboratory, open_laboratory
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.protocols import LaboratoryError
 from actors.spec import LaboratorySpec
@@ -119,3 +119,20 @@ def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_
     np.testing.assert_array_equal(np.array(ours.frames.positions), np.array(twins.frames.positions))
     assert measured == measured_twin
     assert measured.loaded == pytest.approx(0.2, abs=1e-3)
+
+
+def test_a_moments_work_needs_no_ray_and_still_simulates_side_by_side(monkeypatch, fake, task):
+    """`decant plan`: a person waits, and nothing is poured."""
+    monkeypatch.setattr("actors.laboratory.installed", lambda name: name != "ray")
+    spec = LaboratorySpec("planning", simulators=2)
+    check_laboratory(spec, need_bench=False, brief=True)
+    with pytest.raises(LaboratoryError, match="Ray, which is not installed"):
+        check_laboratory(spec, need_bench=False)
+
+    async def play():
+        async with open_laboratory(spec, need_bench=False, brief=True, make=fake()) as laboratory:
+            pool = laboratory.simulators
+            results = await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(4)))
+            return pool.size, pool.separate, [result.outcome.seed for result in results]
+
+    assert asyncio.run(play()) == (2, True, [0, 1, 2, 3])

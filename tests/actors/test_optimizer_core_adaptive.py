@@ -105,7 +105,7 @@ def test_a_pour_where_hypotheses_differ_promises_more_than_one_where_all_is_lost
 
 
 def test_with_pours_to_follow_the_first_one_goes_where_it_tells_more():
-    question = asked(displaced, [], acquisition="least_loss")
+    question = asked(shelf, [], acquisition="least_loss")
     last, first = propose(replace(question, mismatch=replace(question.mismatch, left=0))), propose(question)
     assert first.means[0] > last.means[0]
     model, everywhere = averaged(question), np.random.default_rng(0).random((200, 2))
@@ -208,3 +208,14 @@ def test_a_cost_in_another_unit_is_the_same_question():
 def test_a_question_that_makes_no_sense_is_refused(changes, text):
     with pytest.raises(ValueError, match=text):
         propose(asked(displaced, POURED, **changes))
+
+
+@pytest.mark.parametrize("scatter", [0.002, 0.03])
+def test_pours_that_are_alike_tell_how_much_a_pour_scatters(scatter):
+    place, signs = (0.6, 0.6), (1.0, -0.6, 0.3, -1.0, 0.8, -0.5, 0.2, -0.2)
+    costs = tuple(0.05 + scatter * sign for sign in signs)
+    question = asked(cup, [])
+    data = replace(question.data, points=(place,) * len(costs), costs=costs)
+    found = propose(replace(question, data=data, count=0)).best_noise
+    assert found is not None
+    assert 0.5 * scatter < found < 1.5 * scatter + 0.15 * 0.06

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import multiprocessing
 import os
 import signal
 import time
@@ -19,6 +20,7 @@ from actors.device import RayDevice
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.pool import RaySimulatorPool
+from actors.simulation.processes import ProcessSimulatorPool
 from tests.patience import PATIENCE
 
 
@@ -37,13 +39,55 @@ def count(log: Path, what: str) -> int:
     return sum(line.startswith(what) for line in lines(log))
 
 
-@pytest.fixture(params=["in_process", pytest.param("ray", marks=pytest.mark.ray)])
+@pytest.fixture(params=["in_process", "processes", pytest.param("ray", marks=pytest.mark.ray)])
 def make_pool(request):
-    """Both pools, so that one test speaks for both."""
+    """All pools, so that one test speaks for each."""
     if request.param == "ray":
         request.getfixturevalue("ray_running")
         return lambda make: RaySimulatorPool(1, make=make)
+    if request.param == "processes":
+        return lambda make: ProcessSimulatorPool(1, make=make)
     return lambda make: InProcessSimulatorPool(make=make)
+
+
+def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, task, tmp_path):
+    log = tmp_path / "log"
+
+    async def play():
+        pool = ProcessSimulatorPool(2, make=fake(2.0, log))
+        both = [asyncio.create_task(pool.simulate(task(seed=s))) for s in (1, 2)]
+        await until(lambda: count(log, "begin") == 2)
+        os.kill(int(lines(log)[-1].split()[1]), signal.SIGKILL)
+        results = await asyncio.gather(*both)
+        with pytest.raises(SimulationError, match=r"died 3 times over it \(status -9 at last\)"):
+            await pool.simulate(task(name="deadly"))
+        await pool.simulate(task(name="quick"))
+        await pool.close()
+        return [result.outcome.seed for result in results]
+
+    assert asyncio.run(play()) == [1, 2]
+    assert count(log, "made") == 2 + 1 + 2, "those that died are made anew"
+    assert not any(psutil.pid_exists(int(line.split()[1])) for line in lines(log))
+
+
+def test_simulating_processes_end_with_a_killed_owner(fake, task, tmp_path):
+    log = tmp_path / "log"
+
+    def own() -> None:
+        async def play():
+            await ProcessSimulatorPool(1, make=fake(60.0, log)).simulate(task())
+
+        asyncio.run(play())
+
+    owner = multiprocessing.get_context("fork").Process(target=own)
+    owner.start()
+    until_begun = time.monotonic() + PATIENCE
+    while count(log, "begin") == 0:
+        assert time.monotonic() < until_begun, "waited in vain"
+        time.sleep(0.02)
+    os.kill(owner.pid, signal.SIGKILL)
+    owner.join()
+    asyncio.run(until(lambda: count(log, "closed") == 1))
 
 
 @pytest.mark.realtime

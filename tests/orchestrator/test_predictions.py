@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import statistics
 from dataclasses import replace
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import pytest
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
+from orchestrator.config.load import load_campaign
+from orchestrator.jobs import planned
 from orchestrator.lanes import Deadlines, Lanes
 from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
@@ -25,6 +29,7 @@ from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
 from orchestrator.tally import Tally
+from sim_engine.bands import resolution_shift
 from sim_engine.losses import Loss
 from sim_engine.vessel.spec import VesselSpec
 from tests.orchestrator import watched
@@ -33,6 +38,7 @@ from tests.orchestrator.reported import changed, shown
 from tests.orchestrator.toy import ToyLaboratory, run_toy, toy_plan
 from tests.orchestrator.toys import narrow_cup
 
+CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 ACTION = SCENE.action({"angular_velocity": 1.0, "x_offset": 0.1})
 
 
@@ -190,14 +196,20 @@ def test_pours_are_predicted_with_how_well_the_mean_is_known_and_how_much_a_pour
     assert all(p is not None and p.scatter is not None and p.scatter > 0.0 for p in predictions)
 
 
-def test_d1_tells_the_scatter_of_one_seed_though_it_averages_several() -> None:
-    """Means of four seeds scatter half as much as a single one."""
-    strategy = OneShotPlanning(
-        deployment_plan(strategy="D1", simulations_per_iteration=4, iterations=8), SCENE, THETA, 1
-    )
+@pytest.mark.parametrize("left_over", [None, 0.1, 0.8])
+def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | None) -> None:
+    """Means of four seeds scatter half as much as a single one; what the simulator lacks is a shift of the stream."""
+    plan = deployment_plan(strategy="D1", simulations_per_iteration=4, iterations=8)
+    strategy = OneShotPlanning(replace(plan, left_over=left_over), SCENE, THETA, 1)
     Play(narrow_cup)(strategy)
     result: Any = strategy.result()
-    assert result.recommended.predicted_scatter == pytest.approx(2.0 * result.recommended.hyperparameters["noise"])
+    seeds, z = (
+        2.0 * result.recommended.hyperparameters["noise"],
+        NormalDist().inv_cdf(result.recommended.predicted_loss),
+    )
+    shift = max(left_over or 0.0, resolution_shift(THETA.particles))
+    lacking = NormalDist().cdf(z + 0.01 * shift) - NormalDist().cdf(z)
+    assert result.recommended.predicted_scatter == pytest.approx(math.hypot(seeds, 100 * lacking), rel=0.02)
     assert result.recommended.predicted_spillage_deviation > 0.0
     assert result.pours[0].predicted_scatter == result.recommended.predicted_scatter
 
@@ -233,3 +245,10 @@ def test_what_is_asked_for_is_simulations_of_the_slots_that_are_free() -> None:
     assert len(strategy.ask(Slots(2))) == 1
     with pytest.raises(ValueError, match="not asked for"):
         strategy.tell(replace(first[0], seed=-1), Failed("simulation", ""))  # type: ignore[type-var]
+
+
+def test_a_plan_simulates_each_action_once_unless_the_campaign_says_how() -> None:
+    for name, simulations in ("quickstart", 15), ("recorded", 30):
+        deployment = planned(load_campaign(CAMPAIGNS / f"{name}.yaml")).deployment
+        assert deployment is not None
+        assert deployment.settings.simulations == simulations, name

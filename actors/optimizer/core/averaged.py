@@ -5,13 +5,14 @@ its best action x̂, more or less of it, and something more that nobody simulate
 
     f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(z_j(x)), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
     z_j(x) = x̂ + e^{h_j} (A_j x + s_j − x̂),    v_j² = σ_j² + e^{2 g_j} s_s²(z_j(x))
-    y = f(x) + ε,    ε ~ N(0, (n + 0.15 μ_j(x))²)
+    y = f(x) + ε,    ε ~ N(0, (n_j + 0.15 μ_j(x))²)
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. h makes the
-valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. The last
-hypothesis is ignorance: the simulator says nothing of this bench, and f is a GP around 0.6, more towards corners. The
-posterior weights are prior times marginal likelihood of the observations. So nothing is forgotten: a hypothesis that
-fails fades, and the weight of ignorance says how far the simulator is to be trusted.
+valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. n, by which pours of
+one action differ, belongs to the hypothesis, too: a few pours nearby tell it. The last hypothesis is ignorance: the
+simulator says nothing of this bench, and f is a GP around 0.6, more towards corners. The posterior weights are prior
+times marginal likelihood of the observations. So nothing is forgotten: a hypothesis that fails fades, and the weight of
+ignorance says how far the simulator is to be trusted.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
 Limitations: the hypotheses are a fixed set; predictions come from at most 32 draws of them, and ignorance.
@@ -45,12 +46,15 @@ RESTS = (0.02, 0.3)
 LENGTHS = (0.15, 0.6)
 FARTHER = (0.4, 3.0)
 """Factors on a displacement's deviations, evenly by their logarithm: tails for a bench that is far off."""
-NOISE, NOISE_GROWTH = 0.02, 0.15
-"""Deviation of one observation where nothing is lost, and what it grows by where everything is."""
+NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
+"""Smallest and largest deviation of one observation where nothing is lost, evenly by its logarithm; and what it grows
+by where everything is lost."""
 IGNORANT_MEAN, IGNORANT_SIGNAL = 0.6, 0.4
 IGNORANT_EDGE = 0.3
 """How much more ignorance expects in the corners than in the middle: a box is drawn around what may be good."""
-IGNORANT_LENGTHS = (0.15, 0.3, 0.6)
+IGNORANT_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
+IGNORANT_NOISES = np.tile((0.003, 0.01, 0.03), 3)
+"""ℓ and n of what ignorance consists of: were its scatter fixed, pours that hardly scatter would speak against it."""
 KNOWN_SHARE = 0.75
 """Share of the hypotheses around displacements that were found before, where some were."""
 KNOWN_SPREAD = 0.25
@@ -67,6 +71,7 @@ class Hypotheses:
         gains: (J,), logarithms.
         rests: (J,), σ.
         lengths: (J,), ℓ.
+        noises: (J,), n.
         centre: (dimension,), the simulated best.
     """
 
@@ -76,16 +81,17 @@ class Hypotheses:
     gains: Array
     rests: Array
     lengths: Array
+    noises: Array
     centre: Array
 
     @classmethod
     def of(cls, mismatch: Mismatch, centre: Array) -> Hypotheses:
         """Draw, the same for the same question: quasi-random, so that few cover much."""
         dimension = len(mismatch.play)
-        rows = qmc.Sobol(2 * dimension + 6, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
+        rows = qmc.Sobol(2 * dimension + 7, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
         rows = np.clip(rows, 1e-6, 1.0 - 1e-6)
         z = ndtri(rows[:, : 2 * dimension])
-        width, gain, rest, length, far, known = rows[:, 2 * dimension :].T
+        width, gain, rest, length, far, known, noise = rows[:, 2 * dimension :].T
         spread = _evenly(FARTHER, far)
         scales, shifts = np.ones((HYPOTHESES, dimension)), np.zeros((HYPOTHESES, dimension))
         if mismatch.drawn:
@@ -106,12 +112,13 @@ class Hypotheses:
             GAIN * ndtri(gain),
             _evenly(RESTS, rest),
             _evenly(LENGTHS, length),
+            _evenly(NOISES, noise),
             centre,
         )
 
     def only(self, kept: NDArray[np.int_]) -> Hypotheses:
         """Some of them."""
-        names = "scales", "shifts", "widths", "gains", "rests", "lengths"
+        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises"
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def moved(self, points: Array) -> Array:
@@ -151,7 +158,7 @@ class AveragedProcess:
         self._costs = np.clip(costs / mismatch.worst, 0.0, 1.0)
         self._all = Hypotheses.of(mismatch, _least(simulated))
         informed = self._evidences(self._informed(self._all, points), self._all.lengths)
-        ignorant = self._evidences(self._ignorant(points, self._costs), np.array(IGNORANT_LENGTHS))
+        ignorant = self._evidences(self._ignorant(points, self._costs), IGNORANT_LENGTHS)
         logs = np.concatenate(
             [
                 informed + np.log((1.0 - mismatch.ignorance) / len(informed)),
@@ -165,6 +172,7 @@ class AveragedProcess:
         self._kept = self._all.only(kept)
         self.mixture = np.concatenate([times / KEPT * (1.0 - self.ignorance), self.weights[len(informed) :]])
         self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
+        self._least_noises = np.concatenate([self._kept.noises, IGNORANT_NOISES])
         self._at_data = self._prior(points, self._costs)
         self._factors = self._factorised(self._at_data, self._lengths, points)
 
@@ -178,13 +186,13 @@ class AveragedProcess:
         gain = np.exp(hypotheses.gains)[:, None] / self.worst
         means = np.clip(gain * mean.reshape(J, m), 0.0, 1.0)
         spreads = np.hypot(hypotheses.rests[:, None], gain * deviation.reshape(J, m))
-        return _Prior(means, spreads, NOISE + NOISE_GROWTH * means)
+        return _Prior(means, spreads, hypotheses.noises[:, None] + NOISE_GROWTH * means)
 
     def _ignorant(self, points: Array, seen: Array | float) -> _Prior:
         shape = len(IGNORANT_LENGTHS), len(points)
         edge = ((2.0 * points - 1.0) ** 2).mean(axis=1)
         means = np.broadcast_to(IGNORANT_MEAN + IGNORANT_EDGE * np.clip(edge, 0.0, 1.0), shape)
-        noises = np.broadcast_to(NOISE + NOISE_GROWTH * seen, shape)  # by what was seen there, if anything was
+        noises = IGNORANT_NOISES[:, None] + NOISE_GROWTH * np.broadcast_to(seen, shape)  # by what was seen, if anything
         return _Prior(means, np.full(shape, IGNORANT_SIGNAL), noises)
 
     def _prior(self, points: Array, seen: Array | float = IGNORANT_MEAN) -> _Prior:
@@ -223,7 +231,10 @@ class AveragedProcess:
             residuals = solve_triangular(L, self._costs - self._at_data.means[j], lower=True, check_finite=False)
             means[j] = prior.means[j] + V.T @ residuals
             variances[j] = prior.spreads[j] ** 2 - np.einsum("ij,ij->j", V, V)
-        return means, np.sqrt(np.maximum(variances, 1e-10)), NOISE + NOISE_GROWTH * np.clip(means, 0.0, 1.0)
+        return means, np.sqrt(np.maximum(variances, 1e-10)), self._noises(means)
+
+    def _noises(self, means: Array) -> Array:
+        return np.asarray(self._least_noises[:, None] + NOISE_GROWTH * np.clip(means, 0.0, 1.0))
 
     def covariances(self, first: Array, second: Array) -> Array:
         """Posterior covariances (components, m, k) of f between points (m, dimension) and others (k, dimension)."""
@@ -258,7 +269,9 @@ class AveragedProcess:
 
     def noise_at(self, points: Array) -> Array:
         """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
-        return self.worst * NOISE + NOISE_GROWTH * self.predict(points)[0] if len(points) else np.empty(0)
+        if not len(points):
+            return np.empty(0)
+        return self.worst * np.sqrt(self.mixture @ self.components(points)[2] ** 2)
 
     def exceedance(self, points: Array, loss: float) -> Array:
         """Probabilities (m,) that an observation at points (m, dimension) is above a loss."""
@@ -270,7 +283,8 @@ class AveragedProcess:
     @property
     def hyperparameters(self) -> dict[str, float]:
         """What the hypotheses are, by name."""
-        return {"noise": self.worst * NOISE, "simulated_noise": self.simulated.noise, "ignorance": self.ignorance}
+        noise = self.worst * float(self.mixture @ self._least_noises)
+        return {"noise": noise, "simulated_noise": self.simulated.noise, "ignorance": self.ignorance}
 
     def displaced(self) -> tuple[Array, Array, float]:
         """Shift of the cube's centre (dimension,), its deviation, and the median factor on the cost."""

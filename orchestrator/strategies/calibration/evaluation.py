@@ -69,6 +69,9 @@ class Scores(Learnt):
     random_median: dict[str, float | None]
     """Median of the random θ's, by split."""
 
+    posterior_mean: dict[str, float | None] = Field(default_factory=dict)
+    """Mean |r − c̄_s| by split, c̄_s being the mean of the simulations with draws of θ's posterior."""
+
     thetas: dict[str, SimulationParameters]
     """The θ by label."""
 
@@ -105,7 +108,8 @@ class Evaluation:
         """Plan.
 
         Args:
-            thetas: by label; 'random 1', 'random 2' … are the baseline whose median is reported.
+            thetas: by label; 'random 1', 'random 2' … are the baseline whose median is reported, 'posterior 1',
+                'posterior 2' … draws of which the simulations' mean is scored, too.
         """
         seeds = SeedStream(seed, "evaluation")
         self._cases: list[_Case] = []
@@ -173,6 +177,17 @@ class Evaluation:
         known = [score for score in scores if score is not None]
         return median(known) if known else None
 
+    def posterior_mean(self, split: str) -> float | None:
+        """Mean |r − c̄_s| over a split's pours, c̄_s by all θ labelled 'posterior …'; None where nothing is defined."""
+        simulated: dict[tuple[float, int], list[float]] = {}
+        for case in self._cases:
+            if not case.theta.startswith("posterior ") or case.scored.pour.split != split:
+                continue
+            if case.simulated is not None and (r := case.scored.pour.spillage) is not None:
+                simulated.setdefault((r, case.request.seed), []).append(case.simulated)
+        differences = [abs(r - float(np.mean(values))) for (r, _), values in simulated.items()]
+        return float(np.mean(differences)) if differences else None
+
     def result(self) -> Scores:
         """Scores by θ and split, and every pair of measured and simulated spillage."""
         splits = list(dict.fromkeys(case.scored.pour.split for case in self._cases))
@@ -185,6 +200,7 @@ class Evaluation:
             },
             discrepancy={label: {split: self.discrepancy(label, split) for split in splits} for label in self._thetas},
             random_median={split: self.random_median(split) for split in splits},
+            posterior_mean={split: self.posterior_mean(split) for split in splits},
             thetas=dict(self._thetas),
             pairs=tuple(
                 ScoredPair(

@@ -18,6 +18,9 @@ BySplit = dict[str, float | None]
 CALIBRATED = "theta"
 """Label of θ* in the results."""
 
+DRAWS = 5
+"""θ of the posterior whose simulations' mean is scored beside θ*."""
+
 UNCALIBRATED = "uncalibrated"
 """Label of the θ that one would take without calibrating."""
 
@@ -44,7 +47,8 @@ class Scorecard:
     The rivals are the uncalibrated θ, random θ from the same box (their median), the mean of the training pours, and a
     GP regression of the training pours. The regression is judged in the calibration's scene only: of another vessel it
     knows nothing. Random θ are not simulated on training pours, where nothing is to be won by it; the uncalibrated one
-    is, for it has seen no pour at all.
+    is, for it has seen no pour at all. Beside θ* stands what bands are made of: the mean of the simulations over draws
+    of its posterior, where there is one.
     """
 
     def __init__(
@@ -56,6 +60,7 @@ class Scorecard:
         seed: int,
         *,
         uncalibrated: SimulationParameters | None = None,
+        drawn: Sequence[SimulationParameters] = (),
     ) -> None:
         """Plan.
 
@@ -64,6 +69,7 @@ class Scorecard:
             pours: of the splits 'train', 'test' and 'transfer'.
             contexts: in which the regression lives.
             uncalibrated: θ that one would take without calibrating; None, or θ* itself, is not scored.
+            drawn: of θ's posterior.
         """
         unseen = [scored for scored in pours if scored.pour.split != "train"]
         train = [scored for scored in pours if scored.pour.split == "train"]
@@ -74,6 +80,9 @@ class Scorecard:
         ]
         if uncalibrated is not None and uncalibrated != theta:
             self._parts.append(Evaluation({UNCALIBRATED: uncalibrated}, [*unseen, *train], seed))
+        if drawn:  # with other seeds: a draw may be θ* itself
+            draws = {f"posterior {k}": theta for k, theta in enumerate(drawn, 1)}
+            self._parts.append(Evaluation(draws, unseen, seed + 1))
         self._owner: dict[Simulate, Evaluation] = {}
         self._contexts = contexts
         self._pours: dict[str, list[MeasuredPour]] = {}
@@ -120,6 +129,7 @@ class Scorecard:
             undefined={label: count for part in parts for label, count in part.undefined.items()},
             discrepancy={label: scores for part in parts for label, scores in part.discrepancy.items()},
             random_median=parts[1].random_median,
+            posterior_mean=parts[-1].posterior_mean,
             thetas={label: theta for part in parts for label, theta in part.thetas.items()},
             pairs=tuple(pair for part in parts for pair in part.pairs),
             mean_predictor=mean_predictor,

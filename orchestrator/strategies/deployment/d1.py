@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from statistics import NormalDist
 from typing import Any, ClassVar, Literal
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
@@ -21,6 +22,7 @@ from orchestrator.strategies.settings import Complaints, Premises
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial
 from sim_engine.action import Action, described
+from sim_engine.bands import resolution_shift, shift_of
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import Fractions
@@ -247,9 +249,23 @@ class OneShotPlanning(Deployment[D1Settings]):
         return self._repeated(action, "window", repeats)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
-        """Scatter of a single seed: what is observed here are means of m1 of them."""
+        """Scatter of a single pour: from seed to seed, for what is observed here are means of m1 of them, and by what
+        the simulator lacks."""
         of_means = super()._scatter(suggestion, noise)
-        return None if of_means is None else of_means * math.sqrt(self._settings.simulations_per_iteration)
+        if of_means is None or suggestion.best_mean is None:
+            return None
+        of_seeds = of_means * math.sqrt(self._settings.simulations_per_iteration)
+        return math.hypot(of_seeds, self._lacking(suggestion.best_mean))
+
+    def _lacking(self, loss: float) -> float:
+        """How far a pour may be from its simulations by the number of particles, or by what calibration left over where
+        that is more [the loss' unit]: a loss is taken for spilled liquid, whose stream is shifted (`sim_engine.bands`).
+        """
+        if self._plan.objectives is not None:
+            return 0.0  # not a loss
+        worst, particles = self._tolerated(1.0), self._parameters.particles
+        shift = max(resolution_shift(particles), self._plan.left_over or 0.0)
+        return worst * NormalDist().pdf(shift_of(loss / worst, particles)) * shift
 
     def progress(self) -> Progress:
         """Simulations and pours done, and in all."""

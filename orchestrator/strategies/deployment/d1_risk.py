@@ -145,9 +145,11 @@ class RobustPlanning(OneShotPlanning):
         return Prediction(known[0], suggestion.best_deviation, self._scatter(suggestion, suggestion.best_noise))
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
-        """Scatter of a single pour: from seed to seed, and from one error and θ to the next."""
+        """Scatter of a single pour: from seed to seed, from one error and θ to the next, by what simulations lack."""
         of_seeds, known = Deployment._scatter(self, suggestion, noise), self._answer(suggestion)
-        return None if of_seeds is None or known is None else math.hypot(of_seeds, known[1])
+        if of_seeds is None or known is None:
+            return None
+        return math.hypot(of_seeds, known[1], self._lacking(known[0]))
 
     def _answer(self, suggestion: Suggestion) -> tuple[float, float] | None:
         """Mean and standard deviation over the disturbances, of what is recommended."""

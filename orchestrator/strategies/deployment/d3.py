@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from actors.optimizer.core.mismatch import Mismatch
 from actors.optimizer.core.problem import AcquisitionName, Data, MeanName, Suggestion, SuggestProblem
@@ -22,9 +22,6 @@ from orchestrator.strategies.deployment.trust import Compared, TrustCheck
 from orchestrator.strategies.progress import Progress
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
-
-if TYPE_CHECKING:
-    pass
 
 MEANS: dict[str, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
 """How the optimiser calls the models."""
@@ -244,7 +241,8 @@ class Hybrid(Deployment[D3Settings]):
             worst=self._costing.worst,
             left=left,
             limit=limit,
-            looks_ahead=self._rules.limit is None,  # what follows has to stay where it is known to be safe
+            # a first pour for what it tells may end in a corner, and a limit keeps those that follow there
+            looks_ahead=self._rules.limit is None or limit is not None,
         )
 
     def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:

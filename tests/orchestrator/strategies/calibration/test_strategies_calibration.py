@@ -300,6 +300,21 @@ def test_a_score_is_the_mean_absolute_difference():
     assert evaluation.discrepancy("one", "test") == pytest.approx((0.1 + 0.3) / 2)
 
 
+def test_draws_of_the_posterior_are_scored_by_the_mean_of_their_simulations():
+    action = SCENE.action({"angular_velocity": 1.0, "max_angle": 2.0})
+    pours = [ScoredPour("cup", MeasuredPour(action, r, 1.0, split)) for r, split in ((0.1, "train"), (0.5, "test"))]
+    wide = SimulationParameters(wall_distance=1.0)
+    spilled = {TRUE_THETA.wall_distance: 0.3, 1.0: 0.6}
+    card = Scorecard(
+        TRUE_THETA, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, drawn=(TRUE_THETA, wide, TRUE_THETA)
+    )
+    played = Play(lambda a, theta, rng: spilled[theta.wall_distance])(card)
+    assert len(played.simulations) == 2 + 3, "draws are simulated on pours that calibration did not see"
+    result = card.result()
+    assert result.posterior_mean == {"test": pytest.approx(0.5 - (0.3 + 0.6 + 0.3) / 3)}
+    assert result.discrepancy["theta"]["test"] == pytest.approx(0.2)
+
+
 def test_a_regression_beats_the_mean_inside_the_scene_it_was_fitted_in():
     pours = measured()
     train, test = [p for p in pours if p.split == "train"], [p for p in pours if p.split == "test"]

@@ -1,0 +1,130 @@
+"""Simulators in plain processes, for a command that a person waits for: they are there seconds before a Ray would be.
+
+`python -m actors.simulation.processes FD` is such a process. It lives until its owner hangs up or dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+from actors.protocols import LaboratoryError, SimulationError
+from actors.simulation.in_process import ThreadedPool
+from actors.simulation.job_runner import JobCancelledError, JobRunner, Simulator, pour_simulator
+from sim_engine.simulated import SimulatedPour
+from sim_engine.task import PourTask
+
+RETRIES = 2
+"""How often a job is tried again in a fresh process after one died over it."""
+
+LOOK = 0.1
+"""Between two looks whether a job is still wanted [s]."""
+
+CLOSE_DEADLINE = 10.0
+"""Time that a process has to write its kernels at the end [s]."""
+
+
+class ProcessSimulatorPool(ThreadedPool):
+    """`SimulatorPool` over plain processes of this machine, started at once and at the program's own priority.
+
+    Args:
+        size: number of processes.
+        make: makes a simulator, inside its process.
+    """
+
+    def __init__(self, size: int, *, make: Callable[[], Simulator] = pour_simulator) -> None:
+        super().__init__([ProcessRunner(make) for _ in range(size)], separate=True)
+
+
+class ProcessRunner:
+    """A `JobRunner` in a process of its own, made anew where it dies.
+
+    Attributes:
+        pid: of the process.
+    """
+
+    def __init__(self, make: Callable[[], Simulator]) -> None:
+        self._make = make
+        self._start()
+
+    def _start(self) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", __name__, str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,  # an interrupt at the keyboard is for its owner
+            )
+        self.pid = self._process.pid
+        self._connection = Connection(ours.detach())
+        with contextlib.suppress(OSError):  # that it is gone is noticed with its first job
+            self._connection.send(self._make)
+
+    def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulatedPour:
+        """See `JobRunner.simulate`.
+
+        Raises:
+            SimulationError: processes died over it, too.
+        """
+        for _ in range(RETRIES + 1):
+            if cancelled():
+                raise JobCancelledError
+            try:
+                answer = self._ask(task, cancelled)
+            except (EOFError, OSError):
+                self._process.kill()
+                status = self._process.wait()
+                self._connection.close()
+                self._start()
+                continue
+            if isinstance(answer, SimulatedPour):
+                return answer
+            raise answer
+        raise SimulationError(f"the simulator's process died {RETRIES + 1} times over it (status {status} at last)")
+
+    def _ask(self, task: PourTask, cancelled: Callable[[], bool]) -> Any:
+        self._connection.send(task)
+        while not self._connection.poll(LOOK):
+            if cancelled():
+                self._connection.send(None)
+                break
+        return self._connection.recv()
+
+    def close(self) -> None:
+        """Hang up; a process that doesn't end by that is killed."""
+        self._connection.close()
+        try:
+            self._process.wait(CLOSE_DEADLINE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def serve(connection: Connection) -> None:
+    """Simulate until the owner hangs up. Any message amid a job, or its end, gives the job up."""
+    runner = JobRunner(connection.recv())
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            task = connection.recv()
+            if task is None:  # it came after the job's end
+                continue
+            try:
+                answer: Any = runner.simulate(task, connection.poll)
+            except (LaboratoryError, JobCancelledError) as error:
+                answer = error
+            connection.send(answer)
+    runner.close()
+
+
+if __name__ == "__main__":
+    import sim_engine.pour  # noqa: F401 - takes half a second, and nobody has asked for anything yet
+
+    serve(Connection(int(sys.argv[1])))
