@@ -69,7 +69,7 @@ def versions() -> dict[str, Any]:
     try:
         names += [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in importlib.metadata.requires("decant") or []]
     except importlib.metadata.PackageNotFoundError:
-        names += ["numpy", "scipy", "taichi", "ray", "trimesh"]
+        names += ["numpy", "scipy", "scikit-learn", "taichi", "ray", "trimesh"]
     for name in names:
         try:
             packages[name] = importlib.metadata.version(name)

@@ -36,7 +36,7 @@ from orchestrator.cli import main
 try:
     main()
 finally:
-    heavy = {"scipy.spatial", "scipy.ndimage", "scipy.stats", "trimesh", "pandas", "ray", "taichi", "rerun",
+    heavy = {"scipy.spatial", "scipy.ndimage", "scipy.stats", "trimesh", "sklearn", "pandas", "ray", "taichi", "rerun",
              "matplotlib"}
     print("loaded:", *sorted(heavy & set(sys.modules)), file=sys.stderr)
 """

@@ -116,7 +116,7 @@ from orchestrator.cli import main
 try:
     main()
 finally:
-    heavy = {"ray", "taichi", "rerun", "matplotlib"} & set(sys.modules)
+    heavy = {"ray", "taichi", "rerun", "matplotlib", "sklearn"} & set(sys.modules)
     print("loaded:", *sorted(heavy), file=sys.stderr)
 """
 

@@ -155,7 +155,7 @@ def test_loading_a_campaign_starts_nothing_heavy() -> None:
     code = (
         "import sys; from pathlib import Path; from orchestrator.config.load import load_campaign;"
         f"load_campaign(Path({str(CONFIGS / 'campaigns' / 'recorded.yaml')!r}));"
-        "heavy = ('ray', 'taichi', 'rerun', 'scipy.stats', 'matplotlib', 'trimesh');"
+        "heavy = ('ray', 'taichi', 'rerun', 'sklearn', 'scipy.stats', 'matplotlib', 'trimesh');"
         "print([m for m in heavy if m in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)

@@ -1,0 +1,162 @@
+"""The six primary questions of the study of hidden benches (docs/study-questions.md), answered by its finished cells.
+
+    python benchmarks/study_questions.py [runs/study-benches] [--write]
+
+Every number is a bench's: the mean over its repetitions (and receivers) of differences paired by repetition. Their mean
+has a 95 % t interval over the benches. `--write` puts the table into docs/results.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from machine import ROOT
+
+from orchestrator.commands.study import read_study
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.study.cells import cells_of
+from orchestrator.study.folder import finished_results
+from orchestrator.study.report.effects import tests_of
+from orchestrator.study.report.gather import LEVEL, RANDOM, Gathered, Key, gather, mean, running_least
+from orchestrator.study.report.intervals import Estimate, estimate
+
+PAGE = ROOT / "docs" / "results.md"
+BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"
+STUDY = ROOT / "configs" / "studies" / "benches.yaml"
+NEAR = 0.005
+"""'Within half a point'; and by how much six active pours may be worse than twelve."""
+
+ByBench = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One question."""
+
+    question: str
+    by_bench: ByBench
+    yes: Callable[[Estimate, ByBench], bool]
+    unit: str = "points"
+
+    def row(self) -> str:
+        """Of the table."""
+        found = estimate(list(self.by_bench.values()))
+        factor = 100.0 if self.unit == "points" else 1.0
+        better = sum(value < 0.0 for value in self.by_bench.values())
+        shown = f"{factor * found.mean:.2f} ({factor * found.low:.2f} … {factor * found.high:.2f}) {self.unit}"
+        said = "yes" if self.yes(found, self.by_bench) else "no"
+        return f"| {self.question} | {shown} | {better} of {found.count} | {said} |"
+
+
+def calibrated(found: Gathered, levels: list[str], first: str, second: str) -> ByBench:
+    """Test discrepancy of one less that of another."""
+    a, b = tests_of(found, first), tests_of(found, second)
+    return _by_bench(levels, {number: a[number] - b[number] for number in a.keys() & b.keys()})
+
+
+def _by_bench(levels: list[str], differences: Mapping[int, float]) -> ByBench:
+    grouped = {level: [d for n, d in differences.items() if n // LEVEL == i] for i, level in enumerate(levels)}
+    return {level: mean(values) for level, values in grouped.items() if values}
+
+
+def deployed(
+    found: Gathered, levels: list[str], receivers: list[str], value: Callable[[Key], dict[int, float]]
+) -> ByBench:
+    """A deployment's value for D3 less that for D2, by bench."""
+    by_bench: ByBench = {}
+    for level in levels:
+        differences = []
+        for receiver in receivers:
+            ours, theirs = (value(Key(level, receiver, arm)) for arm in ("D3", "D2"))
+            differences += [ours[n] - theirs[n] for n in ours.keys() & theirs.keys()]
+        if differences:
+            by_bench[level] = mean(differences)
+    return by_bench
+
+
+def answers(found: Gathered, levels: list[str], receivers: list[str]) -> list[Answer]:
+    """All six."""
+
+    def below_zero(one: Estimate, _: ByBench) -> bool:
+        return one.high < 0.0
+
+    def losses(key: Key) -> dict[int, float]:
+        return dict(zip(found.numbers.get(key, []), map(mean, found.losses.get(key, [])), strict=True))
+
+    def until_near(key: Key) -> dict[int, float]:
+        both = [run for arm in ("D2", "D3") for run in found.losses.get(Key(key.level, key.receiver, arm), [])]
+        least = min((loss for run in both for loss in run if not math.isnan(loss)), default=math.nan)
+        curves = [running_least(run) for run in found.losses.get(key, [])]
+        pours = [next((i for i, b in enumerate(c, start=1) if b <= least + NEAR), len(c) + 1) for c in curves]
+        return dict(zip(found.numbers.get(key, []), map(float, pours), strict=True))
+
+    def finals(key: Key) -> dict[int, float]:
+        return {number: mean([one.loss for one in some]) for number, some in found.finals.get(key, {}).items()}
+
+    return [
+        Answer("1. C4 less uncalibrated", calibrated(found, levels, "C4", UNCALIBRATED), below_zero),
+        Answer("2. C4 less random θ", calibrated(found, levels, "C4", RANDOM), below_zero),
+        Answer(
+            "3. C4 on 6 active pours less C4 on 12 stratified ones",
+            calibrated(found, levels, "C4-active", "C4"),
+            lambda one, _: one.high < NEAR,
+        ),
+        Answer("4. mean loss of eight pours, D3 less D2", deployed(found, levels, receivers, losses), below_zero),
+        Answer(
+            "5. pours until near the best, D3 less D2",
+            deployed(found, levels, receivers, until_near),
+            below_zero,
+            "pours",
+        ),
+        Answer(
+            "6. recommended action poured again, D3 less D2",
+            deployed(found, levels, receivers, finals),
+            lambda one, benches: one.high < 0.01 and max(benches.values()) <= 0.03,
+        ),
+    ]
+
+
+def table(found: Gathered, levels: list[str], receivers: list[str]) -> str:
+    """Markdown: a row for every question, and what was run."""
+    rows = ["| question | difference, 95 % interval over benches | first better on | |", "|---|---|---|---|"]
+    rows += [one.row() for one in answers(found, levels, receivers)]
+    shares = {name: 100.0 * mean(list(tests_of(found, name).values())) for name in found.calibrated}
+    means = ", ".join(f"{name} {share:.1f}" for name, share in shares.items())
+    lost = {
+        arm: 100.0 * mean([mean(run) for key, runs in found.losses.items() if key.arm == arm for run in runs])
+        for arm in ("D2", "D3")
+    }
+    return "\n".join(
+        [
+            *rows,
+            "",
+            f"Mean |r − c_s| of the pours that only score, in points: {means}. Mean loss of a pour: "
+            f"D2 {lost['D2']:.1f} %, D3 {lost['D3']:.1f} %. {found.finished} of {found.cells} cells, "
+            f"{found.simulations:,} simulations, {found.pours:,} pours, {found.cpu_s / 3600.0:.1f} CPU hours.",
+        ]
+    )
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "runs" / "study-benches")
+    parser.add_argument("--study", type=Path, default=STUDY)
+    parser.add_argument("--write", action="store_true", help="write the table into docs/results.md")
+    asked = parser.parse_args()
+    study = read_study(asked.study)
+    found = gather(study, finished_results(asked.folder, cells_of(study)))
+    receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
+    text = table(found, [level.name for level in study.levels], receivers)
+    print(text)
+    if asked.write:
+        before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+        PAGE.write_text(f"{before}{BEGIN}{text}\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
