@@ -28,6 +28,9 @@ class Ahead:
     Args:
         simulate: makes one simulation; cancelling gives it up.
         width: simulations that run at a time, those that were asked for included.
+
+    Attributes:
+        changed: told how many are being made, and how many are known and wait to be asked for.
     """
 
     def __init__(self, simulate: Callable[[Simulate], Awaitable[Outcome]], width: int) -> None:
@@ -38,6 +41,8 @@ class Ahead:
         self._known: dict[Simulate, Outcome] = {}
         self._promised: dict[Simulate, asyncio.Future[Outcome | None]] = {}
         self._asked_for = 0
+        self._told = (0, 0)
+        self.changed: Callable[[int, int], None] = lambda running, waiting: None
         self.made = 0
         self.used = 0
 
@@ -67,6 +72,7 @@ class Ahead:
         """The outcome of a simulation that is asked for now, if it was foreseen; None: it has to be made."""
         if (known := self._known.pop(request, None)) is not None:
             self.used += 1
+            self._fill()
             return known
         if (task := self._running.pop(request, None)) is None:
             return None
@@ -121,12 +127,16 @@ class Ahead:
             task = asyncio.ensure_future(self._simulate(request))
             self._running[request] = task
             task.add_done_callback(partial(self._done, request))
+        if (now := (len(self._running), len(self._known))) != self._told:
+            self._told = now
+            self.changed(*now)
 
     def _done(self, request: Simulate, task: asyncio.Future[Outcome]) -> None:
         ours = self._running.get(request) is task
         if ours:
             del self._running[request]
         if task.cancelled():
+            self._fill()
             return
         failed = task.exception() is not None  # asked for, so that nobody complains that it never was
         if not ours:

@@ -17,6 +17,7 @@ from orchestrator.events import (
     CampaignOpened,
     CampaignStateChanged,
     LogLine,
+    MadeAhead,
     StageClosed,
     StageOpened,
     Watcher,
@@ -157,6 +158,9 @@ class _Run:
                 laboratory.listen(self._hear)
             self._check_bench(laboratory, histories)
             lanes = Lanes(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
+            lanes.ahead.changed = lambda running, waiting: self._watchers.emit(
+                MadeAhead(running=running, waiting=waiting)
+            )
             opened = CampaignOpened(
                 name=self._plan.name,
                 run_directory=self._directory,

@@ -128,6 +128,19 @@ class PourProgressed(Event):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MadeAhead(Event):
+    """Simulations that nobody has asked for yet: the pool has nothing else to do while the arm pours.
+
+    Attributes:
+        running: being made.
+        waiting: made, and not yet asked for.
+    """
+
+    running: int
+    waiting: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class StrategyProgressed(Event):
     """The strategy was told something: what of its work is done, and what it has learnt so far."""
 

@@ -10,6 +10,7 @@ from orchestrator.events import (
     CampaignOpened,
     CampaignStateChanged,
     Event,
+    MadeAhead,
     PourProgressed,
     RequestFinished,
     RequestStarted,
@@ -88,6 +89,7 @@ class Tally:
         plan: the campaign.
         simulators: members of the pool.
         running: ids of simulations that run.
+        ahead: of those that nobody has asked for yet.
         simulations, failed_simulations: finished ones.
         simulation_seconds: wall seconds that finished simulations took, all together (replayed ones not counted).
         timed_simulations: how many these were.
@@ -101,6 +103,7 @@ class Tally:
     simulators: int = 0
     stages: dict[str, StageTally] = field(default_factory=dict)
     running: set[int] = field(default_factory=set)
+    ahead: MadeAhead = field(default_factory=lambda: MadeAhead(running=0, waiting=0))
     simulations: int = 0
     failed_simulations: int = 0
     simulation_seconds: float = 0.0
@@ -146,6 +149,8 @@ class Tally:
                 self._started(event)
             case RequestFinished():
                 self._finished(event)
+            case MadeAhead():
+                self.ahead = event
             case PourProgressed() if self.pour is not None:
                 self.pour.progress = event.progress
 
@@ -202,8 +207,13 @@ class Tally:
         if self._load_from is None:
             self._load_from = now
         else:
-            self._busy_seconds += min(len(self.running), self.simulators) * max(now - self._load_to, 0.0)
+            self._busy_seconds += self.busy * max(now - self._load_to, 0.0)
         self._load_to = now
+
+    @property
+    def busy(self) -> int:
+        """Simulators that work."""
+        return min(len(self.running) + self.ahead.running, self.simulators)
 
     def load(self) -> float | None:
         """Mean share of the pool (0 … 1) that was busy since this was asked last; None if no time has passed."""
@@ -216,13 +226,15 @@ class Tally:
 
     def pool_line(self, scene: str | None = None) -> str:
         """'pool 2/2 busy · 214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
-        pool = f"pool {len(self.running)}/{self.simulators} busy · " if self.simulators else ""
+        pool = f"pool {self.busy}/{self.simulators} busy · " if self.simulators else ""
         return pool + self.counts_line(scene)
 
     def counts_line(self, scene: str | None = None) -> str:
         """'214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
         each = f", {self.simulation_seconds / self.timed_simulations:.1f} s each" if self.timed_simulations else ""
         parts = [f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}"]
+        if self.ahead.waiting:
+            parts.append(f"{self.ahead.waiting} more made ahead")
         if self.failed_simulations:
             parts.append(f"{self.failed_simulations} failed")
         wanted = self.pour.scene if scene is None and self.pour is not None else scene

@@ -201,7 +201,7 @@ def logs(key: str | None, *, follow: bool, as_json: bool, at: At) -> None:
             return
 
 
-_PASSING = ("PourProgressed", "StrategyProgressed", "RequestStarted", "StageClosed")
+_PASSING = ("PourProgressed", "StrategyProgressed", "MadeAhead", "RequestStarted", "StageClosed")
 
 
 def _line(event: dict[str, Any]) -> str | None:

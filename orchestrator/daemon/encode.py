@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from orchestrator.events import (
     CampaignOpened,
     Event,
+    MadeAhead,
     PourProgressed,
     RequestFinished,
     RequestStarted,
@@ -21,7 +22,7 @@ from orchestrator.events import (
 )
 from orchestrator.requests import Suggest, Suggested
 
-PASSING = (PourProgressed, StrategyProgressed)
+PASSING = (PourProgressed, StrategyProgressed, MadeAhead)
 """Events that say where something stands just now: the next one takes their place, so they are not kept on disk."""
 
 

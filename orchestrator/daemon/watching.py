@@ -62,7 +62,7 @@ class Watching:
             "of_simulations": done.of_simulations if done else 0,
             "pours": done.pours if done else 0,
             "of_pours": done.of_pours if done else 0,
-            "simulators_busy": len(tally.running),
+            "simulators_busy": tally.busy,
             "line": tally.counts_line(),
             "pour": tally.pour_line(),
             "checkpoint": self.checkpoint,

@@ -51,7 +51,8 @@ def test_first_simulations_and_rivals_are_there_when_the_calibration_pours_are_m
     assert made[POURS] == 4 + 3 + 5
     # of 5 simulations the last one is left, and the first two are made anew: they keep their frames
     assert made[CALIBRATION] - made[POURS] == 1 + 2
-    assert made[EVALUATION] - made[CALIBRATION] == 5  # θ* on all pours; those with frames are among them
+    # θ* on all pours, those with frames among them, and five draws of θ on the test pour
+    assert made[EVALUATION] - made[CALIBRATION] == 5 + 5
     with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
         notes = [entry.body["text"] for entry in journal.entries(kinds=[Kind.NOTE])]
     assert any("were made while the arm was pouring" in note for note in notes)

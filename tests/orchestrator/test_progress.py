@@ -13,6 +13,7 @@ from orchestrator.events import (
     CampaignClosed,
     CampaignOpened,
     LogLine,
+    MadeAhead,
     PourProgressed,
     RequestFinished,
     RequestStarted,
@@ -85,6 +86,19 @@ def test_plain_lines_say_how_busy_the_pool_was_not_who_is_idle_at_the_moment_a_r
     lines = [line for line in written(plain).splitlines() if "/8" in line]
     assert "pool 70 % busy · 2 simulations" in lines[0]
     assert "pool 0 % busy · 2 simulations" in lines[1]
+
+
+def test_simulators_that_work_ahead_while_the_arm_pours_are_not_shown_as_idle() -> None:
+    now = 0.0
+    plan, plain = watched.campaign(), console(terminal=False)
+    display = ProgressDisplay(plan, console=plain, clock=lambda: now)
+    display(CampaignOpened(time=0.0, name="x", run_directory=watched.Path("x"), stages=(), mode="none", simulators=2))
+    display(StageOpened(time=0.0, stage="pours", index=1, count=2))
+    display(MadeAhead(time=0.0, running=2, waiting=0))
+    display(MadeAhead(time=8.0, running=1, waiting=5))
+    now = 10.0
+    display(StrategyProgressed(time=now, stage="pours", progress=Progress(0, 0, 1, 8), result=watched.LEARNT))
+    assert "pool 90 % busy · 0 simulations · 5 more made ahead" in written(plain)
 
 
 def test_terminal_shows_bars_the_running_pours_checkpoint_and_the_pool() -> None:
