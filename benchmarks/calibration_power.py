@@ -278,7 +278,7 @@ def set_row(name: str, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         values = [one["discrepancy"][split] for one in found if one["discrepancy"].get(split) is not None]
         row[split] = round(statistics.mean(values), 4) if values else None
         row[f"{split}_seeds"] = [round(value, 4) for value in values]
-        means = [one["posterior"][split] for one in found if one["posterior"].get(split) is not None]
+        means = [mean for one in found if (mean := one.get("posterior", {}).get(split)) is not None]
         row[f"{split}_posterior_seeds"] = [round(value, 4) for value in means]
     row["thetas"] = [_rounded(one["theta"]) for one in found]
     row["cpu_s"] = round(sum(one["cpu_s"] for one in found), 1)

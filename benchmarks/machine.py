@@ -117,6 +117,16 @@ def single_threaded() -> dict[str, str]:
     return {**os.environ, **dict.fromkeys(names, "1")}
 
 
+def as_a_second_time(kept: Path) -> dict[str, str]:
+    """Environment for processes that find in a folder what the first of them left: bytecode, kernels, grids.
+
+    Bytecode is kept also where the environment says otherwise: a user's second run finds it.
+    """
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(kept), ENVIRONMENT_VARIABLE: str(kept)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    return environment
+
+
 def _processor() -> str:
     """Model name as the system tells it."""
     try:

@@ -31,6 +31,31 @@ def scenes(record: Record | None) -> str:
     return f"## {title}\n\n{about}\n\n{table(head, rows, 'rrrrrr')}\n{settings([record])}"
 
 
+def plan(record: Record | None) -> str:
+    """How long a plan for a new cup takes."""
+    title = "Planning"
+    if record is None:
+        return missing(title, "plan_speed.py")
+    r = record["result"]
+    rows = [
+        (
+            row["receiver"],
+            f"{row['seconds']:.1f}",
+            f"{row['cpu_s']:.1f}",
+            str(row["simulations"]),
+            f"{100 * row['predicted_spillage']:.1f} %",
+        )
+        for row in r["plans"]
+    ]
+    about = prose(
+        f"""Seconds that `decant plan` takes with the quickstart's pour into cups that it never saw: fresh processes,
+        start, figures and report included, bytecode and kernels there. Required on two cores: {r["limit_s"]:g} s
+        (median {r["seconds"]:.1f}, {_met(r["within_limit"])})."""
+    )
+    titles = ("into", "s", "CPU s", "simulations", "predicted to spill")
+    return f"## {title}\n\n{about}\n\n{table(titles, rows, 'lrrrr')}\n{settings([record])}"
+
+
 def validate(record: Record | None) -> str:
     """What the check of every shipped file costs."""
     title = "Checking a file"

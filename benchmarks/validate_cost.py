@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from machine import ROOT, describe, say, show, single_threaded
+from machine import ROOT, as_a_second_time, describe, say, show, single_threaded
 
 LIMIT = 2.0
 """What the check of a shipped file may take [CPU s]."""
@@ -50,9 +50,7 @@ def main() -> None:
         raise SystemExit(f"--repeats {options.repeats}: at least one process is needed")
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="decant-") as kept:
-        # bytecode is kept also where the environment says otherwise: a user's second run finds it
-        environment = {**single_threaded(), "PYTHONPYCACHEPREFIX": kept, "DECANT_CACHE_DIR": kept}
-        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        environment = single_threaded() | as_a_second_time(Path(kept))
         for folder in FOLDERS:
             for file in sorted((ROOT / "configs" / folder).glob("*.yaml")):
                 name = file.relative_to(ROOT).as_posix()

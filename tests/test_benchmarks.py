@@ -201,6 +201,16 @@ def test_page_says_what_is_met_what_is_missed_and_what_is_not_measured(tmp_path:
     assert (tmp_path / "images" / "performance-cost.png").stat().st_size > 1000
 
 
+def test_the_page_tells_how_long_a_plan_takes() -> None:
+    import page_many
+
+    row = {"receiver": "cone", "seconds": 16.24, "cpu_s": 19.0, "simulations": 20, "predicted_spillage": 0.0123}
+    result = {"plans": [row], "seconds": 16.2, "limit_s": 15.0, "within_limit": False, "core": None, "machine": MACHINE}
+    page = page_many.plan({"command": "c", "result": result})
+    assert "| cone | 16.2 | 19.0 | 20 | 1.2 % |" in page
+    assert "15 s (median 16.2, **missed**)" in page.replace("\n", " ")
+
+
 def test_the_page_tells_what_the_check_of_each_file_costs() -> None:
     import page_many
 

@@ -108,7 +108,9 @@ def found(train: float, test: float, errors: list[float]) -> dict[str, Any]:
 
 def test_rows_are_means_over_seeds_and_folds_weigh_pours_alike(power: ModuleType) -> None:
     two = [found(0.01, 0.02, [0.1]), found(0.03, 0.06, [0.2, 0.3, 0.4])]
+    two[1]["posterior"] = {"train": None, "test": 0.041}  # the first one had none, or was kept before there were any
     row = power.set_row("viscosity", two)
+    assert (row["train_posterior_seeds"], row["test_posterior_seeds"]) == ([], [0.041])
     assert (row["train"], row["test"], row["transfer"], row["test_seeds"]) == (0.02, 0.04, None, [0.02, 0.06])
     assert (row["searched"], row["cpu_s"], row["thetas"][0]) == ("viscosity", 3.0, {"viscosity": 1.235})
     folds = power.fold_summary(two)

@@ -25,8 +25,8 @@ RETRIES = 2
 LOOK = 0.1
 """Between two looks whether a job is still wanted [s]."""
 
-CLOSE_DEADLINE = 10.0
-"""Time that a process has to write its kernels at the end [s]."""
+DEADLINE = 10.0
+"""Time that a process has to give a job up, and to write its kernels at the end [s]."""
 
 
 class ProcessSimulatorPool(ThreadedPool):
@@ -95,6 +95,8 @@ class ProcessRunner:
         while not self._connection.poll(LOOK):
             if cancelled():
                 self._connection.send(None)
+                if not self._connection.poll(DEADLINE):
+                    raise EOFError  # it hangs: as good as dead
                 break
         return self._connection.recv()
 
@@ -102,7 +104,7 @@ class ProcessRunner:
         """Hang up; a process that doesn't end by that is killed."""
         self._connection.close()
         try:
-            self._process.wait(CLOSE_DEADLINE)
+            self._process.wait(DEADLINE)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

@@ -18,6 +18,7 @@ from actors.arm.numbers import NumbersArm, NumbersSpec
 from actors.cluster.versions import versions
 from actors.device import RayDevice
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
+from actors.simulation import processes
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.pool import RaySimulatorPool
 from actors.simulation.processes import ProcessSimulatorPool
@@ -68,6 +69,23 @@ def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, t
     assert asyncio.run(play()) == [1, 2]
     assert count(log, "made") == 2 + 1 + 2, "those that died are made anew"
     assert not any(psutil.pid_exists(int(line.split()[1])) for line in lines(log))
+
+
+def test_a_process_that_hangs_holds_nobody_up(fake, task, tmp_path, monkeypatch):
+    log = tmp_path / "log"
+    monkeypatch.setattr(processes, "DEADLINE", 0.5)
+
+    async def play():
+        pool = ProcessSimulatorPool(1, make=fake(60.0, log))
+        job = asyncio.create_task(pool.simulate(task()))
+        await until(lambda: count(log, "begin") == 1)
+        os.kill(int(lines(log)[-1].split()[1]), signal.SIGSTOP)
+        job.cancel()
+        result = await asyncio.wait_for(pool.simulate(task(name="quick", seed=2)), PATIENCE)
+        await pool.close()
+        return result.outcome.seed
+
+    assert asyncio.run(play()) == 2
 
 
 def test_simulating_processes_end_with_a_killed_owner(fake, task, tmp_path):

@@ -1,0 +1,87 @@
+"""How long `decant plan` takes for a cup that it never saw: seconds and CPU seconds of fresh processes.
+
+    python benchmarks/plan_speed.py [--receivers cone narrow bowl mug] [--json]
+
+The quickstart's pour, with Decant's defaults for θ, start, imports, figures and report included. Bytecode and kernels
+are there: a plan for the tumbler, not counted, sees to that. Each receiver is planned for once: a second time its grid
+would be there, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from machine import ROOT, as_a_second_time, describe, say, show
+
+LIMIT = 15.0
+"""A plan for a new cup shall take no longer on two cores [s]."""
+
+RECEIVERS = ("cone", "narrow", "bowl", "mug")
+
+
+def plan(configs: Path, receiver: str, environment: dict[str, str]) -> dict[str, Any]:
+    """One plan in a fresh process.
+
+    Raises:
+        SystemExit: it failed.
+    """
+    command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "plan", "--json"]
+    command += [
+        str(configs / "campaigns" / "quickstart.yaml"),
+        "--receiver",
+        str(configs / "vessels" / f"{receiver}.yaml"),
+    ]
+    before, begun = os.times(), time.monotonic()
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    after, seconds = os.times(), time.monotonic() - begun
+    if done.returncode != 0:
+        raise SystemExit(f"{receiver}: {done.stderr}")
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    answer = json.loads(done.stdout.splitlines()[-1])
+    return {
+        "receiver": receiver,
+        "seconds": round(seconds, 1),
+        "cpu_s": round(cpu, 1),
+        "simulations": answer["simulations"],
+        "predicted_spillage": round(answer["predicted_spillage"], 4),
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--receivers", nargs="+", default=RECEIVERS, metavar="NAME", help="of configs/vessels")
+    parser.add_argument("--json", action="store_true", help="one line of JSON")
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory(prefix="decant-") as kept:
+        configs = Path(shutil.copytree(ROOT / "configs", Path(kept) / "configs"))
+        environment = as_a_second_time(Path(kept))
+        plan(configs, "tumbler", environment)
+        for receiver in options.receivers:
+            rows.append(plan(configs, receiver, environment))
+            say(f"{receiver}: {rows[-1]['seconds']:.1f} s, {rows[-1]['cpu_s']:.1f} CPU s")
+    seconds = statistics.median(row["seconds"] for row in rows)
+    result = {
+        "plans": rows,
+        "seconds": round(seconds, 1),
+        "limit_s": LIMIT,
+        "within_limit": seconds <= LIMIT,
+        "core": None,
+        "machine": describe(),
+    }
+    show(result, options.json)
+
+
+if __name__ == "__main__":
+    main()
