@@ -87,6 +87,7 @@ class PourSimulator:
                 oldest = next(iter(self._vessels))
                 del self._vessels[oldest]
                 self._masks.pop(oldest, None)
+                self._planes = {key: kept for key, kept in self._planes.items() if key[0] != oldest}
             self._vessels[spec] = build_vessel(spec)
         return self._vessels[spec]
 

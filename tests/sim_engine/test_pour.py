@@ -92,6 +92,13 @@ def test_same_seed_same_bits_and_recording_changes_nothing(simulator: PourSimula
     assert other.outcome.received == pytest.approx(plain.outcome.received, abs=0.06)
 
 
+def test_a_vessel_comes_back_after_many_others(simulator: PourSimulator, plain: SimulatedPour) -> None:
+    for k in range(40):
+        simulator.vessel(cylinder(f"cup {k}", inner_radius=0.03 + 1e-4 * k, inner_height=0.06))
+    again = run(simulator).outcome
+    assert (again.spilled, again.received) == (plain.outcome.spilled, plain.outcome.received)
+
+
 def test_frames_follow_each_particle_and_the_cup(plain: SimulatedPour) -> None:
     frames = plain.frames
     assert frames is not None
