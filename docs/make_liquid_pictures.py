@@ -1,4 +1,4 @@
-"""Draw the picture of docs/liquids.md: water, oil and syrup leave the same cup.
+"""Draw the pictures of docs/liquids.md: water, oil and glycerol leave the same cup, and where their streams may cling.
 
 python docs/make_liquid_pictures.py
 """
@@ -10,17 +10,28 @@ from pathlib import Path
 
 import numpy as np
 
+from orchestrator.config.load import load_vessel
 from sim_engine.action import DEG, Action
+from sim_engine.hydrostatics import GRAVITY
+from sim_engine.lip import flow_course, weber
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.liquids import look_up
+from sim_engine.motion import plan_motion
 from sim_engine.pour import PourSimulator
+from sim_engine.regimes import DRIBBLING_WEBER
 from sim_engine.task import PourTask, Scene
+from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import cylinder
 
 IMAGES = Path(__file__).resolve().parent / "images"
 TIMES = (1.5, 2.0, 3.0)
 VOLUME = 200e-6
 PARTICLES = 1_000
+
+
+VESSELS = IMAGES.parents[1] / "configs" / "vessels"
+VELOCITIES = np.geomspace(2.0, 120.0, 40)
+LOADS = np.linspace(50.0, 450.0, 21)
 
 
 def liquids() -> dict[str, Liquid]:
@@ -39,6 +50,59 @@ def liquids() -> dict[str, Liquid]:
     return found
 
 
+def clinging(liquid: Liquid) -> tuple[np.ndarray, np.ndarray]:
+    """Shares of what the shipped beaker pours that leave below the critical Weber number, by load and velocity.
+
+    Returns:
+        With the film as thick as viscosity makes it where that is thicker, e = (3νq/g)^(1/3) for q = Ue; and as the
+        program tells it, with the film of inertia. We = ρq²/(σe).
+    """
+    pourer, receiver = (load_vessel(VESSELS / f"{name}.yaml") for name in ("beaker", "tumbler"))
+    built = build_vessel(pourer), build_vessel(receiver)
+    shares = np.empty((2, len(LOADS), len(VELOCITIES)))
+    for i, load in enumerate(1e-6 * LOADS):
+        scene = Scene("cups", pourer, receiver, liquid.model_copy(update={"mass": load * liquid.density}))
+        for k, velocity in enumerate(VELOCITIES):
+            action = Action(velocity * DEG, x_offset=0.085, height=0.115, max_angle=110 * DEG, hold_time=2.0)
+            course = flow_course(plan_motion(scene, action, *built), load, *built)
+            assert course is not None
+            told = weber(liquid, course.velocity, course.film)
+            flow = course.velocity * course.film
+            viscous = np.cbrt(3.0 * liquid.kinematic_viscosity * flow / GRAVITY)
+            thinned = told * np.minimum(course.film / viscous, 1.0)
+            shares[:, i, k] = [course.share(we < DRIBBLING_WEBER) for we in (thinned, told)]
+    return shares[0], shares[1]
+
+
+def draw_clinging() -> None:
+    """A map for each liquid: criterion, not simulation."""
+    import matplotlib.pyplot as plt
+
+    rows = liquids()
+    figure, axes = plt.subplots(1, len(rows), figsize=(10.0, 3.9), sharex=True, sharey=True, layout="constrained")
+    for panel, (title, liquid) in zip(axes, rows.items(), strict=True):
+        share, told = clinging(liquid)
+        levels = np.linspace(0.0, 100.0, 11)
+        filled = panel.contourf(VELOCITIES, LOADS, 100.0 * share, levels=levels, cmap="YlOrBr")
+        panel.contour(VELOCITIES, LOADS, 100.0 * share, levels=[5.0], colors="black", linewidths=1.4)
+        panel.contour(
+            VELOCITIES, LOADS, 100.0 * told, levels=[5.0], colors="black", linewidths=1.0, linestyles="dashed"
+        )
+        panel.set_xscale("log")
+        panel.set_xticks([2, 5, 10, 20, 50, 100], labels=["2", "5", "10", "20", "50", "100"])
+        panel.minorticks_off()
+        panel.set_title(title, fontsize=10)
+        panel.set_xlabel("angular velocity [deg/s]")
+    axes[0].set_ylabel("load [mL]")
+    figure.colorbar(filled, ax=axes, label="may cling to the wall [% of what is poured]")
+    figure.suptitle(
+        f"A criterion, not a simulation: what leaves the beaker's lip at a Weber number below {DRIBBLING_WEBER:g}",
+        fontsize=11,
+    )
+    figure.savefig(IMAGES / "liquids-clinging.png", dpi=110)
+    print(IMAGES / "liquids-clinging.png")
+
+
 def main() -> None:
     """Simulate and draw."""
     import matplotlib
@@ -46,6 +110,7 @@ def main() -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    draw_clinging()
     scene = Scene(
         "cups",
         cylinder("pourer", inner_radius=0.04, inner_height=0.1),

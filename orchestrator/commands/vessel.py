@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -16,10 +16,14 @@ from sim_engine.vessel.errors import VesselError
 if TYPE_CHECKING:
     from sim_engine.vessel.sources.evidence import Radii
     from sim_engine.vessel.sources.outline import Evidence, Outline
+    from sim_engine.vessel.sources.points import Scan
     from sim_engine.vessel.spec import LengthUnit
 
 CALLIPERS = 2e-4
 """Standard deviation of a radius that was measured with callipers [m]."""
+
+HEIGHT = 3e-4
+"""Standard deviation of the height of the rim [m]; a depth image's is a pixel."""
 
 RULER, BALANCE, ANGLE = 5e-4, 5e-4, 0.005
 """Standard deviations of a level [m], of a mass [kg] and of a tilt [rad] in tables."""
@@ -38,6 +42,9 @@ class Sources:
     known_height: str | None = None
     known_width: str | None = None
     points: Path | None = None
+    depth: Path | None = None
+    focal: float | None = None
+    centre: str | None = None
     mesh: Path | None = None
     unit: str | None = None
     up: str = "z"
@@ -136,7 +143,7 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
     wall = _quantity(sources.wall, "--wall", "m", "3 mm")
     floor = _quantity(sources.floor, "--floor", "m", "4 mm")
     height = _quantity(sources.height, "--height", "m", "95 mm")
-    seen = _points(sources, wall, floor, notes) if sources.points is not None else None
+    seen = _points(sources, wall, floor, notes) if sources.points or sources.depth else None
     if isinstance(seen, _Uneven):
         return _written_mesh(out, name, seen.vertices, seen.faces, sources, notes)
     if seen is not None:
@@ -145,9 +152,11 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
         raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'", BAD_INPUT)
     floor = wall if floor is None else floor
     evidence: list[Evidence] = []
+    off = HEIGHT
     if seen is not None:
         evidence.append(seen.radii)
-        height = height or seen.height
+        if height is None:
+            height, off = seen.height, max(off, seen.pixel)
     if sources.photo is not None:
         radii, inside = _photographed(sources, wall, floor)
         evidence.append(radii)
@@ -157,7 +166,7 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
             "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'", BAD_INPUT
         )
     evidence += _measured(sources, height)
-    outline = find_outline(height, evidence, wall, floor)
+    outline = find_outline(height, evidence, wall, floor, height_deviation=off)
     spec = VesselSpec(name=name, shape=outline.shape())
     build_vessel(spec)
     doubts = _doubts(outline, sources)
@@ -218,6 +227,7 @@ class _Seen:
     radii: Radii
     height: float
     wall: float | None
+    pixel: float
 
 
 @dataclass(frozen=True)
@@ -227,12 +237,10 @@ class _Uneven:
 
 
 def _points(sources: Sources, wall: float | None, floor: float | None, notes: list[str]) -> _Seen | _Uneven:
-    from orchestrator.commands.vessel_tables import read_points
-    from sim_engine.vessel.sources.points import radii_of, scan_of, wall_between
+    from sim_engine.vessel.sources.points import radii_of, wall_between
     from sim_engine.vessel.sources.surface import mesh_of
 
-    assert sources.points is not None
-    scan = scan_of(read_points(sources.points, _unit(sources), sources.up))
+    scan, pixel = _scanned(sources)
     between = wall_between(scan)
     thick = wall or between
     surfaces = {"both": "both surfaces", "inner": "the inner surface", "outer": "the outer surface"}[scan.seen]
@@ -249,7 +257,41 @@ def _points(sources: Sources, wall: float | None, floor: float | None, notes: li
             BAD_INPUT,
         )
     below = thick if floor is None else floor
-    return _Seen(radii_of(scan, thick, below), scan.height - (0.0 if scan.seen == "inner" else below), between)
+    radii = radii_of(scan, thick, below)
+    if sources.depth is not None:
+        radii = replace(radii, name="depth image")
+    return _Seen(radii, scan.height - (0.0 if scan.seen == "inner" else below), between, pixel)
+
+
+def _scanned(sources: Sources) -> tuple[Scan, float]:
+    """What was scanned, and how large a pixel of a depth image is on it [m]; 0 of points."""
+    from orchestrator.commands.vessel_tables import read_depth, read_points
+    from sim_engine.vessel.sources.depth import points_on_table
+    from sim_engine.vessel.sources.points import scan_of
+
+    if sources.points is not None and sources.depth is not None:
+        raise RefusalError("--depth goes without --points: give one of them", BAD_INPUT)
+    if sources.points is not None:
+        return scan_of(read_points(sources.points, _unit(sources), sources.up)), 0.0
+    assert sources.depth is not None
+    if sources.focal is None:
+        raise RefusalError(
+            "a depth image needs its camera's focal length in pixels: --focal 615; the camera's software tells it (fx)",
+            BAD_INPUT,
+        )
+    points = points_on_table(read_depth(sources.depth, _unit(sources)), sources.focal, _centre(sources.centre))
+    return scan_of(points, "outer", underside=0.0), float(points[:, 1].min()) / sources.focal
+
+
+def _centre(text: str | None) -> tuple[float, float] | None:
+    """Column and row of '318.2, 241.5'."""
+    try:
+        column, row = (float(part) for part in text.split(",")) if text is not None else (0.0, 0.0)
+    except ValueError:
+        raise RefusalError(
+            f"--centre {text!r}: should be a column and a row, such as '318.2, 241.5'", BAD_INPUT
+        ) from None
+    return None if text is None else (column, row)
 
 
 def _photographed(sources: Sources, wall: float, floor: float) -> tuple[Radii, float]:
@@ -309,7 +351,12 @@ def _from_mesh(out: Path, name: str, sources: Sources) -> Made:
     from sim_engine.vessel.sources.mending import mended
 
     require("manifold3d", "mending a mesh")
-    others = {"--diameters": sources.diameters, "--photo": sources.photo, "--points": sources.points}
+    others = {
+        "--diameters": sources.diameters,
+        "--photo": sources.photo,
+        "--points": sources.points,
+        "--depth": sources.depth,
+    }
     others |= {"--fill": sources.fill, "--tilt": sources.tilt}
     if given := [option for option, value in others.items() if value is not None]:
         raise RefusalError(f"{given[0]} goes with turned vessels; a mesh says all of its shape itself", BAD_INPUT)

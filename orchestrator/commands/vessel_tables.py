@@ -1,4 +1,4 @@
-"""What `decant vessel` reads: pairs of lengths, tables of two columns, points, a photograph."""
+"""What `decant vessel` reads: pairs of lengths, tables of two columns, points, a photograph, a depth image."""
 
 from __future__ import annotations
 
@@ -155,6 +155,36 @@ def read_photograph(path: Path) -> Floats:
             return np.asarray(picture.convert("L"), dtype=float)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # cut off, damaged
         raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
+
+
+def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
+    """A depth image, rows from the top, shape (rows, columns) [m]; 0 where nothing was seen.
+
+    Raises:
+        RefusalError: it is not one, or its unit is not clear (exit code 2).
+    """
+    import numpy as np
+    from PIL import Image, UnidentifiedImageError
+
+    from sim_engine.vessel.mesh_file import UNITS
+
+    _check_size(path)
+    try:
+        if path.suffix.lower() == ".npy":
+            depth = np.load(path, allow_pickle=False)
+        else:
+            with Image.open(path) as picture:
+                depth = np.asarray(picture)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise RefusalError(f"{path}: is not a depth image that can be read ({error})", BAD_INPUT) from None
+    if depth.ndim != 2 or depth.dtype.kind not in "uif" or depth.dtype.itemsize < 2:
+        raise RefusalError(
+            f"{path}: should be a grey image of 16 bits, or an array of rows and columns, with distances in it; a "
+            "picture in colours or of 8 bits shows them, and has none",
+            BAD_INPUT,
+        )
+    result: Floats = np.nan_to_num(depth.astype(float), posinf=0.0, neginf=0.0) * UNITS[unit or "mm"]
+    return result
 
 
 def _check_size(path: Path) -> None:

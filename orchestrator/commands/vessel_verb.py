@@ -21,8 +21,13 @@ def vessel(
     known_height: Annotated[str | None, typer.Option(help="Outer height, for its scale.")] = None,
     known_width: Annotated[str | None, typer.Option(help="Largest outer width, for its scale.")] = None,
     points: Annotated[Path | None, typer.Option(help="Points of its surface: PLY, XYZ, or CSV with x, y, z.")] = None,
+    depth: Annotated[Path | None, typer.Option(help="Depth image from its side: PNG of 16 bits, or NPY.")] = None,
+    focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
+    centre: Annotated[
+        str | None, typer.Option(help="Column and row of its axis: '318.2, 241.5'; the image's middle unless given.")
+    ] = None,
     mesh: Annotated[Path | None, typer.Option(help="Mesh to be mended: STL, OBJ, PLY or GLB.")] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of the points or the mesh: m, cm, mm, in.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of points, mesh or depths: m, cm, mm, in; depths: mm.")] = None,
     up: Annotated[str, typer.Option(help="Axis of points or mesh that points out of the opening.")] = "z",
     fill: Annotated[Path | None, typer.Option(help="CSV of levels and what was in it then: level_mm, mass_g.")] = None,
     tilt: Annotated[Path | None, typer.Option(help="CSV of tilts and what it still held: tilt_deg, mass_g.")] = None,
@@ -34,7 +39,7 @@ def vessel(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a vessel file from what you can measure: callipers, photograph, points, a mesh, a fill or a tilt table.
+    """Make a vessel file from what you can measure: callipers, photograph, points, depths, a mesh, fill or tilt tables.
 
     Sources for a turned vessel can be joined: each says what it knows, with its own uncertainty. Beside the file there
     is a picture with the section, its band and what was measured. What was measured is written into the file.

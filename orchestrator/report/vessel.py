@@ -21,8 +21,8 @@ BAND = 2.0
 
 
 def draw_outline(name: str, outline: Outline, evidence: Sequence[Evidence], path: Path) -> Path:
-    """The section of a turned vessel with its band, and radii that were measured."""
-    from sim_engine.vessel.sources.evidence import Radii
+    """The section of a turned vessel with its band, and the radii and levels that were measured."""
+    from sim_engine.vessel.sources.evidence import FillTable, Radii
 
     figure, axes = style.new_figure(size=(6.0, 5.0))
     shape = outline.shape()
@@ -45,13 +45,17 @@ def draw_outline(name: str, outline: Outline, evidence: Sequence[Evidence], path
                 1e3 * piece.heights,
                 next(marks),
                 color=style.MEASURED,
-                ms=4,
+                ms=4 if len(piece.observed) < 15 else 2.5,
                 label=piece.name,
                 zorder=4,
             )
+        elif isinstance(piece, FillTable):
+            levels = 1e3 * piece.levels
+            axes.plot(0.0 * levels, levels, "_", color=style.MEASURED, ms=12, label=f"levels of the {piece.name}")
     title = f"{name}: {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL"
     style.dress(axes, title=title, x="distance from the axis [mm]", y="height above the inner floor [mm]")
     axes.set_aspect("equal")
+    axes.margins(0.08)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
     return style.save(figure, path)
 
@@ -60,7 +64,7 @@ def draw_solid(name: str, vessel: Vessel, path: Path) -> Path:
     """The section of a mesh through its middle."""
     figure, axes = style.new_figure(size=(6.0, 5.0))
     for loop in section(vessel.solid_vertices, vessel.solid_faces):
-        axes.fill(1e3 * loop[:, 0], 1e3 * (loop[:, 1] - vessel.inner_floor), color=style.GREY, lw=0)
+        axes.fill(1e3 * loop[:, 0], 1e3 * (loop[:, 1] - vessel.inner_floor), fc=style.PALE, ec=style.INK, lw=1.6)
     style.dress(
         axes,
         title=f"{name}: {1e6 * vessel.capacity:.0f} mL",
@@ -68,4 +72,5 @@ def draw_solid(name: str, vessel: Vessel, path: Path) -> Path:
         y="height above the inner floor [mm]",
     )
     axes.set_aspect("equal")
+    axes.margins(0.08)
     return style.save(figure, path)

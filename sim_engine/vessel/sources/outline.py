@@ -166,7 +166,7 @@ class Outline:
 
 
 def find_outline(
-    height: float, evidence: Sequence[Evidence], wall: float, floor: float, *, height_deviation: float = 3e-4
+    height: float, evidence: Sequence[Evidence], wall: float, floor: float, *, height_deviation: float
 ) -> Outline:
     """The most likely profile given everything that was measured.
 

@@ -84,12 +84,15 @@ class Scan:
         return self.out_of_round <= max(ROUND, 0.5 * self.scatter)
 
 
-def scan_of(points: Floats, surface: Literal["auto", "inner", "outer"] = "auto") -> Scan:
+def scan_of(
+    points: Floats, surface: Literal["auto", "inner", "outer"] = "auto", *, underside: float | None = None
+) -> Scan:
     """Find the axis and the surfaces of a cloud of points.
 
     Args:
         points: z up, shape (n, 3) [m].
         surface: which one was seen; 'auto': both where there are two, else the outer one.
+        underside: its height, where it is known better than by the lowest of them [m].
 
     Raises:
         VesselError: too few points, or no axis.
@@ -123,6 +126,8 @@ def scan_of(points: Floats, surface: Literal["auto", "inner", "outer"] = "auto")
     moved = _moved(centred, polished.x, size)
     low, high = _ends(moved, min(float(polished.fun) * size, ROUND))
     moved = moved[(moved[:, 2] >= low - 0.1 * (high - low)) & (moved[:, 2] <= high + 0.1 * (high - low))]
+    if underside is not None:
+        low = underside - float(points[:, 2].min())
     moved[:, 2] -= low
     layers, seen = _layers(moved, surface)
     if len(layers) < LAYERS // 4:
@@ -205,7 +210,7 @@ def _layers(points: Floats, surface: str) -> tuple[list[Layer], Literal["inner",
             continue
         radii = [float(np.median(each)) for each in parts]
         if not twice:
-            radii = [float(np.median(parts[0]))]
+            radii = radii[-1:] if surface == "outer" else radii[:1]
         scatter = float(np.median([1.4826 * np.median(np.abs(each - np.median(each))) for each in parts]))
         inner = radii[0] if twice or surface == "inner" else None
         outer = radii[-1] if surface != "inner" else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from orchestrator.commands.vessel import Sources, vessel
 from orchestrator.config.load import load_vessel
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.profile import volume
-from tests.measured import Bench
+from tests.measured import FOCAL, Bench
 
 VESSELS = Path("configs/vessels")
 
@@ -56,16 +57,21 @@ def points(of: Bench, folder: Path) -> Sources:
     return Sources(points=of.save_cloud(folder / "cloud.csv"), unit="mm", floor=f"{of.shape.floor} m")
 
 
+def depth(of: Bench, folder: Path) -> Sources:
+    wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
+    return Sources(depth=of.depth(folder / "depth.png"), focal=FOCAL, wall=wall, floor=floor)
+
+
 def mesh(of: Bench, folder: Path) -> Sources:
     of.solid().export(folder / "scan.stl")
     return Sources(mesh=folder / "scan.stl")
 
 
 @pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("door", [callipers, fill, tilt, photo, points, mesh])
+@pytest.mark.parametrize("door", [callipers, fill, tilt, photo, points, depth, mesh])
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
-    of = bench(name)
-    assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
+    of, within = bench(name), 0.03 if door is depth else 0.015  # a pixel of the camera is 1.4 mm on the cup
+    assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=within)
 
 
 def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_level(tmp_path: Path) -> None:
@@ -167,6 +173,10 @@ def tiny(of: Bench, folder: Path) -> Sources:
     return Sources(mesh=folder / "tiny.stl")
 
 
+def steep(of: Bench, folder: Path) -> Sources:
+    return replace(depth(of, folder), depth=of.depth(folder / "steep.png", down=0.7))
+
+
 def written(text: str) -> Door:
     def door(of: Bench, folder: Path) -> Sources:
         (folder / "fill.csv").write_text(text)
@@ -192,6 +202,10 @@ def written(text: str) -> Door:
             lambda of, folder: Sources(photo=of.photo(folder / "p.png", handle=True), known_height="9 cm", wall="3 mm"),
             r"not the same on both sides",
         ),
+        (lambda of, folder: replace(depth(of, folder), focal=None), r"focal length in pixels: --focal"),
+        (lambda of, folder: replace(depth(of, folder), centre="318"), r"--centre '318': should be a column and a row"),
+        (lambda of, folder: Sources(depth=of.photo(folder / "p.png"), focal=FOCAL, wall="3 mm"), r"16 bits"),
+        (steep, r"no table is seen"),
         (lambda of, folder: Sources(mesh=folder / "x.stl", tilt=folder / "t.csv"), r"--tilt goes with turned vessels"),
         (written("level,mass\n1,2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
         (written("level_mm,mass_g\n10,20\n20,x\n"), r"fill.csv:3: should be two numbers"),
