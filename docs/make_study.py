@@ -1,6 +1,6 @@
 """Brings a study's figures and tables into docs/results.md.
 
-    python docs/make_study.py runs/study-paper/report
+    python docs/make_study.py runs/study-benches/report
 
 Figures go to docs/images/study; tables stand between `<!-- study: NAME ... -->` and `<!-- end of study -->`.
 What follows the name picks rows: `mismatch=small/large; strategy=D3`. A column of one wanted value is left out.
@@ -17,7 +17,8 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 PAGE, IMAGES = DOCS / "results.md", DOCS / "images" / "study"
 MARKED = re.compile(r"(<!-- study: (?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(<!-- end of study -->)", re.DOTALL)
-FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7", "final")
+FIGURES = ("3b", "5b", "6", "final")
+"""Those that the page shows."""
 
 
 def table(path: Path, wanted: dict[str, set[str]]) -> str:

@@ -12,7 +12,17 @@ import numpy as np
 from orchestrator.report import style
 from orchestrator.report.units import LossUnit, deployment_unit, largest_loss
 from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.drawing import Drawn, Look, colour, legend, log_axis, look
+from orchestrator.study.report.drawing import (
+    Drawn,
+    Look,
+    colour,
+    is_first,
+    legend,
+    level_panels,
+    level_words,
+    log_axis,
+    look,
+)
 from orchestrator.study.report.gather import Gathered, Key, at_pour, mean
 from orchestrator.study.report.intervals import Estimate, Range, estimate
 
@@ -114,13 +124,13 @@ def level_note(study: StudyPlan, level: str) -> str:
         if len({liquid[name] for liquid in liquids.values()}) > 1
     ]
     if len({bench.pose_error.x for bench in benches.values()}) > 1:
-        told.append(f"receiver{HARD_SPACE}{1e3 * benches[level].pose_error.x:+.0f}{HARD_SPACE}mm")
+        told.append(f"receiver{HARD_SPACE}{round(1e3 * benches[level].pose_error.x):+d}{HARD_SPACE}mm")
     return ", ".join(told)
 
 
 def level_title(study: StudyPlan, level: str) -> str:
     """Title of a panel: the level's name, and below it what its bench is like."""
-    return "\n".join([f"{level} mismatch", *textwrap.wrap(level_note(study, level), TITLE_WIDTH)])
+    return "\n".join([level_words(level), *textwrap.wrap(level_note(study, level), TITLE_WIDTH)])
 
 
 LEVELS = (
@@ -149,16 +159,16 @@ def least_shown(unit: LossUnit) -> float:
 def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
     levels, receivers, arms = places(study, found)
     unit, receiver, pours = deployment_unit(study.deployments[0].plan), receivers[0], checkpoints(study)
-    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.2), squeeze=False, sharey=True)
+    figure, panels = level_panels(levels, height=4.2)
     rows: list[list[object]] = []
-    for axes, level in zip(grid[0], levels, strict=True):
+    for (axes,), level in zip(panels, levels, strict=True):
 
         def after(i: int, arm: str, level: str = level) -> Estimate:
             return mean_loss(study, at_pour(found.best_so_far(Key(level, receiver, arm)), pours[i]))
 
         drawn = means(axes, [str(pour) for pour in pours], arms, after, least_shown(unit))
         rows += [[level, receiver, arm, pours[i], *numbers] for i, arm, numbers in drawn]
-        y = f"least {unit.label}" if level == levels[0] else ""
+        y = f"least {unit.label}" if is_first(axes) else ""
         style.dress(axes, title=level_title(study, level), x="pours", y=y)
     legend(figure, arms)
     return Drawn(
@@ -176,16 +186,16 @@ def _after_pours(study: StudyPlan, found: Gathered) -> Drawn:
 def _mean_of_pours(study: StudyPlan, found: Gathered) -> Drawn:
     levels, receivers, arms = places(study, found)
     unit = deployment_unit(study.deployments[0].plan)
-    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.0), squeeze=False, sharey=True)
+    figure, panels = level_panels(levels, height=4.0)
     rows: list[list[object]] = []
-    for axes, level in zip(grid[0], levels, strict=True):
+    for (axes,), level in zip(panels, levels, strict=True):
 
         def of_all(i: int, arm: str, level: str = level) -> Estimate:
             return mean_loss(study, [mean(pours) for pours in found.losses.get(Key(level, receivers[i], arm), [])])
 
         drawn = means(axes, receivers, arms, of_all, least_shown(unit))
         rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in drawn]
-        style.dress(axes, title=level_title(study, level), y=f"mean {unit.label}" if level == levels[0] else "")
+        style.dress(axes, title=level_title(study, level), y=f"mean {unit.label}" if is_first(axes) else "")
     legend(figure, arms)
     return Drawn(
         "figure-5b",
@@ -205,12 +215,11 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
 
     unit, numbers = deployment_unit(study.deployments[0].plan), list(range(1, most_pours(study) + 1))
     least = least_shown(unit)
-    size = (1.2 + 3.4 * len(receivers), 0.8 + 2.8 * len(levels))
-    figure, grid = style.new_figure(len(levels), len(receivers), size=size, squeeze=False, sharex=True, sharey=True)
+    figure, panels = level_panels(levels, len(receivers), width=3.4, height=2.9)
     rows: list[list[object]] = []
     for i, level in enumerate(levels):
         for j, receiver in enumerate(receivers):
-            axes = grid[i][j]
+            axes = panels[i][j]
             for arm in arms:
                 curves = found.best_so_far(Key(level, receiver, arm))
                 if not curves:
@@ -224,8 +233,8 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
                     # Bars beside each other, and no bands: those of several strategies would fill the panel.
                     aside = 0.6 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
                     _mean(axes, pour + aside, points[pour - 1], shown, least, "")
-            x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if j == 0 else ""
-            style.dress(axes, title=f"{receiver}, {level} mismatch", x=x, y=y, grid="both")
+            x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if is_first(axes) else ""
+            style.dress(axes, title=f"{receiver}, {level_words(level)}", x=x, y=y, grid="both")
             log_axis(axes.yaxis, decades=True)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend(figure, arms)
@@ -275,9 +284,9 @@ def _prices(study: StudyPlan, found: Gathered) -> Drawn:
         "figure-7",
         "7",
         "What pays off at which prices",
-        f"Least loss so far, mean over repetitions and receivers ({level} mismatch), against the time that it would "
-        "have taken at hypothesised prices. D3's simulations beside a pour cost time only where they take longer than "
-        "the pour. Calibration is not counted: D1 and D3 share it. "
+        f"Least loss so far, mean over repetitions and receivers ({level_words(level)}), against the time that it "
+        "would have taken at hypothesised prices. D3's simulations beside a pour cost time only where they take longer "
+        "than the pour. Calibration is not counted: D1 and D3 share it. "
         f"Less than {least_shown(unit):g} {unit.unit} is drawn there.",
         figure,
         ("level", "seconds_per_simulation", "seconds_per_pour", "strategy", "total_seconds", f"least_{unit.unit}"),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from orchestrator.report import style
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
@@ -42,6 +43,9 @@ MARKER = {"D1": "v", "D2": "s", "D3": "o"}
 
 MOST_ABREAST = 8
 """Entries of a legend's row."""
+
+MOST_LEVELS_ABREAST = 4
+"""Panels beside each other, one a level."""
 
 PALEST, DARKEST = 0.45, -0.35
 """Shades of several D1, from the fewest iterations to the most: share of white, or below zero of ink, in the colour."""
@@ -160,6 +164,37 @@ def log_axis(axis: Axis, *, decades: bool = False) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0,) if decades else (1.0, 2.0, 5.0)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def level_words(level: str) -> str:
+    """'small mismatch' of a level 'small'; benches that are numbered are called as they are: 'bench3'."""
+    return level if level[-1:].isdigit() else f"{level} mismatch"
+
+
+def level_panels(
+    levels: Sequence[str], across: int = 1, *, width: float = 3.6, height: float = 4.2
+) -> tuple[Figure, list[list[Axes]]]:
+    """A figure with panels for each level, and these: `across` of them for each one, in as many rows as it takes.
+
+    Args:
+        across: panels of a level.
+        width, height: of a panel, with its share of the margins [inch].
+    """
+    abreast = len(levels) if len(levels) <= MOST_LEVELS_ABREAST else max(MOST_LEVELS_ABREAST // across, 1)
+    abreast = 1 if across > 1 and len(levels) <= MOST_LEVELS_ABREAST else abreast
+    lines = -(-len(levels) // abreast)
+    size = (1.2 + width * abreast * across, height * lines + 0.7)
+    figure, grid = style.new_figure(lines, abreast * across, size=size, squeeze=False, sharey=True)
+    panels = [axes for row in grid for axes in row]
+    for axes in panels[len(levels) * across :]:
+        axes.set_axis_off()
+    return figure, [panels[across * i : across * (i + 1)] for i in range(len(levels))]
+
+
+def is_first(axes: Axes) -> bool:
+    """Whether a panel stands at the left, where the vertical axis is named."""
+    place = axes.get_subplotspec()
+    return place is None or place.is_first_col()
 
 
 def legend(figure: Figure, arms: Sequence[str]) -> None:

@@ -16,7 +16,7 @@ from orchestrator.study.report.deployments import (
     means,
     places,
 )
-from orchestrator.study.report.drawing import Drawn, is_ours, legend
+from orchestrator.study.report.drawing import Drawn, is_first, is_ours, legend, level_panels
 from orchestrator.study.report.effects import Effect, effect
 from orchestrator.study.report.gather import Gathered, Key, mean
 from orchestrator.study.report.intervals import SHARE, Estimate, estimate
@@ -35,16 +35,16 @@ def draw_finals(study: StudyPlan, found: Gathered) -> list[Drawn]:
         return []
     levels, receivers, arms = final_places(study, found)
     unit = deployment_unit(study.deployments[0].plan)
-    figure, grid = style.new_figure(1, len(levels), size=(1.2 + 3.6 * len(levels), 4.2), squeeze=False, sharey=True)
+    figure, panels = level_panels(levels)
     rows: list[list[object]] = []
-    for axes, level in zip(grid[0], levels, strict=True):
+    for (axes,), level in zip(panels, levels, strict=True):
 
         def poured_again(i: int, arm: str, level: str = level) -> Estimate:
             return mean_loss(study, list(final_losses(found, level, [receivers[i]], arm).values()))
 
         drawn = means(axes, receivers, arms, poured_again, least_shown(unit))
         rows += [[level, receivers[i], arm, *numbers] for i, arm, numbers in drawn]
-        style.dress(axes, title=level_title(study, level), y=f"{unit.label}" if level == levels[0] else "")
+        style.dress(axes, title=level_title(study, level), y=f"{unit.label}" if is_first(axes) else "")
     legend(figure, arms)
     header = ("level", "receiver", "strategy", "repetitions", f"final_{unit.unit}", "low", "high")
     caption = f"{CAPTION} Arrows: the interval goes on below {least_shown(unit):g} {unit.unit}. {LEVELS}"

@@ -14,7 +14,7 @@ from orchestrator.study.folder import finished_results, write_whole
 from orchestrator.study.plan import Level, StudyPlan
 from orchestrator.study.report.calibrations import draw_calibrations
 from orchestrator.study.report.deployments import draw_deployments
-from orchestrator.study.report.drawing import Drawn, write_csv
+from orchestrator.study.report.drawing import Drawn, level_words, write_csv
 from orchestrator.study.report.effects import FEWEST
 from orchestrator.study.report.finals import draw_finals
 from orchestrator.study.report.gather import Gathered, gather
@@ -137,7 +137,7 @@ def _settings(study: StudyPlan) -> list[str]:
         axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in arm.plan.parameters.axes)
         lines.append(
             f"{arm.label}: {arm.plan.settings.simulations_on(train)} simulations, {arm.repetitions} repetitions, "
-            f"searching {axes}; at {', '.join(arm.levels)} mismatch{_AS_IN_THE_PAPER.get(arm.label, '')}."
+            f"searching {axes}; at {', '.join(map(level_words, arm.levels))}{_AS_IN_THE_PAPER.get(arm.label, '')}."
         )
     for each in study.deployments:
         paper = _AS_IN_THE_PAPER.get(each.label, "")

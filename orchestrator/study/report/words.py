@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from orchestrator.study.report.drawing import level_words
 from orchestrator.study.report.effects import ALL
 from orchestrator.study.report.intervals import Estimate
 from orchestrator.study.report.tables import Table
@@ -29,7 +30,8 @@ def plain_words(shown: Sequence[Table]) -> list[str]:
 def _sentence(compared: str, of: str, level: str, receiver: str, difference: Estimate, better: str) -> str:
     first, _, second = compared.partition(" − ")
     into = {ALL: ", over all receivers", "—": ""}.get(receiver, f", into {receiver}")
-    where = f"At {level} mismatch{into}, {of}{' pours' if of[-1:].isdigit() else ''}"
+    at = f"{'On' if level_words(level) == level else 'At'} {level_words(level)}"
+    where = f"{at}{into}, {of}{' pours' if of[-1:].isdigit() else ''}"
     size = f"{compared}: {difference.text()}, better in {better}"
     if math.isnan(difference.low):
         return f"{where}: there are too few repetitions for an interval ({size})."
