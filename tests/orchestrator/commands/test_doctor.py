@@ -64,6 +64,16 @@ def checked(path: Path, *options: str) -> dict[str, dict[str, Any]]:
     return {check["name"]: check for check in reversed(table)}
 
 
+def when_not_overloaded(path: Path, *options: str) -> Result:
+    """What doctor says once this machine, which may be busy, keeps up with the controller's packages."""
+    found = doctor(path, *options)
+    for _ in range(20):
+        if "FAIL  connection" not in found.stdout:
+            break
+        found = doctor(path, *options)
+    return found
+
+
 @pytest.mark.realtime
 def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance
@@ -76,13 +86,13 @@ def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     assert refused.exit_code == 1
     assert "accepted by nobody" in refused.stdout
     assert f"decant doctor {path} --accept-safety" in refused.stdout
-    accepted = doctor(path, "--accept-safety")
+    accepted = when_not_overloaded(path, "--accept-safety")
     assert accepted.exit_code == 0, accepted.output
     record = json.loads(record_path(path).read_text())
     assert record["checksum"] == before["checksum"]
     assert record["serial"] == "2016300123"
     assert set(record) == {"checksum", "serial", "model", "software", "date", "accepted_by"}
-    again = doctor(path)
+    again = when_not_overloaded(path)
     assert again.exit_code == 0
     assert "ready" in again.stderr
     for line in ("PolyScope 3.15", "at home", "kcp", "0 g, stable", "not tried"):
