@@ -1,6 +1,6 @@
 """Compose docs/images/quickstart.png from quickstart runs with several seeds: a pour, all pours, the learnt loss.
 
-for seed in 7 8 9 10: decant run configs/campaigns/quickstart.yaml --laboratory configs/laboratories/twin.yaml --seed …
+for seed in 1 2 3: decant run configs/campaigns/quickstart.yaml --laboratory configs/laboratories/twin.yaml --seed …
 python docs/make_quickstart_picture.py runs/quickstart-…   # one folder a seed; the first one's best pour is simulated
 """
 
@@ -77,7 +77,8 @@ def draw_pours(path: Path, runs: list[Deployed]) -> None:
     shown = [tick for tick in ticks if tick <= top]
     axes.set_yticks(shown, ["≤ 0.05", *(f"{tick:g}" for tick in shown[1:])])
     axes.minorticks_off()
-    title = f"Six pours into a narrow cup, {len(runs)} seeds"
+    axes.set_xticks(range(1, 1 + max(map(len, losses))))
+    title = f"Pours into a narrow cup until one is good enough, {len(runs)} seeds"
     style.dress(axes, title=title, x="pour", y="(spilled + retained) / loaded [%]", grid="both")
     handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=9, frameon=False)

@@ -25,7 +25,7 @@ from orchestrator.events import (
 from orchestrator.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.strategies.progress import Progress
 
-PRICE = 1.2e-3
+PRICE = 1e-3
 """Price of a simulated pour on one core, per particle, before one has been seen [s]."""
 
 THOUGHT = 0.2

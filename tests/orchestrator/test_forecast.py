@@ -11,7 +11,7 @@ import pytest
 from actors.bench.spec import VirtualBenchSpec
 from actors.spec import LaboratorySpec
 from orchestrator.events import Event, RequestFinished, RequestStarted, StageClosed, StageOpened, StrategyProgressed
-from orchestrator.forecast import Forecast, Work
+from orchestrator.forecast import PRICE, Forecast, Work
 from orchestrator.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.strategies.progress import Progress
 from orchestrator.work import pour_time, work_of
@@ -113,7 +113,7 @@ def test_first_pours_that_start_a_bench_and_what_is_made_beside_them_say_nothing
 @pytest.mark.parametrize("last", [True, False])
 def test_simulations_made_while_the_arm_pours_are_not_waited_for(made: bool, last: bool) -> None:
     """Unless they weren't: then the forecast is right again once that is seen."""
-    forecast, timeline = Forecast(slots=2, particles=1000.0), Timeline()
+    forecast, timeline = Forecast(slots=2, particles=0.6 * 2 / PRICE), Timeline()
     forecast.begin(2, {"pours": Work(pours=4, pour_time=8.0), "evaluation": Work(35, ahead=25)})
     assert forecast.left(timeline.now) == pytest.approx(4 * 8.2 + 10 * 0.6)
     answered = (*(0.6 for _ in range(10)), *((0.0 if made else 0.6) for _ in range(25)))
@@ -135,7 +135,7 @@ def test_the_time_left_falls_while_a_pour_or_a_simulation_takes_its_time() -> No
         if isinstance(event, RequestStarted) and (event.stage, event.id) in {("pours", 5), ("calibration", 20)}:
             lefts = [forecast.left(event.time + 0.5 * k) or 0.0 for k in range(4)]
             assert all(later <= sooner for sooner, later in pairwise(lefts)), event.stage
-            assert lefts[0] - lefts[2] == pytest.approx(1.0 if event.stage == "pours" else 0.9 * 0.8, abs=0.1)
+            assert lefts[0] - lefts[2] == pytest.approx(1.0 if event.stage == "pours" else 0.9 * 0.7, abs=0.1)
 
 
 def test_simulations_beside_a_pour_cost_time_only_where_they_outlast_it() -> None:
@@ -169,6 +169,6 @@ def test_a_person_s_pour_takes_the_time_that_was_set_for_it_and_a_fast_bench_a_p
     scene, actions = campaign.deployment.scenes[0], campaign.deployment.actions
     slow = pour_time(LaboratorySpec("slow", bench=replace(bench, time_scale=1.0)), scene, actions)
     fast = pour_time(LaboratorySpec("fast", bench=replace(bench, time_scale=10.0)), scene, actions)
-    liquid = 1.2e-3 * bench.liquid.particles
+    liquid = PRICE * bench.liquid.particles
     assert bench.operator_time + 15.0 < slow - liquid < bench.operator_time + 45.0
     assert fast - liquid == pytest.approx((slow - liquid) / 10.0)
