@@ -215,6 +215,10 @@ class Tally:
         """Simulators that work."""
         return min(len(self.running) + self.ahead.running, self.simulators)
 
+    @property
+    def _calibration_pour(self) -> bool:
+        return self.pour is not None and self.pour.calibrating and not self.pour.result
+
     def load(self) -> float | None:
         """Mean share of the pool (0 … 1) that was busy since this was asked last; None if no time has passed."""
         elapsed = 0.0 if self._load_from is None else self._load_to - self._load_from
@@ -233,7 +237,7 @@ class Tally:
         """'214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
         each = f", {self.simulation_seconds / self.timed_simulations:.1f} s each" if self.timed_simulations else ""
         parts = [f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}"]
-        if self.ahead.waiting:
+        if self.ahead.waiting and (self.ahead.running or self._calibration_pour):  # later on some are never asked for
             parts.append(f"{self.ahead.waiting} more made ahead")
         if self.failed_simulations:
             parts.append(f"{self.failed_simulations} failed")
