@@ -34,7 +34,6 @@ from typing import Any
 from machine import ROOT, run_self, say
 from players import interval
 
-from actors.optimizer.core import averaged
 from actors.optimizer.core.mismatch import Mismatch
 from actors.simulation.in_process import InProcessSimulatorPool
 from actors.simulation.job_runner import Simulator, pour_simulator
@@ -57,14 +56,9 @@ def _with_lookahead() -> None:
     vars(d3).update(Mismatch=mismatch)
 
 
-def _without_widths() -> None:
-    averaged.WIDTH = 0.0
-
-
 ARMS: dict[str, Callable[[], None]] = {
     "shipped": lambda: None,
     "look-ahead": _with_lookahead,
-    "no widths": _without_widths,
 }
 
 

@@ -16,6 +16,10 @@ LONG_FIRST_JOB = 5.0
 cost a second or two; compiled, six to eight."""
 
 
+RETRIES = 2
+"""How often a job is tried again in another process after one died over it."""
+
+
 class JobCancelledError(Exception):
     """The job was given up because nobody waits for it any more."""
 

@@ -14,15 +14,12 @@ from actors.cluster.versions import Versions
 from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
 from actors.simulation.actor import CONTROL, Answer, simulator_actor
 from actors.simulation.crew import Crew
-from actors.simulation.job_runner import Simulator, pour_simulator
+from actors.simulation.job_runner import RETRIES, Simulator, pour_simulator
 from actors.simulation.member import Job, Member, Sent
 from actors.simulation.parcel import Packer
 from actors.simulation.statistics import Account, PoolStatistics
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
-
-RETRIES = 2
-"""How often a job is given to another member after one died over it."""
 
 DEADLINE = 1800.0
 """Longest time for one job on one member [s]: half an hour means dead, not slow."""

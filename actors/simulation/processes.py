@@ -6,21 +6,18 @@
 from __future__ import annotations
 
 import contextlib
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
+from actors.child import Child
 from actors.protocols import LaboratoryError, SimulationError
 from actors.simulation.in_process import ThreadedPool
-from actors.simulation.job_runner import JobCancelledError, JobRunner, Simulator, pour_simulator
+from actors.simulation.job_runner import RETRIES, JobCancelledError, JobRunner, Simulator, pour_simulator
 from sim_engine.simulated import SimulatedPour
 from sim_engine.task import PourTask
-
-RETRIES = 2
-"""How often a job is tried again in a fresh process after one died over it."""
 
 LOOK = 0.1
 """Between two looks whether a job is still wanted [s]."""
@@ -53,20 +50,10 @@ class ProcessRunner:
         self._start()
 
     def _start(self) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", __name__, str(theirs.fileno())],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,  # an interrupt at the keyboard is for its owner
-            )
-        self.pid = self._process.pid
-        self._connection = Connection(ours.detach())
+        self._child = Child(__name__)
+        self.pid = self._child.process.pid
         with contextlib.suppress(OSError):  # that it is gone is noticed with its first job
-            self._connection.send(self._make)
+            self._child.connection.send(self._make)
 
     def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulatedPour:
         """See `JobRunner.simulate`.
@@ -74,40 +61,41 @@ class ProcessRunner:
         Raises:
             SimulationError: processes died over it, too.
         """
+        last_words = ""
         for _ in range(RETRIES + 1):
             if cancelled():
                 raise JobCancelledError
             try:
                 answer = self._ask(task, cancelled)
             except (EOFError, OSError):
-                self._process.kill()
-                status = self._process.wait()
-                self._connection.close()
+                self._child.process.kill()
+                last_words = f"(status {self._child.process.wait()} at last){self._child.said()}"
+                self._child.connection.close()
                 self._start()
                 continue
             if isinstance(answer, SimulatedPour):
                 return answer
             raise answer
-        raise SimulationError(f"the simulator's process died {RETRIES + 1} times over it (status {status} at last)")
+        raise SimulationError(f"the simulator's process died {RETRIES + 1} times over it {last_words}")
 
     def _ask(self, task: PourTask, cancelled: Callable[[], bool]) -> Any:
-        self._connection.send(task)
-        while not self._connection.poll(LOOK):
+        self._child.connection.send(task)
+        while not self._child.connection.poll(LOOK):
             if cancelled():
-                self._connection.send(None)
-                if not self._connection.poll(DEADLINE):
+                self._child.connection.send(None)
+                if not self._child.connection.poll(DEADLINE):
                     raise EOFError  # it hangs: as good as dead
                 break
-        return self._connection.recv()
+        return self._child.connection.recv()
 
     def close(self) -> None:
         """Hang up; a process that doesn't end by that is killed."""
-        self._connection.close()
+        self._child.connection.close()
         try:
-            self._process.wait(DEADLINE)
+            self._child.process.wait(DEADLINE)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self._child.process.kill()
+            self._child.process.wait()
 
 
 def serve(connection: Connection) -> None:

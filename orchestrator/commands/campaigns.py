@@ -117,23 +117,18 @@ def calibrate(path: Path, options: RunOptions) -> None:
 
 def calibration_json(finished: Finished) -> dict[str, Any]:
     """θ* and mean |r − c_s| by split: its own, that of its rivals: see `Scorecard`."""
+    from orchestrator.report.results import rival_scores
     from orchestrator.results import learnt_by
     from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta
     from orchestrator.strategies.calibration.base import Calibrated
     from orchestrator.strategies.calibration.evaluation import Scores
-    from orchestrator.strategies.calibration.scorecard import CALIBRATED, UNCALIBRATED
+    from orchestrator.strategies.calibration.scorecard import CALIBRATED
 
     results = finished.result.results
     theta, calibration = calibrated_theta(results).theta.model_dump(), learnt_by(results, CALIBRATION, Calibrated)
     evaluation = learnt_by(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
-    rivals = {
-        "posterior": evaluation.posterior_mean,
-        "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
-        "random_theta": evaluation.random_median,
-        "mean_predictor": evaluation.mean_predictor,
-        "regression": evaluation.regression,
-    }
+    rivals = rival_scores(evaluation)
     data: dict[str, Any] = {"theta": theta}
     for split in ("train", "test", "transfer"):
         data[f"{split}_discrepancy"] = ours.get(split)

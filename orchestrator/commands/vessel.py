@@ -285,13 +285,15 @@ def _scanned(sources: Sources) -> tuple[Scan, float]:
 
 def _centre(text: str | None) -> tuple[float, float] | None:
     """Column and row of '318.2, 241.5'."""
+    if text is None:
+        return None
     try:
-        column, row = (float(part) for part in text.split(",")) if text is not None else (0.0, 0.0)
+        column, row = map(float, text.split(","))
     except ValueError:
         raise RefusalError(
             f"--centre {text!r}: should be a column and a row, such as '318.2, 241.5'", BAD_INPUT
         ) from None
-    return None if text is None else (column, row)
+    return column, row
 
 
 def _photographed(sources: Sources, wall: float, floor: float) -> tuple[Radii, float]:

@@ -72,6 +72,17 @@ def calibrated_label(evaluation: Scores) -> str | None:
     return next((label for label in evaluation.discrepancy if not label.startswith(rivals)), None)
 
 
+def rival_scores(evaluation: Scores) -> dict[str, dict[str, float | None]]:
+    """What θ* is held against, by name and split: see `Scorecard`."""
+    return {
+        "posterior": evaluation.posterior_mean,
+        "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
+        "random_theta": evaluation.random_median,
+        "mean_predictor": evaluation.mean_predictor,
+        "regression": evaluation.regression,
+    }
+
+
 def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
     """Scores by set of pours, for `draw_discrepancy`."""
     label = calibrated_label(evaluation)

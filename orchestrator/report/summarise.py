@@ -16,12 +16,12 @@ from orchestrator.report.results import (
     deployments_of,
     evaluation_of,
     predictions_of,
+    rival_scores,
     theta_of,
 )
 from orchestrator.report.summary import NotSimulated, ReceiverSummary, RunSummary, Totals
 from orchestrator.results import Results
 from orchestrator.strategies.calibration.evaluation import Scores
-from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed, Recommended
 from orchestrator.strategies.repeats import Foreseen
@@ -97,17 +97,12 @@ def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | Non
     if evaluation is None or label is None:
         return {}
     table: dict[str, dict[str, float | None]] = {}
-    rivals = {
-        "posterior": evaluation.posterior_mean,
-        "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
-        "random_theta": evaluation.random_median,
-        "mean_predictor": evaluation.mean_predictor,
-        "regression": evaluation.regression,
-    }
     for split in SPLITS:
         if split in evaluation.discrepancy[label]:
             table[split] = {"calibrated": evaluation.discrepancy[label][split]}
-            table[split] |= {name: scores[split] for name, scores in rivals.items() if split in scores}
+            table[split] |= {
+                name: scores[split] for name, scores in rival_scores(evaluation).items() if split in scores
+            }
     return table
 
 

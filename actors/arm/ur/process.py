@@ -7,25 +7,19 @@ moves. It ends when this process closes its side of the connection, in whatever 
 from __future__ import annotations
 
 import contextlib
-import os
-import socket
 import subprocess
-import sys
-import tempfile
 import threading
 import time
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
-from multiprocessing.connection import Connection
 from typing import Any
 
 from actors.arm.errors import ArmLostError, ArmRefusedError
 from actors.arm.ur.messages import Progress, TroubleError
+from actors.child import Child
 
 SIGN_OF_LIFE = 0.1
 """Between two signs of life to the worker while a call is awaited [s]."""
-
-_NOISE_KEPT = 2000
 
 
 class WorkerProcess:
@@ -37,20 +31,9 @@ class WorkerProcess:
     """
 
     def __init__(self) -> None:
-        ours, theirs = socket.socketpair()
-        self._noise = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
-        with theirs:
-            command = [sys.executable, "-m", "actors.arm.ur.worker", str(theirs.fileno())]
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=self._noise,
-                stderr=self._noise,
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,  # an interrupt at the keyboard is not for it
-            )
+        self._child = Child("actors.arm.ur.worker")
+        self._process, self._connection = self._child.process, self._child.connection
         self.pid = self._process.pid
-        self._connection = Connection(ours.detach())
         self._sending = threading.Lock()
         self._pending: dict[int, Future[Any]] = {}
         self._number = 0
@@ -92,9 +75,9 @@ class WorkerProcess:
             except TroubleError as trouble:
                 if trouble.kind == "refused":
                     raise ArmRefusedError(trouble.text) from None
-                raise ArmLostError(trouble.text + self._said()) from None
+                raise ArmLostError(trouble.text + self._child.said()) from None
         self.kill()
-        raise ArmLostError(f"the arm's worker did not answer '{method}' within {deadline:g} s{self._said()}")
+        raise ArmLostError(f"the arm's worker did not answer '{method}' within {deadline:g} s{self._child.said()}")
 
     def stop(self, stops: int) -> None:
         """Stop whatever moves; doesn't wait."""
@@ -136,12 +119,3 @@ class WorkerProcess:
 
     def _obituary(self, method: str) -> str:
         return f"the arm's worker died during {method} (status {self._process.poll()}); connect again"
-
-    def _said(self) -> str:
-        """What it, or the client library in it, has printed."""
-        with contextlib.suppress(OSError, ValueError):
-            size = os.fstat(self._noise.fileno()).st_size
-            data = os.pread(self._noise.fileno(), _NOISE_KEPT, max(0, size - _NOISE_KEPT))
-            if text := data.decode("utf-8", "replace").strip():
-                return f" (it said: {text})"
-        return ""

@@ -44,8 +44,8 @@ MARKER = {"D1": "v", "D2": "s", "D3": "o"}
 MOST_ABREAST = 8
 """Entries of a legend's row."""
 
-MOST_LEVELS_ABREAST = 4
-"""Panels beside each other, one a level."""
+MOST_ABREAST_OF_PANELS = 4
+"""Panels beside each other, where there are more than so many levels."""
 
 PALEST, DARKEST = 0.45, -0.35
 """Shades of several D1, from the fewest iterations to the most: share of white, or below zero of ink, in the colour."""
@@ -166,9 +166,9 @@ def log_axis(axis: Axis, *, decades: bool = False) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def level_words(level: str) -> str:
-    """'small mismatch' of a level 'small'; benches that are numbered are called as they are: 'bench3'."""
-    return level if level[-1:].isdigit() else f"{level} mismatch"
+def level_words(*levels: str) -> str:
+    """'small, large mismatch' of levels 'small' and 'large'; numbered benches are called as they are: 'bench3'."""
+    return ", ".join(levels) + ("" if levels[-1][-1:].isdigit() else " mismatch")
 
 
 def level_panels(
@@ -180,8 +180,8 @@ def level_panels(
         across: panels of a level.
         width, height: of a panel, with its share of the margins [inch].
     """
-    abreast = len(levels) if len(levels) <= MOST_LEVELS_ABREAST else max(MOST_LEVELS_ABREAST // across, 1)
-    abreast = 1 if across > 1 and len(levels) <= MOST_LEVELS_ABREAST else abreast
+    few = len(levels) <= MOST_ABREAST_OF_PANELS
+    abreast = (len(levels) if across == 1 else 1) if few else max(MOST_ABREAST_OF_PANELS // across, 1)
     lines = -(-len(levels) // abreast)
     size = (1.2 + width * abreast * across, height * lines + 0.7)
     figure, grid = style.new_figure(lines, abreast * across, size=size, squeeze=False, sharey=True)

@@ -137,7 +137,7 @@ def _settings(study: StudyPlan) -> list[str]:
         axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in arm.plan.parameters.axes)
         lines.append(
             f"{arm.label}: {arm.plan.settings.simulations_on(train)} simulations, {arm.repetitions} repetitions, "
-            f"searching {axes}; at {', '.join(map(level_words, arm.levels))}{_AS_IN_THE_PAPER.get(arm.label, '')}."
+            f"searching {axes}; at {level_words(*arm.levels)}{_AS_IN_THE_PAPER.get(arm.label, '')}."
         )
     for each in study.deployments:
         paper = _AS_IN_THE_PAPER.get(each.label, "")

@@ -30,8 +30,7 @@ def plain_words(shown: Sequence[Table]) -> list[str]:
 def _sentence(compared: str, of: str, level: str, receiver: str, difference: Estimate, better: str) -> str:
     first, _, second = compared.partition(" − ")
     into = {ALL: ", over all receivers", "—": ""}.get(receiver, f", into {receiver}")
-    at = f"{'On' if level_words(level) == level else 'At'} {level_words(level)}"
-    where = f"{at}{into}, {of}{' pours' if of[-1:].isdigit() else ''}"
+    where = f"At {level_words(level)}{into}, {of}{' pours' if of[-1:].isdigit() else ''}"
     size = f"{compared}: {difference.text()}, better in {better}"
     if math.isnan(difference.low):
         return f"{where}: there are too few repetitions for an interval ({size})."

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.profile import volume
-from sim_engine.vessel.spec import ProfileShape
+from sim_engine.vessel.spec import NARROWEST, ProfileShape
 
 Floats = NDArray[np.float64]
 
@@ -41,9 +41,6 @@ LEVEL = 0.5
 
 KEPT = 0.9
 """Share of the radii's variance that a vessel's file keeps."""
-
-SMALLEST = 2e-4
-"""Radii are kept above this [m]: a cup has no inside out."""
 
 ITERATIONS = 30
 
@@ -245,7 +242,7 @@ class _Problem:
             pull = slope.T @ residual - precision @ (radii - self.middle)
             step = np.linalg.solve(slope.T @ slope + precision, pull)
             damping = min(1.0, 4.0 * damping)
-            while (found := self._cost(tried := np.maximum(radii + damping * step, SMALLEST), precision)) > cost:
+            while (found := self._cost(tried := np.maximum(radii + damping * step, NARROWEST), precision)) > cost:
                 damping /= 2.0
                 if damping < 1e-4:
                     break
