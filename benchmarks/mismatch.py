@@ -9,8 +9,8 @@ the real ones. A seed has the same world and the same scatter of pours in all ar
 interrupted comparison goes on; `--write` makes none, and puts the rows of FILE into the table of docs/optimiser.md.
 
 Primary questions, written before any of it was run. Seeds below 1000 are for tuning, those from 1000 on for answers:
-1000 to 1019, and 2000 to 2019 for what was changed after the answers of those were known. What is lost is without
-scatter, means over at least 20 seeds with 95 % bootstrap intervals:
+1000 to 1019, and 2000, 3000 and 7000 to 7019 for what was changed after the answers of those before were known (5000 to
+5019 were tuned on, too). What is lost is without scatter, means over at least 20 seeds with 95 % bootstrap intervals:
 
 1. Mean of 15 pours of `adaptive` at no, small, moderate and large mismatch: at most 0.05, 0.08, 0.10, 0.25?
 2. Its pours that lose more than 10 % after the first that lost less than 1 %: at most 0.2 a campaign?
