@@ -78,7 +78,8 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> d
     play(strategy, world.answer)
     best = strategy.best_values
     reported = 1.0 if best is None else valley.true(valley.space.encode(best))
-    return {"arm": arm, "level": level, "seed": seed, "poured": world.poured, "reported": reported}
+    shown = [[*pour.predicted_band, pour.loss] for pour in strategy.result().weighed if pour.predicted_band is not None]
+    return {"arm": arm, "level": level, "seed": seed, "poured": world.poured, "reported": reported, "bands": shown}
 
 
 def receivers(level: str, bench: int, carried: bool, pours: int, simulations: int) -> list[dict[str, float]]:
@@ -134,22 +135,31 @@ def figures(run: dict[str, Any]) -> dict[str, float]:
     }
 
 
+def held(runs: list[dict[str, Any]]) -> str:
+    """Of the pours of runs, how many lie in their bands, the first ones apart; nothing where there are no bands."""
+    first = [run["bands"][0] for run in runs if run.get("bands")]
+    later = [band for run in runs for band in run.get("bands", [])[1:]]
+    inside = [sum(low <= lost <= high for low, high, lost in bands) for bands in (first, later)]
+    return f"{inside[0]} of {len(first)}, then {inside[1]} of {len(later)}" if first else ""
+
+
 def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
     """Markdown: a row for each level and arm with that many seeds; D2 knows no simulator and has one row."""
     lines = [
         "| simulator | | mean of 15 pours | pours above 10 % after the first below 1 % | best of 3 | pours 4 to 15 "
-        "| action in the end |",
-        "|---|---|---|---|---|---|---|",
+        "| action in the end | in their 90 % bands, the first pours and all others |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for level in LEVELS:
         for arm, name in NAMES.items():
-            found = [figures(run) for run in runs if (run["level"], run["arm"]) == (level, arm)]
+            chosen = [run for run in runs if (run["level"], run["arm"]) == (level, arm)]
+            found = [figures(run) for run in chosen]
             if len(found) >= fewest:
                 cells = []
                 for key in ("mean", "bad", "best of 3", "from the fourth", "reported"):
                     mean, low, high = interval([one[key] for one in found])
                     cells.append(f"{mean:.3f} ({low:.3f} … {high:.3f})")
-                lines.append(f"| {'any' if arm == 'D2' else level} | {name} | {' | '.join(cells)} |")
+                lines.append(f"| {'any' if arm == 'D2' else level} | {name} | {' | '.join(cells)} | {held(chosen)} |")
     return "\n".join(lines)
 
 

@@ -28,7 +28,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from statistics import NormalDist, median
+from statistics import median
 from typing import Any
 
 from machine import ROOT, run_self, say
@@ -117,7 +117,7 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
             "at": [round(u, 4) for u in campaign.deployment.actions.encode(pour.action_si)],
             "loss": pour.loss,
             "predicted": pour.predicted,
-            "deviation": math.hypot(pour.predicted_deviation or 0.0, pour.predicted_scatter or 0.0),
+            "band": pour.predicted_band,
         }
         for pour in found.pours
         if pour.status == "weighed" and pour.loss is not None
@@ -159,9 +159,9 @@ def figures(run: dict[str, Any]) -> dict[str, float]:
 
 
 def held(pour: dict[str, Any]) -> bool:
-    """Whether a pour lies in its 90 % band, which ends at nothing lost."""
-    half = NormalDist().inv_cdf(0.95) * pour["deviation"]
-    return bool(max(pour["predicted"] - half, 0.0) <= pour["loss"] <= pour["predicted"] + half)
+    """Whether a pour lies in its 90 % band."""
+    low, high = pour["band"]
+    return bool(low <= pour["loss"] <= high)
 
 
 def table(runs: list[dict[str, Any]]) -> str:
@@ -250,7 +250,10 @@ def main() -> None:
             runs.append(run_self(__file__, f"--one={seed}", "--arms", arm, *places))
             with file.open("a", encoding="utf-8") as kept:
                 kept.write(json.dumps(runs[-1]) + "\n")
-            losses = ", ".join(f"{100 * pour['loss']:.2f} %" for pour in runs[-1]["pours"])
+            losses = ", ".join(
+                f"{100 * pour['loss']:.2f} % ({100 * pour['band'][0]:.1f} … {100 * pour['band'][1]:.1f})"
+                for pour in runs[-1]["pours"]
+            )
             say(f"seed {seed}, {arm}: {losses} ({runs[-1]['cpu_s']:.0f} CPU s, {runs[-1]['simulated']} simulated)")
     for arm in asked.arms:
         chosen = [run for run in runs if run["seed"] in wanted and run["arm"] == arm]

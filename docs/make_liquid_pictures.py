@@ -12,7 +12,6 @@ import numpy as np
 
 from orchestrator.config.load import load_vessel
 from sim_engine.action import DEG, Action
-from sim_engine.hydrostatics import GRAVITY
 from sim_engine.lip import flow_course, weber
 from sim_engine.liquid import Liquid, SimulationParameters
 from sim_engine.liquids import look_up
@@ -50,28 +49,20 @@ def liquids() -> dict[str, Liquid]:
     return found
 
 
-def clinging(liquid: Liquid) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of what the shipped beaker pours that leave below the critical Weber number, by load and velocity.
-
-    Returns:
-        With the film as thick as viscosity makes it where that is thicker, e = (3νq/g)^(1/3) for q = Ue; and as the
-        program tells it, with the film of inertia. We = ρq²/(σe).
-    """
+def clinging(liquid: Liquid) -> np.ndarray:
+    """Shares of what the shipped beaker pours that leave below the critical Weber number, by load and velocity."""
     pourer, receiver = (load_vessel(VESSELS / f"{name}.yaml") for name in ("beaker", "tumbler"))
     built = build_vessel(pourer), build_vessel(receiver)
-    shares = np.empty((2, len(LOADS), len(VELOCITIES)))
+    shares = np.empty((len(LOADS), len(VELOCITIES)))
     for i, load in enumerate(1e-6 * LOADS):
-        scene = Scene("cups", pourer, receiver, liquid.model_copy(update={"mass": load * liquid.density}))
+        loaded = liquid.model_copy(update={"mass": load * liquid.density})
+        scene = Scene("cups", pourer, receiver, loaded)
         for k, velocity in enumerate(VELOCITIES):
             action = Action(velocity * DEG, x_offset=0.085, height=0.115, max_angle=110 * DEG, hold_time=2.0)
-            course = flow_course(plan_motion(scene, action, *built), load, *built)
+            course = flow_course(plan_motion(scene, action, *built), loaded, *built)
             assert course is not None
-            told = weber(liquid, course.velocity, course.film)
-            flow = course.velocity * course.film
-            viscous = np.cbrt(3.0 * liquid.kinematic_viscosity * flow / GRAVITY)
-            thinned = told * np.minimum(course.film / viscous, 1.0)
-            shares[:, i, k] = [course.share(we < DRIBBLING_WEBER) for we in (thinned, told)]
-    return shares[0], shares[1]
+            shares[i, k] = course.share(weber(liquid, course.velocity, course.film) < DRIBBLING_WEBER)
+    return shares
 
 
 def draw_clinging() -> None:
@@ -81,13 +72,10 @@ def draw_clinging() -> None:
     rows = liquids()
     figure, axes = plt.subplots(1, len(rows), figsize=(10.0, 3.9), sharex=True, sharey=True, layout="constrained")
     for panel, (title, liquid) in zip(axes, rows.items(), strict=True):
-        share, told = clinging(liquid)
+        share = clinging(liquid)
         levels = np.linspace(0.0, 100.0, 11)
         filled = panel.contourf(VELOCITIES, LOADS, 100.0 * share, levels=levels, cmap="YlOrBr")
         panel.contour(VELOCITIES, LOADS, 100.0 * share, levels=[5.0], colors="black", linewidths=1.4)
-        panel.contour(
-            VELOCITIES, LOADS, 100.0 * told, levels=[5.0], colors="black", linewidths=1.0, linestyles="dashed"
-        )
         panel.set_xscale("log")
         panel.set_xticks([2, 5, 10, 20, 50, 100], labels=["2", "5", "10", "20", "50", "100"])
         panel.minorticks_off()

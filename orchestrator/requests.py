@@ -19,11 +19,14 @@ class Prediction:
         mean: expected loss.
         deviation: standard deviation of that expectation: how well it is known.
         scatter: standard deviation of a single pour around it (in simulation: of a single seed); None if unknown.
+        band: the shortest interval that a single pour lies in with a probability of `sim_engine.bands.LEVEL`; None if
+            unknown.
     """
 
     mean: float
     deviation: float
     scatter: float | None = None
+    band: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

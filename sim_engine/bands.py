@@ -84,6 +84,19 @@ def resolution_shift(particles: int) -> float:
     return float(RESOLUTION * (RESOLUTION_AT / particles) ** (1.0 / 3.0))
 
 
+def lacking_shift(particles: int, discrepancy: float | None) -> float:
+    """Standard deviation of the shift by which a pour is off its simulations.
+
+    By the number of particles, or by what calibration left over where that is more: it was found with coarse particles,
+    too, and holds their error.
+
+    Args:
+        particles: of a simulation.
+        discrepancy: see `left_over`; None where nothing was calibrated.
+    """
+    return max(resolution_shift(particles), discrepancy or 0.0)
+
+
 def shift_of(spillage: float, particles: int) -> float:
     """z of a simulated spillage. None or all of the particles spilled stands for half a particle less than one.
 
@@ -130,9 +143,7 @@ def band(spillages: Sequence[float], particles: int, discrepancy: float | None =
     places = [shift_of(r, particles) for r in spillages]
     mean = math.fsum(places) / count
     spread = math.fsum((z - mean) ** 2 for z in places) / (count - 1) if count > 1 else 0.0
-    coarse = resolution_shift(particles)
-    # What calibration left over was found with coarse particles, too, and holds their error: the larger of both counts.
-    lacking = max(coarse, discrepancy or 0.0)
+    coarse, lacking = resolution_shift(particles), lacking_shift(particles, discrepancy)
     # The mixture of the simulations has a variance of s² (n − 1) / n; a further one differs from their mean by
     # s² (n + 1) / n.
     width = math.sqrt(lacking**2 + 2.0 * spread / count)

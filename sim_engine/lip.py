@@ -4,9 +4,13 @@ From the tilting-cup equation (`sim_engine.hydrostatics`), ρ, σ and μ of the 
 
 * **at the lip**: a film of thickness e and mean velocity U that leaves over the wetted width b of the opening,
   Q = U e b. U = ∫√(2g·depth) dA / A over the wetted area A of the opening; the discharge coefficient is taken as the
-  jet's contraction, e = C_d A / b. Re = ρUe/μ, We = ρU²e/σ, Bo = ρge²/σ = (e / capillary length)².
+  jet's contraction, e = C_d A / b. That is what inertia makes of Q. Viscosity makes of it a film e = (3νQ/gb)^(1/3)
+  that runs down a vertical wall at U = Q/(b e), and a thicker one on any lesser slope: where that is thicker than what
+  inertia makes, it counts. Re = ρUe/μ, We = ρU²e/σ, Bo = ρge²/σ = (e / capillary length)².
 * **in the falling stream**, where it passes the level of the receiver's rim: v² = U² + 2g·(fall), a round stream of
   diameter D = √(4Q/πv). Re = ρvD/μ, We = ρv²D/σ, Bo = ρgD²/σ.
+
+Source of the viscous film: Nusselt, Z. VDI 60 (1916): u = ge²/3ν in the mean.
 
 Limitations: the liquid's surface is level, so that in fast pours the film is thinner and faster than told. The opening
 is a circle; spouts concentrate the flow.
@@ -149,12 +153,12 @@ class FlowCourse:
         )
 
 
-def flow_course(motion: Motion, volume: float, pourer: Vessel, receiver: Vessel) -> FlowCourse | None:
+def flow_course(motion: Motion, liquid: Liquid, pourer: Vessel, receiver: Vessel) -> FlowCourse | None:
     """Film and stream over a pour.
 
     Args:
         motion: of the pourer.
-        volume: that the pourer holds at first [m³].
+        liquid: that the pourer holds at first.
         pourer, receiver: vessels.
 
     Returns:
@@ -164,7 +168,7 @@ def flow_course(motion: Motion, volume: float, pourer: Vessel, receiver: Vessel)
         ValueError: the pourer can't hold the volume.
     """
     times = np.linspace(0.0, motion.duration, max(2, math.ceil(motion.duration / 0.01)))
-    flow = lip_flow(pourer, volume, times, motion.tilt(times))
+    flow = lip_flow(pourer, liquid.volume, times, motion.tilt(times))
     left = flow.outflow * np.diff(flow.times, append=flow.times[-1])
     leaving = left > 0.0
     if not leaving.any():
@@ -172,12 +176,16 @@ def flow_course(motion: Motion, volume: float, pourer: Vessel, receiver: Vessel)
     lip, fall = (along[leaving] for along in _lip(motion, flow, pourer, receiver))
     outflow = flow.outflow[leaving]
     opening = _wetted(pourer.opening_radius, flow.heads[leaving], flow.tilts[leaving])
-    velocity = opening.ideal_flow / opening.area
+    flux = outflow / opening.width
+    by_inertia = flux * opening.area / opening.ideal_flow
+    by_viscosity = np.cbrt(3.0 * liquid.kinematic_viscosity * flux / GRAVITY)
+    film = np.maximum(by_inertia, by_viscosity)
+    velocity = flux / film
     falling = np.sqrt(velocity**2 + 2.0 * GRAVITY * fall)
     return FlowCourse(
         volume=left[leaving],
         velocity=velocity,
-        film=outflow / (velocity * opening.width),
+        film=film,
         stream_velocity=falling,
         diameter=np.sqrt(4.0 * outflow / (math.pi * falling)),
         covered=opening.covered,

@@ -118,7 +118,7 @@ def regimes(
     """
     motion = plan_motion(scene, action, pourer, receiver) if motion is None else motion
     liquid = scene.liquid
-    course = flow_course(motion, liquid.volume, pourer, receiver)
+    course = flow_course(motion, liquid, pourer, receiver)
     if course is None:
         return Regimes(0.0)
     found = [

@@ -148,6 +148,8 @@ def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     assert kept.read_text() == made
     written = page.read_text()
     assert f"| small | D3, `adaptive` | {np.mean(run['poured']):.3f} (" in written
+    inside = [low <= lost <= high for low, high, lost in run["bands"]]
+    assert f"| {int(inside[0])} of 1, then {sum(inside[1:])} of 2 |" in written
     assert "old" not in written
     assert "| large | D3, `adaptive` | kept |" in written
     assert written.startswith("before")

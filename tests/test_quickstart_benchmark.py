@@ -25,7 +25,7 @@ def quickstart(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def run_of(*losses: float, recommended: int, ended: str | None = None) -> dict[str, Any]:
-    pours = [{"at": [i, i], "loss": loss, "predicted": 0.02, "deviation": 0.01} for i, loss in enumerate(losses)]
+    pours = [{"at": [i, i], "loss": loss, "predicted": 0.02, "band": [0.005, 0.03]} for i, loss in enumerate(losses)]
     return {"seed": 7, "pours": pours, "recommended": [recommended, recommended], "ended": ended}
 
 
@@ -61,3 +61,5 @@ def test_the_table_says_what_was_asked(quickstart: ModuleType) -> None:
     assert "| 7 | 3.0, 2.0, 2.0 % | 3 | none |  | 2.0 % | 2.0 % | all pours made |" in text
     assert "no pour above 10 % after the first below 1 % in 2 of them; 2.5 pours in the median" in text
     assert "below 1 % in 1 of them, in the median at pour 2" in text
+    assert "5 of 5 pours (100 %) lie in their 90 % bands" in text
+    assert "3 of 4 pours (75 %)" in quickstart.summary([run_of(0.02, 0.04, 0.03, 0.005, recommended=0)])

@@ -14,7 +14,7 @@ ANSWER_DEADLINE = 30.0
 
 
 class DeviceBalance:
-    """`actors.balance.protocol.Balance` over a `Device` that holds a `BalanceDriver`.
+    """A balance with a tray: a `BalanceDriver` behind a `Device`, awaited.
 
     Args:
         device: of the driver.
@@ -32,21 +32,25 @@ class DeviceBalance:
         return ANSWER_DEADLINE + max(self._longest_call, passing)
 
     async def tare(self) -> None:
-        """See `Balance.tare`."""
+        """See `BalanceDriver.tare`."""
         await self.device.call("tare", deadline=self._deadline(PATIENCE))
 
     async def weigh(self) -> Weight:
-        """See `Balance.weigh`."""
+        """See `BalanceDriver.weigh`."""
         weight: Weight = await self.device.call("weigh", deadline=self._deadline(PATIENCE))
         return weight
 
     async def read(self) -> Weight:
-        """See `Balance.read`."""
+        """See `BalanceDriver.read`."""
         weight: Weight = await self.device.call("read", deadline=ANSWER_DEADLINE, urgent=True)
         return weight
 
     async def stream(self, interval: float = 0.1) -> AsyncIterator[Weight]:
-        """See `Balance.stream`."""
+        """What the display shows, again and again.
+
+        Args:
+            interval: wall time between two readings [s].
+        """
         while True:
             yield await self.read()
             await asyncio.sleep(interval)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -47,20 +46,24 @@ class BalanceDriver(Protocol):
         ...
 
     def tare(self) -> None:
-        """See `Balance.tare`."""
+        """Wait until the balance is at rest and count what is on it as zero.
+
+        Raises:
+            LaboratoryError: not at rest in time, or lost.
+        """
         ...
 
     def weigh(self) -> Weight:
-        """See `Balance.weigh`. After a lost connection it refuses until `keep_reference` or another tare.
+        """Wait for a stable weight. After a lost connection it refuses until `keep_reference` or another tare.
 
         Raises:
             ReferenceLostError: the balance may have been off since the last tare, and begun at a new zero.
-            LaboratoryError: see `Balance.weigh`; the text is for the person beside it.
+            LaboratoryError: no stable weight in time, or lost; the text is for the person beside it.
         """
         ...
 
     def read(self) -> Weight:
-        """See `Balance.read`; never fails, and doesn't wait for a call that is under way."""
+        """What the display shows now, stable or not; never fails, and doesn't wait for a call that is under way."""
         ...
 
     def keep_reference(self) -> None:
@@ -77,36 +80,4 @@ class BalanceDriver(Protocol):
 
     def close(self) -> None:
         """Let go of it; never fails, and may be called again."""
-        ...
-
-
-class Balance(Protocol):
-    """A laboratory balance with a tray."""
-
-    async def tare(self) -> None:
-        """Wait until the balance is at rest and count what is on it as zero.
-
-        Raises:
-            LaboratoryError: not at rest in time, or lost.
-        """
-        ...
-
-    async def weigh(self) -> Weight:
-        """Wait for a stable weight.
-
-        Raises:
-            LaboratoryError: no stable weight in time, or lost.
-        """
-        ...
-
-    async def read(self) -> Weight:
-        """What the display shows now, stable or not; answered at once."""
-        ...
-
-    def stream(self, interval: float = 0.1) -> AsyncIterator[Weight]:
-        """What the display shows, again and again.
-
-        Args:
-            interval: wall time between two readings [s].
-        """
         ...

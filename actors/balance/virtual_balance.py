@@ -119,18 +119,18 @@ class VirtualBalance:
         """Its connection can't be lost."""
 
     def tare(self) -> None:
-        """See `Balance.tare`."""
+        """See `BalanceDriver.tare`."""
         mass = self._stable()
         with self._lock:
             self._tare += mass
 
     def weigh(self) -> Weight:
-        """See `Balance.weigh`."""
+        """See `BalanceDriver.weigh`."""
         mass = self._stable()
         return Weight(mass, True, self._time, step=self._settings.resolution)
 
     def read(self) -> Weight:
-        """See `Balance.read`. Draws its noise from a stream of its own, so that watching changes no measurement."""
+        """See `BalanceDriver.read`. Its noise is a stream of its own, so that watching changes no measurement."""
         with self._lock:
             lag = abs(self._load_at(self._time) - self._shown)
             return Weight(self._reading(self._display_rng), lag <= self._tolerance, self._time)

@@ -16,7 +16,7 @@ from orchestrator.campaign import run_campaign
 from orchestrator.daemon.feed import Feed
 from orchestrator.daemon.packing import CAMPAIGN, load_confined
 from orchestrator.daemon.people import Asking, RemoteOperator, RunQuestions
-from orchestrator.daemon.settings import DESK, Rig, Settings
+from orchestrator.daemon.settings import Rig, Settings
 from orchestrator.daemon.store import Item, Store
 from orchestrator.daemon.watching import Watching
 from orchestrator.events import CampaignStateChanged, Watcher
@@ -252,8 +252,3 @@ class Running:
     def pouring(self) -> bool:
         """Whether a pour of it is under way."""
         return self.watching is not None and self.watching.checkpoint != ""
-
-    @property
-    def pours_nothing(self) -> bool:
-        """Whether it is at the desk."""
-        return self._rig.name == DESK

@@ -36,8 +36,15 @@ class LossUnit:
         return f"{number} {self.unit}"
 
     def prediction(self, predicted: Prediction) -> str:
-        """'1.2 ± 0.9 %, a pour ± 0.5 %': how well the mean is known, and how much a single pour differs from it."""
-        return self.text(predicted.mean, predicted.deviation) + self.scatter(predicted.scatter)
+        """'1.2 ± 0.9 %, a pour ± 0.5 %': how well the mean is known, and how much a single pour differs from it.
+
+        Where its band is known: '1.2 ± 0.9 %, a pour: 0.0 … 3.1 %'.
+        """
+        expected = self.text(predicted.mean, predicted.deviation)
+        if predicted.band is None:
+            return expected + self.scatter(predicted.scatter)
+        low, high = (f"{self.factor * end:.{self.decimals}f}" for end in predicted.band)
+        return f"{expected}, a pour: {low} … {high} {self.unit}"
 
     def scatter(self, deviation: float | None) -> str:
         """The end of a prediction: ', a pour ± 0.5 %'; empty if nobody knows."""

@@ -1,6 +1,7 @@
 """Taichi's start and end, and the arrays of one process. The only place that calls `ti.init`."""
 
 import contextlib
+import functools
 import io
 import os
 from collections.abc import Sequence
@@ -278,17 +279,23 @@ class _Pool(Generic[T]):
         return np.ascontiguousarray(np.concatenate(self._parts))
 
 
-def _without_places() -> None:
-    """Keep Taichi from drawing the line and carets of an error message for each of the thousands of nodes of a kernel.
+def _look_up_quickly() -> None:
+    """Keep Taichi from what takes most of the time in which even known kernels are looked up in the cache.
 
-    Nobody reads them while kernels compile, and they are half of the time that even known kernels take to be looked up
-    in the cache. `DECANT_KERNEL_PLACES=1` leaves them in, for who changes a kernel.
+    It draws the line and carets of an error message for each of the thousands of nodes of a kernel, which nobody reads
+    while kernels compile. `DECANT_KERNEL_PLACES=1` leaves them in, for who changes a kernel. And it looks for the
+    source of a function anew wherever one is called.
     """
+    from taichi.lang import kernel_impl
     from taichi.lang.ast import ast_transformer_utils
 
     context = getattr(ast_transformer_utils, "ASTTransformerContext", None)
     if context is not None and hasattr(context, "get_pos_info") and not os.environ.get("DECANT_KERNEL_PLACES"):
         context.get_pos_info = _no_place
+    for name in ("getsourcefile", "getsourcelines"):
+        search = getattr(kernel_impl, name, None)
+        if search is not None and not hasattr(search, "cache_info"):
+            setattr(kernel_impl, name, functools.cache(search))
 
 
 def _no_place(context: object, node: object) -> str:
@@ -302,7 +309,7 @@ def start(backend: str) -> None:
         BackendError: this machine has no such backend.
     """
     require_backend(backend)
-    _without_places()
+    _look_up_quickly()
     # Taichi says on which architecture it starts, on stdout, which is for results alone.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(

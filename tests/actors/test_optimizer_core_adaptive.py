@@ -11,6 +11,7 @@ from actors.optimizer.core.mismatch import Displacement, Limit, Mismatch, Play
 from actors.optimizer.core.models import fit
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.optimizer.core.propose import propose
+from actors.optimizer.core.shortest import shortest_bands
 from orchestrator.codec import canonical, from_json, to_json
 from sim_engine.space import Axis, Space
 
@@ -85,6 +86,15 @@ def test_ignorance_grows_by_pours_that_no_displacement_explains_and_shrinks_by_t
     assert wrong.ignorance > 0.9
 
 
+def test_after_a_pour_that_lost_all_in_place_of_little_the_next_goes_where_the_simulator_sees_most_lost():
+    question = asked(lambda x: 1.0 - 0.8 * cup(x), [], acquisition="least_loss", count=1)
+    first = propose(question).points[0]
+    assert cup(first)[0] > 0.9
+    second = propose(replace(question, data=data_of([first], cup(first)), mismatch=Mismatch(PLAY, left=9)))
+    assert cup(second.points[0])[0] < 0.1
+    assert second.mismatch.ignorance > 0.5
+
+
 @pytest.mark.parametrize(("simulated_width", "factor"), [(1.4, 1.1), (0.7, 0.95)])
 def test_pours_tell_that_the_valley_is_narrower_or_wider_than_simulated(simulated_width, factor):
     def widened(points):
@@ -122,6 +132,25 @@ def test_a_pour_that_is_not_to_look_ahead_goes_where_least_is_lost():
     everywhere = tuple((x, y) for x in np.linspace(0, 1, 21) for y in np.linspace(0, 1, 21))
     grid = replace(question, count=0, predict_at=everywhere)
     assert here.means[0] < min(propose(grid).predictions) + 0.001
+
+
+@pytest.mark.parametrize("middle", [0.004, 0.4, 0.99])
+def test_a_band_is_the_shortest_interval_that_holds_nine_pours_in_ten(middle):
+    weights, means, deviations = np.array([0.7, 0.3]), np.array([[middle], [middle]]), np.array([[0.01], [0.06]])
+    rng = np.random.default_rng(0)
+    chosen = (rng.random(100_000) < 0.3).astype(int)
+    drawn = np.clip(middle + deviations[chosen, 0] * rng.standard_normal(100_000), 0.0, 1.0)
+    low, high = shortest_bands(weights, means, deviations, 0.9)[0]
+    assert np.mean((drawn >= low) & (drawn <= high)) == pytest.approx(0.9, abs=0.01)
+    equal = np.quantile(drawn, [0.05, 0.95])
+    assert high - low < (0.85 if middle != 0.4 else 1.005) * (equal[1] - equal[0])
+
+
+def test_most_pours_lie_in_the_bands_that_come_with_them():
+    answer = propose(asked(displaced, POURED, acquisition="least_loss", count=1))
+    low, high = answer.bands[0]
+    assert 0.0 <= low <= cup(answer.points[0])[0] <= high
+    assert high < answer.means[0] + 2.0 * float(np.hypot(answer.deviations, answer.noises)[0])
 
 
 def test_with_something_good_in_hand_no_unknown_corner_is_tried():

@@ -218,6 +218,7 @@ def test_the_line_of_a_pour_says_both() -> None:
     predicted = Prediction(0.008, 0.009, 0.005)
     assert loss_unit(Loss()).prediction(predicted) == "0.80 ± 0.90 %, a pour ± 0.50 %"
     assert loss_unit(Loss()).prediction(replace(predicted, scatter=None)) == "0.80 ± 0.90 %"
+    assert loss_unit(Loss()).prediction(replace(predicted, band=(0.0, 0.021))) == "0.80 ± 0.90 %, a pour: 0.00 … 2.10 %"
     plan = watched.campaign()
     tally = Tally(plan)
     for event in watched.events(plan):

@@ -44,10 +44,10 @@ def planned(scene: Scene = SCENE, action: Action = STANDARD, spacing: float = FI
     return regimes(scene, action, build_vessel(scene.pourer), build_vessel(scene.receiver), spacing=spacing)
 
 
-def of_liquid(**changes: float) -> Regimes:
-    """The standard pour of 200 mL of another liquid."""
+def of_liquid(action: Action = STANDARD, **changes: float) -> Regimes:
+    """The standard pour, or another one, of 200 mL of another liquid."""
     liquid = WATER.model_copy(update=changes)
-    return planned(replace(SCENE, liquid=liquid.model_copy(update={"mass": WATER.volume * liquid.density})))
+    return planned(replace(SCENE, liquid=liquid.model_copy(update={"mass": WATER.volume * liquid.density})), action)
 
 
 def kinds(found: Regimes) -> set[str]:
@@ -137,7 +137,7 @@ def test_a_longer_fall_makes_the_stream_faster_and_thinner_and_changes_nothing_a
 
 def test_film_and_stream_carry_what_leaves() -> None:
     cup, glass = build_vessel(CUP), build_vessel(GLASS)
-    course = lip.flow_course(plan_motion(SCENE, STANDARD, cup, glass), WATER.volume, cup, glass)
+    course = lip.flow_course(plan_motion(SCENE, STANDARD, cup, glass), WATER, cup, glass)
     assert course is not None
     flow = course.stream_velocity * math.pi * course.diameter**2 / 4.0
     assert course.volume[:-1] == pytest.approx(0.01 * flow[:-1], rel=0.02)
@@ -189,14 +189,28 @@ def test_a_trickle_from_a_cup_that_is_hardly_tilted_dribbles_and_a_quick_pour_do
     assert kinds(planned(action=STANDARD.with_values(angular_velocity=90 * DEG))) == set()
 
 
+def test_a_thick_liquid_dribbles_by_the_film_that_viscosity_leaves_it() -> None:
+    """Of a flow q a width of the lip a vertical film is (3νq/g)^(1/3) thick, which slows glycerol down at the lip."""
+    slow = STANDARD.with_values(angular_velocity=15 * DEG)
+    glycerol = {"density": 1260.0, "surface_tension": 0.063}
+    thick, thin = (of_liquid(slow, **glycerol, dynamic_viscosity=mu) for mu in (1.41, 1e-3))
+    assert "dribbling" in kinds(thick)
+    assert "dribbling" not in kinds(thin)
+    assert thick.lip is not None
+    assert thin.lip is not None
+    flux = thick.lip.velocity.largest * thick.lip.thickness.largest
+    assert flux == pytest.approx(thin.lip.velocity.largest * thin.lip.thickness.largest, rel=0.01)
+    assert thick.lip.thickness.largest == pytest.approx((3 * 1.41 / 1260 * flux / GRAVITY) ** (1 / 3), rel=1e-6)
+
+
 def test_thick_liquids_are_simulated_and_told_only_beyond_what_was_checked() -> None:
     assert kinds(of_liquid(density=1260.0, dynamic_viscosity=1.41, surface_tension=0.063)) == set()
     (oil,) = of_liquid(density=915.0, dynamic_viscosity=0.0788, surface_tension=0.0335).not_covered
     assert oil.kind == "viscous"
     assert oil.share == 1.0
     assert "(86.1 mm^2/s); the simulator adds up to 300 mm^2/s of its own" in oil.text
-    (told,) = of_liquid(density=1400.0, dynamic_viscosity=9.0, surface_tension=0.08).not_covered
-    assert told.kind == "viscous"
+    honey = of_liquid(density=1400.0, dynamic_viscosity=9.0, surface_tension=0.08)
+    (told,) = (one for one in honey.not_covered if one.kind == "viscous")
     assert told.share == 1.0
     assert "9 Pa*s" in told.text
 

@@ -9,10 +9,11 @@ its best action x̂, more or less of it, and something more that nobody simulate
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. h makes the
 valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. n, by which pours of
-one action differ, belongs to the hypothesis, too: a few pours nearby tell it. The last hypothesis is ignorance: the
-simulator says nothing of this bench, and f is a GP around 0.6, more towards corners. The posterior weights are prior
-times marginal likelihood of the observations. So nothing is forgotten: a hypothesis that fails fades, and the weight of
-ignorance says how far the simulator is to be trusted.
+one action differ, belongs to the hypothesis, too: a few pours nearby tell it. Two last ones, of equal prior weight, do
+not trust the simulator: it says the contrary, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1); or it says nothing of this
+bench, and f is a GP around 0.6, more towards corners. The posterior weights are prior times marginal likelihood of the
+observations. So nothing is forgotten: a hypothesis that fails fades, and the weight of these two, ignorance, says how
+far the simulator is to be trusted.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
 Limitations: the hypotheses are a fixed set; predictions come from at most 32 draws of them, and ignorance.
@@ -30,6 +31,7 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
 from actors.optimizer.core.mismatch import Mismatch
+from actors.optimizer.core.shortest import shortest_bands
 from actors.optimizer.core.surrogate import GaussianProcess
 
 Array = NDArray[np.float64]
@@ -55,6 +57,10 @@ IGNORANT_EDGE = 0.3
 IGNORANT_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
 IGNORANT_NOISES = np.tile((0.003, 0.01, 0.03), 3)
 """ℓ and n of what ignorance consists of: were its scatter fixed, pours that hardly scatter would speak against it."""
+CONTRARY, CONTRARY_REST = 128, 0.15
+"""How many hypotheses take the simulator for the wrong way round, half of the ignorance beforehand being theirs; and
+their smallest σ: were they sure that all is lost where nothing was simulated to be, any pour that went wrong would
+speak for them."""
 KNOWN_SHARE = 0.75
 """Share of the hypotheses around displacements that were found before, where some were."""
 KNOWN_SPREAD = 0.25
@@ -72,6 +78,7 @@ class Hypotheses:
         rests: (J,), σ.
         lengths: (J,), ℓ.
         noises: (J,), n.
+        contrary: (J,), whether it takes the simulator for the wrong way round.
         centre: (dimension,), the simulated best.
     """
 
@@ -82,6 +89,7 @@ class Hypotheses:
     rests: Array
     lengths: Array
     noises: Array
+    contrary: NDArray[np.bool_]
     centre: Array
 
     @classmethod
@@ -89,11 +97,11 @@ class Hypotheses:
         """Draw, the same for the same question: quasi-random, so that few cover much."""
         dimension = len(mismatch.play)
         rows = qmc.Sobol(2 * dimension + 7, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
-        rows = np.clip(rows, 1e-6, 1.0 - 1e-6)
+        rows = np.clip(np.concatenate([rows, rows[:CONTRARY]]), 1e-6, 1.0 - 1e-6)
         z = ndtri(rows[:, : 2 * dimension])
         width, gain, rest, length, far, known, noise = rows[:, 2 * dimension :].T
-        spread = _evenly(FARTHER, far)
-        scales, shifts = np.ones((HYPOTHESES, dimension)), np.zeros((HYPOTHESES, dimension))
+        spread, contrary = _evenly(FARTHER, far), np.arange(len(rows)) >= HYPOTHESES
+        scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
         if mismatch.drawn:
             index = np.minimum((known / KNOWN_SHARE * len(mismatch.drawn)).astype(int), len(mismatch.drawn) - 1)
             around = known < KNOWN_SHARE
@@ -110,15 +118,16 @@ class Hypotheses:
             factors * shifts + moved,
             WIDTH * ndtri(width),
             GAIN * ndtri(gain),
-            _evenly(RESTS, rest),
+            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), rest), _evenly(RESTS, rest)),
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
+            contrary,
             centre,
         )
 
     def only(self, kept: NDArray[np.int_]) -> Hypotheses:
         """Some of them."""
-        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises"
+        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "contrary"
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def moved(self, points: Array) -> Array:
@@ -141,8 +150,8 @@ class AveragedProcess:
 
     Attributes:
         simulated: surrogate of the simulations.
-        weights: posterior weights (J + ignorant ones,); the last `len(IGNORANT_LENGTHS)` are ignorance.
-        ignorance: their sum.
+        weights: posterior weights (J + ignorant ones,); of the last `len(IGNORANT_LENGTHS)` the simulator says nothing.
+        ignorance: their sum and that of the contrary ones.
     """
 
     def __init__(self, simulated: GaussianProcess, points: Array, costs: Array, mismatch: Mismatch) -> None:
@@ -159,18 +168,17 @@ class AveragedProcess:
         self._all = Hypotheses.of(mismatch, _least(simulated))
         informed = self._evidences(self._informed(self._all, points), self._all.lengths)
         ignorant = self._evidences(self._ignorant(points, self._costs), IGNORANT_LENGTHS)
-        logs = np.concatenate(
-            [
-                informed + np.log((1.0 - mismatch.ignorance) / len(informed)),
-                ignorant + np.log(mismatch.ignorance / len(ignorant)),
-            ]
-        )
+        half = 0.5 * mismatch.ignorance
+        prior = np.where(self._all.contrary, half / CONTRARY, (1.0 - mismatch.ignorance) / HYPOTHESES)
+        logs = np.concatenate([informed + np.log(prior), ignorant + np.log(half / len(ignorant))])
         weights = np.exp(logs - logs.max())
         self.weights = weights / weights.sum()
-        self.ignorance = float(self.weights[len(informed) :].sum())
-        kept, times = np.unique(self._evenly_drawn(KEPT), return_counts=True)
+        told, alone = self.weights[: len(informed)], self.weights[len(informed) :]
+        self._trusting = np.where(self._all.contrary, 0.0, told)
+        self.ignorance = float(told[self._all.contrary].sum() + alone.sum())
+        kept, times = np.unique(_evenly_drawn(told, KEPT), return_counts=True)
         self._kept = self._all.only(kept)
-        self.mixture = np.concatenate([times / KEPT * (1.0 - self.ignorance), self.weights[len(informed) :]])
+        self.mixture = np.concatenate([times / KEPT * told.sum(), alone])
         self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
         self._least_noises = np.concatenate([self._kept.noises, IGNORANT_NOISES])
         self._at_data = self._prior(points, self._costs)
@@ -182,10 +190,12 @@ class AveragedProcess:
         J, m = len(hypotheses.gains), len(points)
         if m == 0:
             return _Prior(*(np.empty((J, 0)) for _ in range(3)))
-        mean, deviation = self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
+        mean, deviation = (
+            part.reshape(J, m) for part in self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
+        )
         gain = np.exp(hypotheses.gains)[:, None] / self.worst
-        means = np.clip(gain * mean.reshape(J, m), 0.0, 1.0)
-        spreads = np.hypot(hypotheses.rests[:, None], gain * deviation.reshape(J, m))
+        means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
+        spreads = np.hypot(hypotheses.rests[:, None], gain * deviation)
         return _Prior(means, spreads, hypotheses.noises[:, None] + NOISE_GROWTH * means)
 
     def _ignorant(self, points: Array, seen: Array | float) -> _Prior:
@@ -278,6 +288,11 @@ class AveragedProcess:
         means, deviations, noises = self.components(points)
         return np.asarray(self.mixture @ ndtr((means - loss / self.worst) / np.hypot(deviations, noises)))
 
+    def bands(self, points: Array, level: float) -> Array:
+        """Shortest intervals (m, 2), in the cost's unit, that hold single observations at points (m, dimension)."""
+        means, deviations, noises = self.components(points)
+        return self.worst * shortest_bands(self.mixture, means, np.hypot(deviations, noises), level)
+
     # -- for people and pictures -----------------------------------------------------------------------------------
 
     @property
@@ -288,8 +303,7 @@ class AveragedProcess:
 
     def displaced(self) -> tuple[Array, Array, float]:
         """Shift of the cube's centre (dimension,), its deviation, and the median factor on the cost."""
-        weights = self.weights[: len(self._all.gains)]
-        weights = weights / max(weights.sum(), 1e-300)
+        weights = self._trusting / max(self._trusting.sum(), 1e-300)
         shifts = 0.5 * (self._all.scales - 1.0) + self._all.shifts
         mean = weights @ shifts
         deviation = np.sqrt(np.maximum(weights @ (shifts - mean) ** 2, 0.0))
@@ -299,15 +313,8 @@ class AveragedProcess:
 
     def drawn(self, count: int) -> tuple[Array, Array]:
         """Scales and shifts (count, dimension) of displacements drawn from the posterior, evenly by their weight."""
-        chosen = self._evenly_drawn(count)
+        chosen = _evenly_drawn(self._trusting, count)
         return self._all.scales[chosen], self._all.shifts[chosen]
-
-    def _evenly_drawn(self, count: int) -> NDArray[np.int_]:
-        """Hypotheses (count,), drawn from the posterior at even steps of the weight, heaviest first."""
-        weights = self.weights[: len(self._all.gains)]
-        order = np.argsort(-weights, kind="stable")
-        levels = (np.arange(count) + 0.5) / count * weights.sum()
-        return np.asarray(order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)])
 
     @property
     def heaviest(self) -> tuple[Hypotheses, Array]:
@@ -339,6 +346,13 @@ def shortfall(level: Array | float, means: Array, deviations: Array) -> Array:
 
 def _density(u: Array) -> Array:
     return np.asarray(np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi))
+
+
+def _evenly_drawn(weights: Array, count: int) -> NDArray[np.int_]:
+    """Hypotheses (count,), drawn at even steps of their weights (J,), heaviest first."""
+    order = np.argsort(-weights, kind="stable")
+    levels = (np.arange(count) + 0.5) / count * weights.sum()
+    return np.asarray(order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)])
 
 
 def _evenly(bounds: tuple[float, float], u: Array) -> Array:

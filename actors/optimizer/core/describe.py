@@ -19,6 +19,7 @@ from actors.optimizer.core.problem import (
 )
 from actors.optimizer.core.region import Feasibility, Region
 from actors.optimizer.core.risk import RiskProcess
+from sim_engine.bands import LEVEL
 
 Array = NDArray[np.float64]
 
@@ -61,6 +62,8 @@ def describe(
             **dict(zip((f"length.{name}" for name in _axis_names(problem)), map(float, process.lengths), strict=True)),
         },
     }
+    if model.averaged is not None and len(points):
+        description["bands"] = tuples(model.averaged.bands(points, LEVEL))
     if problem.predict_at:
         predictions, spreads = model.surrogate.predict(
             asked.region.snap(array(problem.predict_at, problem.space.dimension))

@@ -291,6 +291,8 @@ class Suggestion:
         prediction_deviations: their standard deviations.
         seconds: CPU seconds it took.
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
+        bands: 'adaptive': shortest intervals that hold single real observations at the proposals with a probability of
+            `sim_engine.bands.LEVEL`.
         feasibilities: probabilities that the proposals are not refused and don't fail; empty while nothing was or did.
         posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
@@ -316,6 +318,7 @@ class Suggestion:
     predictions: tuple[float, ...] = ()
     prediction_deviations: tuple[float, ...] = ()
     noises: tuple[float, ...] = ()
+    bands: tuple[tuple[float, float], ...] = ()
     feasibilities: tuple[float, ...] = ()
     posterior: Posterior | None = None
     best_noise: float | None = None

@@ -121,7 +121,7 @@ def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> 
     Not a number if most of it leaves below the receiver's rim.
     """
     try:
-        course = flow_course(plan_motion(scene, action, pourer, receiver), scene.liquid.volume, pourer, receiver)
+        course = flow_course(plan_motion(scene, action, pourer, receiver), scene.liquid, pourer, receiver)
     except ValueError:
         return None  # a motion that can't be made, which is reported elsewhere
     if course is None:

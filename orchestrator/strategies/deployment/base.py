@@ -169,7 +169,12 @@ class Deployment(ABC, Generic[S]):
         known = None
         if suggestion.means and not self._compromise.exploring:
             noise = suggestion.noises[0] if suggestion.noises else None
-            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise))
+            known = Prediction(
+                suggestion.means[0],
+                suggestion.deviations[0],
+                self._scatter(suggestion, noise),
+                suggestion.bands[0] if suggestion.bands else None,
+            )
         self._pour(suggestion.points[0], known)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:

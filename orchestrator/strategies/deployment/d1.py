@@ -22,7 +22,7 @@ from orchestrator.strategies.settings import Complaints, Premises
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial
 from sim_engine.action import Action, described
-from sim_engine.bands import resolution_shift, shift_of
+from sim_engine.bands import lacking_shift, shift_of
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import Fractions
@@ -258,13 +258,12 @@ class OneShotPlanning(Deployment[D1Settings]):
         return math.hypot(of_seeds, self._lacking(suggestion.best_mean))
 
     def _lacking(self, loss: float) -> float:
-        """How far a pour may be from its simulations by the number of particles, or by what calibration left over where
-        that is more [the loss' unit]: a loss is taken for spilled liquid, whose stream is shifted (`sim_engine.bands`).
-        """
+        """How far a pour may be from its simulations by what the simulator lacks [the loss' unit]: a loss is taken for
+        spilled liquid, whose stream is shifted (`sim_engine.bands`)."""
         if self._plan.objectives is not None:
             return 0.0  # not a loss
         worst, particles = self._tolerated(1.0), self._parameters.particles
-        shift = max(resolution_shift(particles), self._plan.left_over or 0.0)
+        shift = lacking_shift(particles, self._plan.left_over)
         return worst * NormalDist().pdf(shift_of(loss / worst, particles)) * shift
 
     def progress(self) -> Progress:

@@ -56,6 +56,9 @@ class PourRow(Part):
     predicted_scatter: float | None
     """How much a single pour differs from it."""
 
+    predicted_band: tuple[float, float] | None = None
+    """Where nine pours in ten should lie; None where nobody knows."""
+
     loss: float | None
     """In its own unit; of a failed pour the worst, where it counts."""
 
@@ -151,6 +154,7 @@ class PourTrial:
             predicted=None if predicted is None else predicted.mean,
             predicted_deviation=None if predicted is None else predicted.deviation,
             predicted_scatter=None if predicted is None else predicted.scatter,
+            predicted_band=None if predicted is None else predicted.band,
             loss=self.cost,
             objectives={} if self.vector is None else dict(zip(objectives, self.vector, strict=False)),
             spillage=None if weighed is None else normalised_spillage(weighed.fractions),
@@ -168,6 +172,9 @@ def expecting(text: str, prediction: Prediction) -> Decision:
     if prediction.scatter is not None:
         expected["scatter"] = prediction.scatter
         text += f", a pour scatters by {prediction.scatter:.2g}"
+    if prediction.band is not None:
+        expected["low"], expected["high"] = prediction.band
+        text += f", nine pours in ten lie between {prediction.band[0]:.2g} and {prediction.band[1]:.2g}"
     return Decision(text, expected)
 
 

@@ -203,13 +203,14 @@ def test_the_posterior_is_drawn(determined: Any, tmp_path: Path) -> None:
     assert is_picture(path)
 
 
-def test_a_prediction_takes_turns_with_thetas_of_the_posterior(determined: Any, tmp_path: Path) -> None:
+def test_a_prediction_takes_turns_with_thetas_of_the_posterior(tmp_path: Path) -> None:
     path = tmp_path / "theta.json"
-    path.write_text(json.dumps(theta_file(determined.found)), encoding="utf-8")
+    rows = [{"theta": {**TRUE_THETA.model_dump(), "cohesion": 0.02 * k}, "weight": 1.0} for k in range(4)]
+    path.write_text(json.dumps({"theta": TRUE_THETA.model_dump(), "posterior": rows}), encoding="utf-8")
     thetas = load_posterior(path, 4)
-    assert len(set(thetas)) > 1
+    assert len(set(thetas)) == 4
     action = SCENE.action({"angular_velocity": 80 * DEG, "max_angle": 100 * DEG})
-    costing = Costing(Loss(), SCENE, thetas[0])
+    costing = Costing(Loss(), SCENE, TRUE_THETA)
     one, several = (RepeatedSimulation(costing, action, 8, 3, drawn) for drawn in ((), thetas))
     played = Play(calibration_spill)(several)
     assert [request.parameters for request in played.simulations] == [*thetas, *thetas]

@@ -65,6 +65,18 @@ def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(per_pou
     assert trust.after[-1].ignorance < 0.08
 
 
+def test_every_pour_is_announced_with_the_band_that_its_row_has() -> None:
+    strategy = adaptive(pours=2)
+    Play(narrow_cup)(strategy)
+    announced = [
+        decision for decision in strategy.decisions if "  predicted " in decision.text and "/2 " in decision.text
+    ]
+    for pour, decision in zip(strategy.result().pours, announced, strict=True):
+        assert pour.predicted_band == (decision.values["low"], decision.values["high"])
+        assert "nine pours in ten lie between" in decision.text
+        assert 0.0 <= pour.predicted_band[0] < pour.predicted_band[1] <= 1.0
+
+
 def test_a_result_with_what_was_said_survives_its_file() -> None:
     strategy = adaptive(pours=2)
     Play(narrow_cup)(strategy)
