@@ -37,11 +37,11 @@ lint: $(READY)
 	$(BIN)/lint-imports
 
 unit: $(READY)
-	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile
+	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
 
 # What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
 slow: $(READY)
-	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 --dist loadfile
+	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 --dist loadfile --no-loadscope-reorder
 
 docs: $(READY)
 	$(BIN)/sphinx-build -W --keep-going -q -b html -c docs . build/site
@@ -49,7 +49,7 @@ docs: $(READY)
 
 # Which lines the quick tests run, in this process and in those that they start.
 coverage: $(READY)
-	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow" -n 3 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
 
 # The tests that start nothing, with the oldest dependencies that pyproject.toml allows (needs uv).
 OLDEST := build/oldest

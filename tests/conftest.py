@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
+import re
 import shutil
 import signal
 import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -23,8 +27,32 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     atexit.register(shutil.rmtree, os.environ[VARIABLE], ignore_errors=True)
 
 
+MANY = (Path(__file__).parent / "actors", Path(__file__).parent / "orchestrator")
+"""Folders of many short files. They come last, so that no long one is alone at the end of a run on several workers."""
+
 PART = "DECANT_TESTS_PART"
 """Variable '2/4': of the files with tests that were chosen, each fourth one, from the second on."""
+
+
+SLOW_FILE = re.compile(r"^pytestmark = .*\bmark\.slow\b", re.MULTILINE)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """A file of nothing but slow tests is not imported where none of them is wanted: some import much."""
+    if config.option.markexpr != "not slow" or collection_path.suffix != ".py":
+        return None
+    return True if SLOW_FILE.search(collection_path.read_text(encoding="utf-8")) else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collecting makes objects that stay: a search for garbage among them takes long and finds none, then and later."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(trylast=True)  # after those that were not chosen have gone
@@ -33,6 +61,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
     Reruns are counted in the last line. A test that needs one on an idle machine has a fault.
     """
+    items.sort(key=lambda item: any(item.path.is_relative_to(folder) for folder in MANY))
     for item in items:
         if item.get_closest_marker("realtime") is not None:
             item.add_marker(pytest.mark.flaky(reruns=2))

@@ -116,6 +116,7 @@ def test_liquid_is_measured_by_volume_and_place() -> None:
     assert standard_pour.delivered(upright, 0.5 * d) == 1.0  # the receiver stands at the origin
 
 
+@pytest.mark.slow
 def test_standard_pour_is_measured_and_told_as_json() -> None:
     command = [sys.executable, str(BENCHMARKS / "pour_speed.py"), "--particles=200", "--repeats=1", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)

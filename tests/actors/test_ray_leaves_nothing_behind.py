@@ -94,15 +94,7 @@ def assert_clean(facts, home: Path, seconds: float = 15.0) -> None:
 
 
 @pytest.mark.realtime
-def test_kill_9_leaves_nothing(tmp_path):
-    program, facts = start("wait", tmp_path)
-    program.kill()
-    program.communicate(timeout=PATIENCE)
-    assert_clean(facts, tmp_path)
-
-
-@pytest.mark.realtime
-def test_no_helper_of_ray_runs_that_nobody_uses(tmp_path):
+def test_no_helper_of_ray_runs_that_nobody_uses_and_kill_9_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
     lines = [word for pid in facts["pids"] if psutil.pid_exists(pid) for word in psutil.Process(pid).cmdline()]
     program.kill()
@@ -114,6 +106,7 @@ def test_no_helper_of_ray_runs_that_nobody_uses(tmp_path):
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_ctrl_c_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
     os.killpg(program.pid, signal.SIGINT)

@@ -53,16 +53,6 @@ def test_same_seed_and_action_measure_the_same_bits_whatever_was_poured_before(o
 
 
 @pytest.mark.realtime
-@pytest.mark.ray
-def test_bench_in_processes_measures_what_its_twin_measures(ray_running, open_bench, scene, action):
-    async def play(ray):
-        async with open_bench(ray=ray, time_scale=100.0 if ray else 0.0) as laboratory:
-            return await laboratory.bench.pour(scene, action, seed=5)
-
-    assert asyncio.run(play(True)) == asyncio.run(play(False))
-
-
-@pytest.mark.realtime
 def test_measured_masses_are_those_of_the_hidden_liquid_within_the_balance(open_bench, scene, action, fake, bench_spec):
     """The fake liquid retains exactly a tenth, and spills what its seed says."""
 
@@ -197,7 +187,7 @@ async def tilting(arm):
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("ray", [False, pytest.param(True, marks=pytest.mark.ray)])
+@pytest.mark.parametrize("ray", [False, pytest.param(True, marks=[pytest.mark.ray, pytest.mark.slow])])
 def test_a_stop_during_the_pour_leaves_it_unknown_and_the_bench_usable(request, open_bench, scene, action, ray):
     if ray:
         request.getfixturevalue("ray_running")

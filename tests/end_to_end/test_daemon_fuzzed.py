@@ -23,6 +23,8 @@ from tests.end_to_end.daemon_thread import Real
 
 pytestmark = pytest.mark.slow
 
+pytest_plugins = ["schemathesis.pytest.plugin"]
+
 SCHEMA = schemathesis.openapi.from_dict(create_app().openapi())
 
 CHECKS = [

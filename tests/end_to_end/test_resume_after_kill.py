@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 from orchestrator.journal import Entry, Kind
+from tests.depth import THOROUGH
 from tests.end_to_end import small
 from tests.end_to_end.command import (
     Workplace,
@@ -29,11 +30,15 @@ pytestmark = [pytest.mark.ray]
 RUN = ("run", "small.yaml")
 RESUME = (*RUN, "--resume")
 
+CAMPAIGN = (
+    small.CAMPAIGN if THOROUGH else small.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false,")
+)
+
 
 @pytest.fixture
 def workplace(tmp_path: Path) -> Iterator[Workplace]:
     place = Workplace(tmp_path)
-    small.write_campaign(tmp_path)
+    small.write_campaign(tmp_path, CAMPAIGN)
     yield place
     place.close()
 
@@ -51,7 +56,7 @@ class Finished:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
     folder = tmp_path_factory.mktemp("undisturbed")
-    small.write_campaign(folder)
+    small.write_campaign(folder, CAMPAIGN)
     place = Workplace(folder)
     yield Finished(place)
     place.close()
@@ -133,7 +138,7 @@ def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undistu
     workplace.interrupt(in_calibration, signal.SIGKILL, *RESUME, "--answer", "repeat")
     workplace.assert_nothing_is_left()
 
-    small.write_campaign(workplace.folder)
+    small.write_campaign(workplace.folder, CAMPAIGN)
     workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGKILL, *RESUME)
     workplace.assert_nothing_is_left()
 
@@ -148,7 +153,7 @@ def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undistu
 
 def assert_a_person_is_asked(place: Workplace) -> None:
     """Unless the campaign says that such pours are repeated."""
-    small.write_campaign(place.folder, small.CAMPAIGN.replace("on_unknown: repeat", "on_unknown: ask"))
+    small.write_campaign(place.folder, CAMPAIGN.replace("on_unknown: repeat", "on_unknown: ask"))
     before = len(place.entries())
     process = place.start(*RESUME)
     with ended(process):
@@ -169,8 +174,11 @@ def closed(stage: str, entries: list[Entry]) -> bool:
 
 
 @pytest.mark.realtime
-def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Workplace, undisturbed: Finished) -> None:
-    process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN)
+@pytest.mark.parametrize("where", [pytest.param([], id="Ray", marks=pytest.mark.slow), ["--in-process"]])
+def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(
+    workplace: Workplace, undisturbed: Finished, where: list[str]
+) -> None:
+    process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN, *where)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert "a pour that has begun is finished and weighed first" in errors
@@ -180,7 +188,7 @@ def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Wo
     advice = errors.strip().splitlines()[-1]
     assert advice.startswith("decant: interrupted; nothing is lost. Go on with: decant run small.yaml --resume --run ")
     command = advice.rpartition("Go on with: decant ")[2].split()
-    result = workplace.finish(*command)
+    result = workplace.finish(*command, *where)
     assert_same_run(workplace, undisturbed)
     assert result["receivers"] == undisturbed.summary["receivers"]
 

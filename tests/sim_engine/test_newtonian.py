@@ -31,6 +31,7 @@ def poured(viscosity: float, factor: float = 1.0) -> PourTask:
     return PourTask(replace(SCENE, liquid=liquid), STANDARD, theta, seed=1)
 
 
+@pytest.mark.slow
 def test_a_puddle_of_syrup_spreads_as_huppert_says(simulator: PourSimulator) -> None:
     found, _ = films.spreading(1_000, 2e-3, PLAIN)
     assert found[0].value < 0.12  # of the radius, over a second and a half
@@ -57,6 +58,7 @@ def test_the_thicker_the_more_stays_in_the_cup(simulator: PourSimulator) -> None
     assert left[2] > 0.1
 
 
+@pytest.mark.slow
 def test_a_batch_of_thin_and_thick_liquids_is_bit_for_bit_what_each_is_alone(simulator: PourSimulator) -> None:
     tasks = [poured(1e-3), poured(0.5), poured(1e-3)]
     together = [run.outcome for run in simulator.simulate_many(tasks)]
@@ -75,7 +77,8 @@ def test_the_factor_is_that_of_the_viscosity_and_none_to_a_liquid_as_thin_as_wat
     )
 
 
-@pytest.mark.parametrize("degrees", [150.0, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [150.0, 60.0])
 def test_a_puddle_stands_as_high_as_its_contact_angle_says(simulator: PourSimulator, degrees: float) -> None:
     angle = math.radians(degrees)
     value, _, _ = wetting.puddle(2_000, angle)

@@ -168,30 +168,47 @@ def _ends(points: Floats, scatter: float) -> tuple[float, float]:
 
 def _slices(points: Floats) -> list[Floats]:
     ordered = points[np.argsort(points[:, 2])]
-    low, high = ordered[0, 2], ordered[-1, 2]
-    margin = FOOT * (high - low)
-    edges = np.linspace(low + margin, high - 0.5 * margin, LAYERS + 1)
+    edges = _edges(ordered[0, 2], ordered[-1, 2])
     return np.split(ordered, np.searchsorted(ordered[:, 2], edges))[1:-1]
 
 
+def _edges(low: float, high: float) -> Floats:
+    """Heights between the layers of points from `low` to `high`, shape (LAYERS + 1,) [m]."""
+    margin = FOOT * (high - low)
+    return np.linspace(low + margin, high - 0.5 * margin, LAYERS + 1)
+
+
 def _scatter(points: Floats) -> float:
-    found = [
-        np.std(part) * len(part)
-        for layer in _slices(points)
-        if len(layer) >= 6
-        for part in _halved(np.hypot(layer[:, 0], layer[:, 1]))
-    ]
-    return float(np.sum(found)) / len(points) if found else float("inf")
+    """Mean standard deviation of the layers' radii, each of one or of two surfaces [m]; of layers of six points on.
 
-
-def _halved(radii: Floats) -> list[Floats]:
-    """The radii of one or of two surfaces, none left out: cut at the widest gap, if there are enough on both sides."""
-    ordered = np.sort(radii)
-    least = max(len(ordered) // 8, 3)
-    gaps = np.diff(ordered)[least - 1 : len(ordered) - least]
-    if len(gaps) == 0 or gaps.max() < APART:
-        return [ordered]
-    return np.split(ordered, [least + int(np.argmax(gaps))])
+    Where the radii of a layer have a wide gap with enough of them on both sides, they are cut at the widest one.
+    """
+    z, radii = points[:, 2], np.hypot(points[:, 0], points[:, 1])
+    layer = np.searchsorted(_edges(z.min(), z.max()), z, side="right") - 1
+    layer[(layer < 0) | (layer >= LAYERS)] = LAYERS
+    counts = np.bincount(layer, minlength=LAYERS + 1)
+    counts[LAYERS] = 0
+    used = counts[layer] >= 6
+    if not used.any():
+        return float("inf")
+    wide = 2.0 * radii.max()  # one sorting for both: of layers, and of the radii in each
+    both = np.sort(wide * layer[used] + radii[used])
+    layer = np.repeat(np.arange(LAYERS + 1), np.where(counts >= 6, counts, 0))
+    radii = both - wide * layer
+    starts = np.flatnonzero(np.diff(layer, prepend=-1))
+    sizes = np.diff(starts, append=len(layer))
+    index = np.repeat(np.arange(len(starts)), sizes)
+    place, least = np.arange(len(layer)) - starts[index], np.maximum(sizes // 8, 3)[index]
+    # a gap belongs to the point below it
+    may_cut = (place >= least - 1) & (place < sizes[index] - least)
+    gaps = np.where(may_cut, np.diff(radii, append=np.inf), 0.0)
+    widest = np.maximum.reduceat(gaps, starts)
+    first = np.minimum.reduceat(np.where(gaps == widest[index], place, len(layer)), starts)
+    part = 2 * index + ((widest >= APART)[index] & (place > first[index]))
+    number = np.bincount(part)
+    means = np.bincount(part, radii) / np.maximum(number, 1)
+    squares = np.bincount(part, (radii - means[part]) ** 2)
+    return float(np.sqrt(squares * number).sum()) / len(points)
 
 
 def surfaces(radii: Floats) -> list[Floats]:

@@ -118,9 +118,9 @@ def test_bad_usage_is_explained(command: str, folder: Path) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        "run misspelt.yaml",
+        pytest.param("run misspelt.yaml", marks=pytest.mark.slow),
         "run open-mesh.yaml",
-        "plan small.yaml --receiver small.yaml",
+        pytest.param("plan small.yaml --receiver small.yaml", marks=pytest.mark.slow),
         "simulate small.yaml --set angular_velocity=100 --set x_offset=10",
     ],
 )

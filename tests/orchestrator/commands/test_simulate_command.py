@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from orchestrator.commands import single
 from sim_engine.spread import spreads
 from tests.orchestrator import watched
-from tests.orchestrator.commands.typed import SIMULATE, process
+from tests.orchestrator.commands.typed import SIMULATE, invoke, process
 
 
 @pytest.fixture(scope="module")
 def simulated(inputs: Path) -> subprocess.CompletedProcess[str]:
     """One pour through the command, shown in every way."""
     return process(f"{SIMULATE} --seed 5 --json --rrd pour.rrd --png pour.png", inputs)
+
+
+def typed(command: str, folder: Path) -> Any:
+    """In this process, which starts the simulator once."""
+    with contextlib.chdir(folder):
+        done = invoke(command)
+    assert done.exit_code == 0, done.stderr
+    return done
 
 
 def test_simulate_prints_one_line_of_json_and_nothing_else(simulated: subprocess.CompletedProcess[str]) -> None:
@@ -55,10 +65,7 @@ def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
 
 
 def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path) -> None:
-    done = process(
-        "simulate small.yaml --set angular_velocity=20 --set max_angle=75 --set x_offset=70 --seeds 2", inputs
-    )
-    assert done.returncode == 0, done.stderr
+    done = typed("simulate small.yaml --set angular_velocity=20 --set max_angle=75 --set x_offset=70 --seeds 2", inputs)
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
     assert "mean ± standard deviation, 2 seeds" in done.stdout
     assert re.search(
@@ -74,13 +81,12 @@ def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
     (inputs / "theta.json").write_text(
         json.dumps({"theta": theta, "remaining_discrepancy": {"shift": 0.2}, "posterior": draws}), encoding="utf-8"
     )
-    done = process(
+    done = typed(
         "simulate small.yaml --from pours.csv --parameters theta.json --seeds 2 --csv scored.csv --png scored.png "
         "--json",
         inputs,
     )
     (inputs / "theta.json").unlink()
-    assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["scene"] == "calibration"
     assert [pour["measured"] for pour in found["pours"]] == pytest.approx([4 / 90, 8 / 95, 0.09])
@@ -123,9 +129,8 @@ def test_simulate_takes_units_parameters_and_another_receiver(
         "simulate small.yaml --set 'angular_velocity=1.5 rad/s' --set 'x_offset=8 cm' "
         "--parameters theta.json --receiver tumbler.yaml --json"
     )
-    done = process(command, inputs)
+    done = typed(command, inputs)
     (inputs / "theta.json").unlink()
-    assert done.returncode == 0, done.stderr
     outcome = json.loads(done.stdout)
     assert outcome["particles"] == 350
     assert (outcome["action"]["angular_velocity"], outcome["action"]["x_offset"]) == pytest.approx((1.5, 0.08))
@@ -138,8 +143,7 @@ def test_a_cup_whose_shape_may_be_off_has_a_wider_band(inputs: Path) -> None:
     (inputs / "off.yaml").write_text(cup + ", radius_deviations: [[0, 3, 3]]}\n", encoding="utf-8")
     printed = {}
     for name in ("known", "off"):
-        done = process(f"{SIMULATE.replace('70', '120')} --seed 6 --seeds 4 --receiver {name}.yaml", inputs)
-        assert done.returncode == 0, done.stderr
+        done = typed(f"{SIMULATE.replace('70', '120')} --seed 6 --seeds 4 --receiver {name}.yaml", inputs)
         printed[name] = done.stdout
     low, high = ([float(end) for end in _BAND.findall(text)[0]] for text in printed.values())
     assert high[1] - high[0] > 1.5 * (low[1] - low[0])

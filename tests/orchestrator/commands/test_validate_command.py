@@ -42,7 +42,14 @@ finally:
 """
 
 
-@pytest.mark.parametrize("file", ["campaigns/paper.yaml", "studies/paper.yaml", "laboratories/virtual.yaml"])
+@pytest.mark.parametrize(
+    "file",
+    [
+        "campaigns/paper.yaml",
+        pytest.param("studies/paper.yaml", marks=pytest.mark.slow),
+        pytest.param("laboratories/virtual.yaml", marks=pytest.mark.slow),
+    ],
+)
 def test_checking_a_shipped_file_wakes_nothing_heavy(file: str, inputs: Path) -> None:
     done = process(f"validate {ROOT / 'configs' / file}", inputs, HEAVY)
     assert done.returncode == 0, done.stderr

@@ -120,7 +120,7 @@ def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsy
     assert deviations[2] < min(deviations[:2])
 
 
-@pytest.mark.parametrize("door", [callipers, fill, photo])
+@pytest.mark.parametrize("door", [callipers, fill, pytest.param(photo, marks=pytest.mark.slow)])
 def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) -> None:
     made(tmp_path, door(bench("cone"), tmp_path))
     told = float((tmp_path / "made.yaml").read_text().partition("±")[2].split()[0])

@@ -311,7 +311,7 @@ LEGIBLE = """() => {
 }"""
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.slow), "dark"])
 def test_everything_is_legible_and_large_enough(page: Any, tmp_path: Path, scheme: str) -> None:
     """Contrast 4.5 : 1 (3 : 1 for large letters; WCAG 2.2 AA), targets of 44 px."""
     page.emulate_media(color_scheme=scheme)
@@ -332,7 +332,9 @@ def test_everything_is_legible_and_large_enough(page: Any, tmp_path: Path, schem
         assert page.evaluate(LEGIBLE) == []
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    "size", [pytest.param(size, marks=pytest.mark.slow if size in ("phone", "tablet") else ()) for size in SIZES]
+)
 def test_it_fits_every_screen_with_the_stop_in_reach(page: Any, tmp_path: Path, size: str) -> None:
     width, height = SIZES[size]
     page.set_viewport_size({"width": width, "height": height})

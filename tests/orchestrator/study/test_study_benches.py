@@ -75,6 +75,7 @@ def test_no_bench_lets_the_cups_touch_where_calibration_and_deployment_pour() ->
                 pytest.fail(f"{level.name}, {scene.receiver.name}: {error}")
 
 
+@pytest.mark.slow
 def test_calibrations_are_scored_in_vessels_that_they_did_not_learn_in(played: tuple[StudyPlan, Any]) -> None:
     _, results = played
     for arm in ("C4", "C4-active"):
@@ -84,6 +85,7 @@ def test_calibrations_are_scored_in_vessels_that_they_did_not_learn_in(played: t
         assert not tested & {pair.scene for pair in scores.pairs if pair.split == "train"}
 
 
+@pytest.mark.slow
 def test_the_active_arm_learns_on_its_own_few_pours_and_is_scored_on_the_same_ones(
     played: tuple[StudyPlan, Any],
 ) -> None:
@@ -103,6 +105,7 @@ def test_the_active_arm_learns_on_its_own_few_pours_and_is_scored_on_the_same_on
     assert calibrated.training_pours == 4
 
 
+@pytest.mark.slow
 def test_the_report_compares_them_on_all_benches(played: tuple[StudyPlan, Any]) -> None:
     study, results = played
     found = gather(study, results)

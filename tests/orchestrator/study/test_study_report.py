@@ -239,6 +239,7 @@ def all_drawn(study: StudyPlan) -> list[Drawn]:
     return [*draw_calibrations(study, found), *draw_deployments(study, found), *draw_finals(study, found)]
 
 
+@pytest.mark.slow
 def test_nothing_leaves_a_figure_no_mark_is_cut_and_no_band_fills_a_panel(study: StudyPlan) -> None:
     for one in all_drawn(study):
         assert strays(one.figure) == [], one.number
