@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from statistics import NormalDist
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from sim_engine.action import Action
+from sim_engine.bands import LEVEL
 from sim_engine.liquid import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.task import PoseError
+
+_NORMAL = NormalDist()
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,18 @@ class Prediction:
     deviation: float
     scatter: float | None = None
     band: tuple[float, float] | None = None
+
+    def of_a_pour(self) -> tuple[float, float]:
+        """Its band; where none was told, that of a normal distribution with these moments. No loss is below 0: where
+        one may well be 0 the band begins there, and holds no more for that."""
+        if self.band is not None:
+            return self.band
+        spread = math.hypot(self.deviation, self.scatter or 0.0)
+        half = _NORMAL.inv_cdf(0.5 * (1.0 + LEVEL)) * spread
+        from_nothing = max(self.mean + _NORMAL.inv_cdf(LEVEL) * spread, 0.0)
+        if self.mean < half or from_nothing < 2.0 * half:
+            return 0.0, from_nothing
+        return self.mean - half, self.mean + half
 
 
 @dataclass(frozen=True)

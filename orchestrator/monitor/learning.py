@@ -26,6 +26,7 @@ from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.pours import Foretold
 from orchestrator.strategies.learnt import Learnt
 from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.bands import LEVEL
 
 PLACE = "/learning"
 
@@ -100,11 +101,10 @@ class LearningStage:
         self._number(f"{place}/measured", shown, f"measured [{unit.unit}]", style.MEASURED, marker=9.0)
         if request.predicted is not None:
             mean = unit.factor * at_least_nothing(request.predicted.mean)
-            sigma = unit.factor * request.predicted.deviation
             self._number(f"{place}/predicted", mean, f"predicted [{unit.unit}]", style.PREDICTED)
-            for name, sign in (("low", -2.0), ("high", 2.0)):
-                label = f"predicted {'−' if sign < 0 else '+'} 2 σ [{unit.unit}]"
-                self._number(f"{place}/predicted_{name}", max(mean + sign * sigma, 0.0), label, "#f0c27a", width=1.5)
+            for name, end in zip(("low", "high"), request.predicted.of_a_pour(), strict=True):
+                label = f"{100 * LEVEL:.0f} % band, {'upper' if name == 'high' else 'lower'} end [{unit.unit}]"
+                self._number(f"{place}/predicted_{name}", unit.factor * end, label, "#f0c27a", width=1.5)
         name = self._names.get(request.scene, request.scene)
         if not calibrating:
             self._best(request.scene, place, shown, unit.unit, name)

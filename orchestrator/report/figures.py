@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from orchestrator.report import style
+from sim_engine.bands import LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,12 +27,13 @@ class PourSeries:
     Attributes:
         receiver: name for people.
         losses: measured loss of each pour in the axis' unit; None where a pour failed.
-        predicted: (mean, standard deviation) that was expected of each pour; None where nothing was.
+        predicted: (mean, low, high): what was expected of each pour, and the band that it should lie in with a
+            probability of `sim_engine.bands.LEVEL`; None where nothing was.
     """
 
     receiver: str
     losses: Sequence[float | None]
-    predicted: Sequence[tuple[float, float] | None]
+    predicted: Sequence[tuple[float, float, float] | None]
 
     def best_so_far(self) -> list[float | None]:
         """Smallest loss up to each pour; None before the first that worked."""
@@ -45,7 +47,7 @@ class PourSeries:
 
 
 def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title: str) -> Path:
-    """Loss against pours, one panel for each receiver: measured, best so far, and what was predicted ± 2 σ.
+    """Loss against pours, one panel for each receiver: measured, best so far, and where it was to lie.
 
     Args:
         path: PNG to write.
@@ -98,27 +100,27 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
     measured = np.array([np.nan if loss is None else loss for loss in series.losses], dtype=float)
     best = np.array([np.nan if value is None else value for value in series.best_so_far()], dtype=float)
     mean = np.array([np.nan if p is None else p[0] for p in series.predicted], dtype=float)
-    deviation = np.array([np.nan if p is None else p[1] for p in series.predicted], dtype=float)
+    low = np.array([np.nan if p is None else p[1] for p in series.predicted], dtype=float)
+    high = np.array([np.nan if p is None else p[2] for p in series.predicted], dtype=float)
     top = float(np.nanmax(measured)) if np.isfinite(measured).any() else 1.0
     if np.isfinite(mean).any():
         # Bars, not a ribbon: every pour is another action, there is nothing between two of them.
         axes.errorbar(
             numbers,
             mean,
-            yerr=np.vstack([np.minimum(2 * deviation, np.maximum(mean, 0.0)), 2 * deviation]),
+            yerr=np.vstack([np.maximum(mean - low, 0.0), np.maximum(high - mean, 0.0)]),
             fmt="_",
             markersize=9,
             markeredgewidth=2.0,
             elinewidth=6.0,
             ecolor=(*_rgb(style.PREDICTED), 0.35),
             color=style.PREDICTED,
-            label="predicted ± 2 σ",
+            label=f"predicted: mean, {100 * LEVEL:.0f} % band",
             zorder=2,
         )
         # A first, clueless prediction must not squeeze what was measured into the lowest tenth.
-        ends = mean + 2 * deviation
-        top = max(top, min(float(np.nanmax(ends)), 2.0 * top))
-        for number, end in zip(numbers, ends, strict=True):
+        top = max(top, min(float(np.nanmax(high)), 2.0 * top))
+        for number, end in zip(numbers, high, strict=True):
             if end > TOP * top:
                 axes.annotate(
                     f"{end:.3g}", (float(number), TOP * top), xytext=(7, -2), textcoords="offset points",

@@ -14,6 +14,7 @@ from orchestrator.report.figures import DiscrepancyGroup, PourSeries
 from orchestrator.report.maps import SurrogatePicture
 from orchestrator.report.names import receiver_name
 from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
+from orchestrator.requests import Prediction
 from orchestrator.results import Results
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
@@ -165,11 +166,16 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
         predictions = [
             None
             if pour.predicted is None
-            else (unit.factor * at_least_nothing(pour.predicted), unit.factor * (pour.predicted_deviation or 0.0))
+            else _told(Prediction(pour.predicted, pour.predicted_deviation or 0.0, None, pour.predicted_band), unit)
             for pour in pours
         ]
         series.append(PourSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))
     return series
+
+
+def _told(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
+    low, high = predicted.of_a_pour()
+    return unit.factor * at_least_nothing(predicted.mean), unit.factor * low, unit.factor * high
 
 
 def _surrogate(shown: DisplayedMap | None, unit: LossUnit) -> dict[str, Any]:

@@ -55,7 +55,8 @@ _FIGURES: dict[str, tuple[str, str]] = {
     ),
     "spillage": (
         "Loss of every pour in the order made, with what was predicted of it and the best so far.",
-        "What every pour came to (dots), what was expected of it (bars, ± 2 σ), and the best so far (line).",
+        "What every pour came to (dots), what was expected of it (bars: where nine in ten such pours lie), and the "
+        "best so far (line).",
     ),
     "loss map": (
         "Map of the expected loss over the searched actions with the pours as numbered dots and the recommended action "

@@ -214,6 +214,23 @@ def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | 
     assert result.pours[0].predicted_scatter == result.recommended.predicted_scatter
 
 
+@pytest.mark.parametrize(
+    ("mean", "deviation", "scatter"), [(0.3, 0.04, 0.03), (0.05, 0.03, 0.0), (0.004, 0.02, None), (-0.01, 0.004, 0.001)]
+)
+def test_nine_pours_in_ten_lie_in_the_band_whatever_the_model_told(
+    mean: float, deviation: float, scatter: float | None
+) -> None:
+    predicted = Prediction(mean, deviation, scatter)
+    low, high = predicted.of_a_pour()
+    normal = NormalDist(mean, math.hypot(deviation, scatter or 0.0))
+    inside = normal.cdf(high) - (normal.cdf(low) if low > 0.0 else 0.0)
+    assert inside >= 0.9 - 1e-9
+    assert low >= 0.0
+    assert inside == pytest.approx(0.9) or high == 0.0
+    assert high - low <= 2.0 * 1.645 * normal.stdev
+    assert replace(predicted, band=(0.1, 0.2)).of_a_pour() == (0.1, 0.2)
+
+
 def test_the_line_of_a_pour_says_both() -> None:
     predicted = Prediction(0.008, 0.009, 0.005)
     assert loss_unit(Loss()).prediction(predicted) == "0.80 ± 0.90 %, a pour ± 0.50 %"

@@ -57,7 +57,7 @@ class PourRow(Part):
     """How much a single pour differs from it."""
 
     predicted_band: tuple[float, float] | None = None
-    """Where nine pours in ten should lie; None where nobody knows."""
+    """Where nine pours in ten should lie; None where nothing was expected."""
 
     loss: float | None
     """In its own unit; of a failed pour the worst, where it counts."""
@@ -154,7 +154,7 @@ class PourTrial:
             predicted=None if predicted is None else predicted.mean,
             predicted_deviation=None if predicted is None else predicted.deviation,
             predicted_scatter=None if predicted is None else predicted.scatter,
-            predicted_band=None if predicted is None else predicted.band,
+            predicted_band=None if predicted is None else predicted.of_a_pour(),
             loss=self.cost,
             objectives={} if self.vector is None else dict(zip(objectives, self.vector, strict=False)),
             spillage=None if weighed is None else normalised_spillage(weighed.fractions),
