@@ -80,7 +80,7 @@ def test_every_pour_has_its_measured_and_predicted_loss_and_the_best_so_far(reco
     assert numbers("measured") == pytest.approx([6.0, 8.5, 16.0])
     assert numbers("best") == pytest.approx([6.0, 8.5, 16.0])
     assert numbers("predicted") == pytest.approx([20 / 3, 10.0, 20.0])
-    assert numbers("predicted_high") == pytest.approx([20 / 3 + 4, 14.0, 24.0])
+    assert numbers("predicted_high") == pytest.approx([20 / 3 + 3.29, 13.29, 23.29], abs=0.01)  # nine in ten
     assert recorded.columns["/learning/narrow_cup/loss/measured"]["step"][-1] >= 3
 
 
