@@ -7,6 +7,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Files of tests to workers, in the order in which they were collected.
+BY_FILE := --dist loadfile --no-loadscope-reorder
 READY := $(VENV)/.ready
 
 .PHONY: install demo test lint unit slow docs coverage oldest lock clean
@@ -37,11 +39,11 @@ lint: $(READY)
 	$(BIN)/lint-imports
 
 unit: $(READY)
-	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m "not slow" -n 3 $(BY_FILE)
 
 # What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
 slow: $(READY)
-	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 --dist loadfile --no-loadscope-reorder
+	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 $(BY_FILE)
 
 docs: $(READY)
 	$(BIN)/sphinx-build -W --keep-going -q -b html -c docs . build/site
@@ -49,7 +51,7 @@ docs: $(READY)
 
 # Which lines the quick tests run, in this process and in those that they start.
 coverage: $(READY)
-	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow" -n 3 $(BY_FILE) --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
 
 # The tests that start nothing, with the oldest dependencies that pyproject.toml allows (needs uv).
 OLDEST := build/oldest

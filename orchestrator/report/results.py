@@ -166,7 +166,12 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
         predictions = [
             None
             if pour.predicted is None
-            else _told(Prediction(pour.predicted, pour.predicted_deviation or 0.0, None, pour.predicted_band), unit)
+            else _told(
+                Prediction(
+                    pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_band
+                ),
+                unit,
+            )
             for pour in pours
         ]
         series.append(PourSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))

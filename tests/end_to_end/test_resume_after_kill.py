@@ -174,11 +174,8 @@ def closed(stage: str, entries: list[Entry]) -> bool:
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("where", [pytest.param([], id="Ray", marks=pytest.mark.slow), ["--in-process"]])
-def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(
-    workplace: Workplace, undisturbed: Finished, where: list[str]
-) -> None:
-    process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN, *where)
+def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Workplace, undisturbed: Finished) -> None:
+    process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert "a pour that has begun is finished and weighed first" in errors
@@ -188,7 +185,7 @@ def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(
     advice = errors.strip().splitlines()[-1]
     assert advice.startswith("decant: interrupted; nothing is lost. Go on with: decant run small.yaml --resume --run ")
     command = advice.rpartition("Go on with: decant ")[2].split()
-    result = workplace.finish(*command, *where)
+    result = workplace.finish(*command)
     assert_same_run(workplace, undisturbed)
     assert result["receivers"] == undisturbed.summary["receivers"]
 
