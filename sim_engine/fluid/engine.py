@@ -1,23 +1,25 @@
 """Taichi's start and end, and the arrays of one process. The only place that calls `ti.init`."""
 
 import contextlib
-import functools
 import io
-import os
 from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from sim_engine.backend import BackendError, require_backend
 from sim_engine.cache import cache_directory
 from sim_engine.contact import rotations
+from sim_engine.fluid.quick import imports, look_up_quickly, uncollected
 from sim_engine.fluid.setup import POSE_STEP, SceneSetup, pose_at
-from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState, of_parameters
-from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 from sim_engine.outcome import ParticleState
+
+with imports():
+    import taichi as ti
+
+    from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState, of_parameters
+    from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 
 POOLS = {"cpu": (50_000, 64), "cuda": (2_500_000, 1_024)}
 """Particles and scenes that a process has room for, by backend; the largest scene has 50,000 particles."""
@@ -279,29 +281,6 @@ class _Pool(Generic[T]):
         return np.ascontiguousarray(np.concatenate(self._parts))
 
 
-def _look_up_quickly() -> None:
-    """Keep Taichi from what takes most of the time in which even known kernels are looked up in the cache.
-
-    It draws the line and carets of an error message for each of the thousands of nodes of a kernel, which nobody reads
-    while kernels compile. `DECANT_KERNEL_PLACES=1` leaves them in, for who changes a kernel. And it looks for the
-    source of a function anew wherever one is called.
-    """
-    from taichi.lang import kernel_impl
-    from taichi.lang.ast import ast_transformer_utils
-
-    context = getattr(ast_transformer_utils, "ASTTransformerContext", None)
-    if context is not None and hasattr(context, "get_pos_info") and not os.environ.get("DECANT_KERNEL_PLACES"):
-        context.get_pos_info = _no_place
-    for name in ("getsourcefile", "getsourcelines"):
-        search = getattr(kernel_impl, name, None)
-        if search is not None and not hasattr(search, "cache_info"):
-            setattr(kernel_impl, name, functools.cache(search))
-
-
-def _no_place(context: object, node: object) -> str:
-    return ""
-
-
 def start(backend: str) -> None:
     """Start Taichi.
 
@@ -309,7 +288,7 @@ def start(backend: str) -> None:
         BackendError: this machine has no such backend.
     """
     require_backend(backend)
-    _look_up_quickly()
+    look_up_quickly()
     # Taichi says on which architecture it starts, on stdout, which is for results alone.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
@@ -340,7 +319,8 @@ def engine(backend: str | None = None) -> FluidEngine:
     """
     global _engine
     if _engine is None:
-        _engine = FluidEngine(backend or "cpu")
+        with uncollected():
+            _engine = FluidEngine(backend or "cpu")
     elif backend is not None and backend != _engine.backend:
         raise BackendError(f"this process already simulates on {_engine.backend}; {backend} needs a process of its own")
     return _engine

@@ -1,0 +1,236 @@
+"""What Taichi 1.7 does in every process and nobody here needs, left out.
+
+Nothing of it touches what is computed. Each piece looks whether what it replaces is there; where it isn't, Taichi does
+as it always did. `DECANT_KERNEL_PLACES=1` leaves it as it is, for who changes a kernel and wants to be told where an
+error is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import importlib
+import inspect
+import linecache
+import os
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from types import CodeType, FrameType, ModuleType
+from typing import Any
+
+import numpy as np
+
+ENVIRONMENT_VARIABLE = "DECANT_KERNEL_PLACES"
+
+
+def as_it_is() -> bool:
+    """Whether Taichi is to be left alone."""
+    return bool(os.environ.get(ENVIRONMENT_VARIABLE))
+
+
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """Without the garbage collector, which goes through a growing heap again and again and finds nothing."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
+@contextlib.contextmanager
+def imports() -> Iterator[None]:
+    """In which Taichi, and modules with kernels, are imported quickly.
+
+    For every function Taichi looks whether it is written inside a class, and to find that line goes through all modules
+    there are.
+    """
+    if as_it_is():
+        yield
+        return
+    # Of what serves source typed at a prompt, and what asks Taichi's maker for a newer version, the names will do.
+    prompt, version = ModuleType("dill"), ModuleType("taichi._version_check")
+    version.start_version_check_thread = _nothing  # type: ignore[attr-defined]
+    for module in prompt, version:
+        sys.modules.setdefault(module.__name__, module)
+    try:
+        with uncollected(), _lines_read():
+            yield
+    finally:
+        _replace(sys.modules.get("taichi.lang.kernel_impl"), "_inside_class", _quick_look)
+        if sys.modules.get("dill") is prompt:  # who wants that shall have it
+            del sys.modules["dill"]
+
+
+@contextlib.contextmanager
+def _lines_read() -> Iterator[None]:
+    """In which the line of a frame is read from where the frame says that it is."""
+    search = inspect.getframeinfo
+    inspect.getframeinfo = _line_of  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        inspect.getframeinfo = search
+
+
+def _quick_look(look: Callable[[int], bool]) -> Callable[[int], bool]:
+    def quick(level_of_class_stackframe: int) -> bool:
+        with _lines_read():
+            return look(level_of_class_stackframe + 1)
+
+    return quick
+
+
+def _line_of(frame: FrameType, context: int = 1) -> inspect.Traceback:
+    """As `inspect.getframeinfo` with one line of context."""
+    code = frame.f_code
+    line = linecache.getline(code.co_filename, frame.f_lineno, frame.f_globals)
+    return inspect.Traceback(code.co_filename, frame.f_lineno, code.co_name, [line], 0)
+
+
+def look_up_quickly() -> None:
+    """Keep Taichi from what takes most of the time in which even known kernels are looked up in its cache."""
+    if as_it_is():
+        return
+    with imports():
+        _part("matrix_ops")  # the first kernel would load it, less quickly
+    expr, impl, kernel_impl, builder = (_part(n) for n in ("expr", "impl", "kernel_impl", "ast.ast_transformer_utils"))
+    # For each of the thousands of nodes of a kernel it looks for the method by its name, notes the place, …
+    if hasattr(impl, "get_runtime") and isinstance(getattr(impl.get_runtime(), "src_info_stack", None), list):
+        _replace(getattr(builder, "Builder", None), "__call__", functools.partial(_quick_builder, impl.get_runtime))
+    # … draws the line and carets of an error message, …
+    _replace(getattr(builder, "ASTTransformerContext", None), "get_pos_info", lambda _: _nothing)
+    # … keeps the stack for each field, in case it will not be placed, …
+    for module in impl, _part("snode"):
+        _replace(module, "get_traceback", lambda _: _nothing)
+    # … looks for a function's source anew wherever it is called, and breaks each of its lines at 9,999 characters.
+    _replace(kernel_impl, "getsourcefile", functools.cache)
+    _replace(kernel_impl, "getsourcelines", lambda search: functools.cache(functools.partial(_source, search)))
+    _replace(kernel_impl, "textwrap", lambda _: _Text)
+    # For each integer it asks numpy for the range of its kind, …
+    _replace(expr, "_check_in_range", lambda _: _in_range)
+    # … and what it makes of a kernel is full of cycles, none of which ends while it does.
+    _replace(getattr(kernel_impl, "Kernel", None), "materialize", _uncollected_call)
+
+
+def _part(name: str) -> Any:
+    """A module of Taichi's language, if there is one of that name."""
+    try:
+        return importlib.import_module(f"taichi.lang.{name}")
+    except ImportError:
+        return None
+
+
+def _replace(owner: object, name: str, by: Callable[[Any], object]) -> None:
+    """Put something in place of an attribute, once; nothing where it is not there."""
+    old = getattr(owner, name, None)
+    if old is not None and (owner, name) not in _replaced:
+        _replaced.add((owner, name))
+        setattr(owner, name, by(old))
+
+
+_replaced: set[tuple[object, str]] = set()
+
+
+def _nothing(*_: object, **__: object) -> str:
+    return ""
+
+
+def _quick_builder(runtime: Callable[[], Any], build: Callable[..., object]) -> Callable[..., object]:
+    """As Taichi's builder, which gets to see only what goes wrong."""
+    methods: dict[type, Any] = {}
+
+    def quick(self: Any, context: object, node: object) -> object:
+        kind = node.__class__
+        if kind not in methods:
+            methods[kind] = getattr(type(self), "build_" + kind.__name__, None)
+        method = methods[kind]
+        if method is None:
+            return build(self, context, node)
+        places = runtime().src_info_stack
+        places.append("")
+        try:
+            return method(context, node)
+        except Exception as problem:
+            return build(_Raising(problem), context, node)
+        finally:
+            places.pop()
+
+    return quick
+
+
+class _Raising:
+    """A builder that meets with a problem, whatever it builds."""
+
+    def __init__(self, problem: Exception) -> None:
+        self._problem = problem
+
+    def __getattr__(self, name: str) -> Callable[..., object]:
+        if not name.startswith("build_"):
+            raise AttributeError(name)
+        return self._raise
+
+    def _raise(self, *_: object) -> object:
+        raise self._problem
+
+
+def _source(search: Callable[..., tuple[list[str], int]], function: Any) -> tuple[list[str], int]:
+    """Lines of a function and the number of the first; `inspect` goes through it token by token to find its end."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    lines = linecache.getlines(code.co_filename) if isinstance(code, CodeType) else []
+    if not isinstance(code, CodeType) or not lines:
+        return search(function)
+    first = code.co_firstlineno - 1
+    margin = _margin(lines[first])
+    end = _last_line(code)
+    # Behind its last expression a function has brackets that close, if anything.
+    while end < len(lines) and lines[end].strip() and _margin(lines[end]) > margin:
+        end += 1
+    return lines[first:end], first + 1
+
+
+def _margin(line: str) -> int:
+    return len(line) - len(line.lstrip())
+
+
+def _last_line(code: CodeType) -> int:
+    """Number of the last line that has code."""
+    inner = [_last_line(constant) for constant in code.co_consts if isinstance(constant, CodeType)]
+    return max([end or 0 for _, end, _, _ in code.co_positions()] + inner)
+
+
+class _Text:
+    """What Taichi uses of `textwrap`."""
+
+    dedent = staticmethod(textwrap.dedent)
+
+    @staticmethod
+    def fill(line: str, **options: Any) -> str:
+        """A line of source that is not to be broken."""
+        if "\t" in line or len(line) > 200:
+            return textwrap.fill(line, **options)
+        return line.rstrip()
+
+
+@functools.cache
+def _range(kind: type) -> tuple[int, int]:
+    info = np.iinfo(kind)
+    return int(info.min), int(info.max)
+
+
+def _in_range(kind: type, value: int) -> bool:
+    least, most = _range(kind)
+    return bool(least <= value <= most)
+
+
+def _uncollected_call(call: Callable[..., object]) -> Callable[..., object]:
+    @functools.wraps(call)
+    def quiet(*args: object, **kwargs: object) -> object:
+        with uncollected():
+            return call(*args, **kwargs)
+
+    return quiet
