@@ -58,8 +58,13 @@ def discard(name: str) -> None:
         return
 
 
-def store_arrays(name: str, arrays: Mapping[str, NDArray[np.generic]]) -> bool:
+def store_arrays(name: str, arrays: Mapping[str, NDArray[np.generic]], *, compressed: bool = True) -> bool:
     """Store arrays under a name, atomically: readers see the old file, the new one or none, never half of one.
+
+    Args:
+        name: file name without suffix.
+        arrays: by name.
+        compressed: small on disk; what hardly gets any smaller is stored in a tenth of the time without.
 
     Returns:
         Whether they were stored. A full or read-only disk costs time on the next run, not this one.
@@ -69,7 +74,7 @@ def store_arrays(name: str, arrays: Mapping[str, NDArray[np.generic]]) -> bool:
         directory = cache_directory()
         with tempfile.NamedTemporaryFile(dir=directory, prefix=f"{name}-", suffix=".tmp", delete=False) as file:
             temporary = Path(file.name)
-            np.savez_compressed(file, **dict(arrays))  # type: ignore[arg-type]
+            (np.savez_compressed if compressed else np.savez)(file, **dict(arrays))  # type: ignore[arg-type]
         temporary.replace(directory / f"{name}.npz")
         return True
     except OSError:

@@ -21,6 +21,13 @@ from sim_engine.vessel.sdf import SignedDistanceGrid
 
 Floats = NDArray[np.float64]
 
+EDITION = 1
+"""Of what `equivalent_distance` computes; raised with any change to it, so that nothing kept from before is used."""
+
+PLACES = 64
+"""So many results of `equivalent_distance` are kept on disk, of about 1 MB each. A new one goes where its digest says,
+in place of what is there: vessels that are drawn anew for each simulation don't fill the disk."""
+
 
 def half_space(q: Floats) -> Floats:
     """∫ W over the half-space beyond a plane at distance q·h (Wendland C2): 1 at q = −1, ½ at 0, 0 at 1."""
@@ -95,6 +102,8 @@ def equivalent_distance(
 ) -> NDArray[np.float32]:
     """Distance of the equivalent plane at the grid's nodes; less than the signed distance in a corner, more at an edge.
 
+    It is kept in the cache directory.
+
     Args:
         grid: signed distance and cavity.
         inside: 1 at nodes in the cavity, continued into the wall up to its middle.
@@ -106,11 +115,45 @@ def equivalent_distance(
         Shape of the grid [m].
     """
     step = grid.spacing
+    if not inside.any() or not (grid.axes()[2] < rim_height - support).any():
+        return grid.values
+    near = _grown(inside > 0)  # only beside the cavity is anything else than the signed distance wanted
+    about = repr((EDITION, np.__version__, grid.shape, step, grid.origin.tolist(), rim_height, support))
+    digest = hashlib.sha256(about.encode() + grid.values.tobytes() + inside.tobytes()).digest()
+    name = f"plane-{digest[0] % PLACES:02}"
+    found = np.ascontiguousarray(grid.values, np.float32).copy()
+    kept = _kept_planes(name, digest, int(near.sum()))
+    if kept is None:
+        kept = _planes(grid, inside, near, rim_height, support)[near]
+        store_arrays(name, {"digest": np.frombuffer(digest, np.uint8), "plane": kept}, compressed=False)
+    found[near] = kept
+    return found
+
+
+def _kept_planes(name: str, digest: bytes, count: int) -> NDArray[np.float32] | None:
+    """What is stored under a name, if it has this digest."""
+    known = load_arrays(name)
+    if known is None or not {"digest", "plane"} <= known.keys() or known["digest"].tobytes() != digest:
+        return None
+    return known["plane"].astype(np.float32) if known["plane"].shape == (count,) else None
+
+
+def _planes(
+    grid: SignedDistanceGrid,
+    inside: NDArray[np.uint8],
+    near: NDArray[np.bool_],
+    rim_height: float,
+    support: float,
+) -> NDArray[np.float32]:
+    """As `equivalent_distance`, worked out, for a vessel that has a cavity below its rim.
+
+    Args:
+        near: nodes in the cavity and beside it.
+    """
+    step = grid.spacing
     reach = int(np.ceil(support / step))
     z = grid.axes()[2]
     weight = np.clip((rim_height - support - z) / support, 0.0, 1.0)
-    if not inside.any() or not weight.any():
-        return grid.values
     depth = np.clip(0.5 - grid.values.astype(np.float64) / step, 0.0, 1.0)
     solid = np.where(inside > 0, depth, 1.0)
     solid[:, :, z > rim_height] = 0.0
@@ -119,8 +162,6 @@ def equivalent_distance(
     u = np.clip(1.0 - r, 0.0, None)
     kernel = u**4 * (1.0 + 4.0 * r)
     kernel /= kernel.sum()
-    near = _grown(inside > 0)
-    # Only beside the cavity is anything else than the signed distance wanted.
     box = tuple(slice(int(where.min()), int(where.max()) + 1) for where in np.nonzero(near))
     padded = np.pad(solid, reach, mode="edge")[tuple(slice(b.start, b.stop + 2 * reach) for b in box)]
     share = np.clip(_convolved(padded, kernel), 0.0, 1.0)

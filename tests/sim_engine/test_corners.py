@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sim_engine.validation.tanks import box, holed_cup
+from sim_engine.vessel import corners
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.corners import equivalent_distance, half_space, inside_mask
 from sim_engine.vessel.spec import cylinder
@@ -89,3 +90,25 @@ def test_what_is_inside_is_kept_and_a_damaged_file_made_anew(tmp_path: Path, mon
         with pytest.raises(ImportError):
             inside_mask(CUP.grid)
     np.testing.assert_array_equal(inside_mask(CUP.grid), MASK)
+
+
+def test_planes_are_kept_by_what_they_depend_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same to the bit from disk; another support, or a damaged file, and they are worked out anew."""
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(corners, "PLACES", 1)  # all of them at the same place
+    cup = build_vessel(cylinder("cup", inner_radius=0.02, inner_height=0.04))
+    inside = inside_mask(cup.grid)
+
+    def planes(support: float) -> bytes:
+        return equivalent_distance(cup.grid, inside, cup.rim_height, support).tobytes()
+
+    first, other = planes(0.005), planes(0.006)
+    assert first != other
+    monkeypatch.setattr(corners, "_planes", None)
+    assert planes(0.006) == other
+    monkeypatch.undo()
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path))
+    (kept,) = tmp_path.glob("plane-00.npz")
+    kept.write_bytes(kept.read_bytes()[:1000])
+    monkeypatch.setattr(corners, "PLACES", 1)
+    assert planes(0.005) == first
