@@ -19,12 +19,24 @@ integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/corners
 import taichi as ti
 
 from sim_engine.fluid.kernels import SIGMA, slope, wall_density, wall_slope, weight
+from sim_engine.fluid.neighbours import measure_pairs
 from sim_engine.fluid.state import SUPPORT, VESSELS
-from sim_engine.fluid.vectors import length, square
+from sim_engine.fluid.vectors import square
 
 PACKING = 1.012
 """Kernel sum of bulk liquid of spacing d over its continuum value, measured on a cup at rest: with it the density there
 is 1.00, the compression that the iterations leave included."""
+
+
+@ti.func
+def weigh_pairs(f: ti.template(), s, inv_h):
+    """The kernel and its slope of all listed pairs. Roots and polynomials of pairs that lie side by side in the lists
+    are taken eight at a time, apart from reading positions here and there."""
+    measure_pairs(f, s)
+    for k in range(f.list_begin[s], f.list_end[s]):
+        u = ti.max(1.0 - ti.sqrt(f.pair[k]) * inv_h, 0.0)
+        f.share[k] = weight(u)
+        f.pair[k] = slope(u)
 
 
 @ti.func
@@ -36,19 +48,16 @@ def measure_first(f: ti.template(), s):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.density[i] = 1.0  # W(0) of the particle itself
         f.sums[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    weigh_pairs(f, s, inv_h)
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x[i]
         rho = ti.cast(0.0, ti.f32)
         sums = ti.Vector([0.0, 0.0, 0.0, 0.0])
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
-            r = xi - f.x[j]
-            r2 = square(r)
-            u = ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0)
-            w = weight(u)
-            g = slope(u)
-            f.pair[k] = g
-            lean = ti.Vector([g * r[0], g * r[1], g * r[2], g * g * r2])
+            w = f.share[k]
+            m = f.pair[k] * (xi - f.x[j])
+            lean = ti.Vector([m[0], m[1], m[2], square(m)])
             rho += w
             sums += lean
             f.density[j] = f.density[j] + w
@@ -71,14 +80,12 @@ def measure(f: ti.template(), s):
     inv_h = 1.0 / (SUPPORT * f.spacing[s])
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.density[i] = 1.0
+    weigh_pairs(f, s, inv_h)
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        xi = f.x[i]
         rho = ti.cast(0.0, ti.f32)
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
-            u = ti.max(1.0 - length(xi - f.x[j]) * inv_h, 0.0)
-            w = weight(u)
-            f.pair[k] = slope(u)
+            w = f.share[k]
             rho += w
             f.density[j] = f.density[j] + w
         f.density[i] = f.density[i] + rho

@@ -99,6 +99,7 @@ class FluidEngine:
                     "grid_size": [walls.grid.values.shape for walls in both],
                     "grid_origin": [walls.grid.origin for walls in both],
                     "grid_spacing": [walls.grid.spacing for walls in both],
+                    "arm": setup.pourer.grid.reach,
                     "wall": [walls.thickness for walls in both],
                     "rim": [walls.rim for walls in both],
                     "origin": origins,

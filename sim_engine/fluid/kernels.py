@@ -28,6 +28,20 @@ def slope(u: ti.f32) -> ti.f32:
 
 
 @ti.func
+def decayed(x: ti.f32) -> ti.f32:
+    """1 − exp(−x) for x ≥ 0, to 1e-6: (Padé's [3/3] of e^(−x/16))^16. The library's exp takes one number at a time."""
+    y = ti.min(x, 16.0) / 16.0
+    y2 = y * y
+    even, odd = 1.0 + 0.1 * y2, y * (0.5 + y2 / 120.0)
+    e = (even - odd) / (even + odd)
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    return 1.0 - e
+
+
+@ti.func
 def wall_density(q: ti.f32) -> ti.f32:
     """∫ W over the half-space beyond a plane at distance q·h: 1 up to q = −1, ½ at q = 0, 0 from q = 1 on."""
     u = ti.max(1.0 - ti.abs(q), 0.0)
@@ -47,16 +61,16 @@ def wall_slope(q: ti.f32) -> ti.f32:
 
 @ti.func
 def attraction(u: ti.f32) -> ti.f32:
-    """Shape of the cohesive force over u = max(1 − q, 0): 1 at its peak q = ½, 0 at q = 0 and from 1 on."""
-    w = u * (1.0 - u)
-    return 64.0 * w * w * w
+    """The cohesive force over q from u = max(1 − q, 0), as a vector over r/h: its size is 64 (u q)³, 1 at its peak
+    q = ½ and 0 at q = 0 and from 1 on."""
+    q = 1.0 - u
+    return 64.0 * u * u * u * q * q
 
 
 @ti.func
-def attraction_slope(u: ti.f32) -> ti.f32:
-    """d(attraction)/dq."""
-    w = u * (1.0 - u)
-    return 192.0 * w * w * (2.0 * u - 1.0)
+def attraction_turn(u: ti.f32) -> ti.f32:
+    """(d(size)/dq − size/q) / q² of that force: what its change along r has beside its change across."""
+    return 64.0 * u * u * (5.0 * u - 3.0)
 
 
 @ti.func

@@ -36,25 +36,44 @@ def cover(f: ti.template(), s, reach):
 
 
 @ti.func
+def begin_cells(f: ti.template(), table, cells, begin):
+    """From how many are in each cell to where it begins, `begin` being the first; one more cell than there are."""
+    run = begin
+    for c in range(table, table + cells + 1):
+        count = f.cell_start[c]
+        f.cell_start[c] = run
+        run += count
+
+
+@ti.func
 def rebuild(f: ti.template(), s, skin):
     """Sort the moving particles by cell, put the others last, and list all pairs within h + skin·d, each once."""
-    d = f.spacing[s]
-    reach = (SUPPORT + skin) * d
+    reach = (SUPPORT + skin) * f.spacing[s]
+    low, edge, size = sort(f, s, reach)
+    list_pairs(f, s, reach, low, edge, size)
+
+
+@ti.func
+def sort(f: ti.template(), s, reach):
+    """Put particles in the order of their cells, and those that move no more last.
+
+    Returns:
+        As `cover`. After it cell_start[c] is where cell c ends, so that it begins at cell_start[c − 1].
+    """
     begin = f.begin[s]
     end = begin + f.moving[s]
     table = f.cells_begin[s]
     low, edge, size = cover(f, s, reach)
     cells = size[0] * size[1] * size[2]
-    for c in range(table, table + cells + 2):
+    for c in range(table, table + cells + 1):
         f.cell_start[c] = 0
-    f.cell_start[table] = begin
     for i in range(begin, end):
         c = table + cells
         if f.home[i] < SPILLED:
             q = ti.cast((f.x[i] - low) / edge, ti.i32)
             c = table + (q[0] * size[1] + q[1]) * size[2] + q[2]
         f.cell[i] = c
-        f.cell_start[c + 1] = f.cell_start[c + 1] + 1
+        f.cell_start[c] = f.cell_start[c] + 1
         f.x_copy[i] = f.x[i]
         f.v_copy[i] = f.v[i]
         f.dx[i] = f.x0[i]
@@ -62,8 +81,7 @@ def rebuild(f: ti.template(), s, skin):
         f.home_copy[i] = f.home[i]
         f.sag_copy[i] = f.sag[i]
         f.name_copy[i] = f.name[i]
-    for c in range(table, table + cells + 1):
-        f.cell_start[c + 1] = f.cell_start[c + 1] + f.cell_start[c]
+    begin_cells(f, table, cells, begin)
     f.moving[s] = f.cell_start[table + cells] - begin
     for i in range(begin, end):
         c = f.cell[i]
@@ -77,7 +95,14 @@ def rebuild(f: ti.template(), s, skin):
         f.home[k] = f.home_copy[i]
         f.sag[k] = f.sag_copy[i]
         f.name[k] = f.name_copy[i]
-    # After the scatter cell_start[c] is where cell c ends, so that it begins at cell_start[c − 1].
+    return low, edge, size
+
+
+@ti.func
+def list_pairs(f: ti.template(), s, reach, low, edge, size):
+    """List all pairs within `reach`, each at the one that comes first."""
+    begin = f.begin[s]
+    table = f.cells_begin[s]
     entries = f.list_begin[s]
     last = f.list_begin[s] + f.particles[s] * NEIGHBOURS
     reach2 = reach * reach
@@ -109,64 +134,15 @@ def rebuild(f: ti.template(), s, skin):
         if entries > last:
             f.fault[s] = 1
             entries = f.list_begin[s]
+    f.list_end[s] = entries
     f.rebuilds[s] += 1
     f.stale[s] = 0
 
 
 @ti.func
-def list_widely(f: ti.template(), s, reach):
-    """List all pairs within `reach`, each once, without sorting particles.
-
-    The next step makes the usual lists again.
-    """
-    begin = f.begin[s]
-    end = begin + f.moving[s]
-    table = f.cells_begin[s]
-    low, edge, size = cover(f, s, reach)
-    cells = size[0] * size[1] * size[2]
-    for c in range(table, table + cells + 1):
-        f.cell_start[c] = 0
-    f.cell_start[table] = begin
-    for i in range(begin, end):
-        q = ti.cast((f.x[i] - low) / edge, ti.i32)
-        c = table + (q[0] * size[1] + q[1]) * size[2] + q[2]
-        f.cell[i] = c
-        f.cell_start[c + 1] = f.cell_start[c + 1] + 1
-    for c in range(table, table + cells):
-        f.cell_start[c + 1] = f.cell_start[c + 1] + f.cell_start[c]
-    for i in range(begin, end):
-        c = f.cell[i]
-        k = f.cell_start[c]
-        f.cell_start[c] = k + 1
-        f.ranked[k] = i
-        f.x_copy[k] = f.x[i]
-    entries = f.list_begin[s]
-    last = f.list_begin[s] + f.particles[s] * NEIGHBOURS
-    reach2 = reach * reach
-    for rank in range(begin, end):
-        i = f.ranked[rank]
+def measure_pairs(f: ti.template(), s):
+    """Distances of all listed pairs, squared, to `pair`."""
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x[i]
-        q = ti.cast((xi - low) / edge, ti.i32)
-        f.first[i] = entries
-        c0 = ti.max(ti.cast((xi[2] - low[2] - reach) / edge[2], ti.i32), 0)
-        c1 = ti.min(ti.cast((xi[2] - low[2] + reach) / edge[2], ti.i32), size[2] - 1)
-        for a in range(q[0], ti.min(q[0] + 2, size[0])):
-            b0 = q[1]
-            if a > q[0]:
-                b0 = ti.max(q[1] - 1, 0)
-            for b in range(b0, ti.min(q[1] + 2, size[1])):
-                column = table + (a * size[1] + b) * size[2]
-                k0 = rank + 1
-                if a != q[0] or b != q[1]:
-                    k0 = begin
-                    if column + c0 > table:
-                        k0 = f.cell_start[column + c0 - 1]
-                for k in range(k0, f.cell_start[column + c1]):
-                    r = xi - f.x_copy[k]
-                    f.neighbour[entries] = f.ranked[k]
-                    entries += ti.cast(square(r) < reach2, ti.i32)
-        f.count[i] = entries - f.first[i]
-        if entries > last:
-            f.fault[s] = 1
-            entries = f.list_begin[s]
-    f.stale[s] = 1
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            f.pair[k] = square(xi - f.x[f.neighbour[k]])

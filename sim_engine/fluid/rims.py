@@ -40,9 +40,10 @@ def lower_rims(f: ti.template(), s, dt, thick: ti.template()):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         for b in range(VESSELS):
             if f.phi[i][b] < NEAR * d:
-                y = to_vessel(f, s, b, f.x[i], False)
-                carried = turned(f.turn[s, b], y) + f.origin[s, b] - turned(f.turn0[s, b], y) - f.origin0[s, b]
-                u = f.v[i] - carried / dt
+                u = f.v[i]
+                if f.swing[s, b] > 0.0:
+                    y = to_vessel(f, s, b, f.x[i], False)
+                    u -= (turned(f.turn[s, b], y) + f.origin[s, b] - turned(f.turn0[s, b], y) - f.origin0[s, b]) / dt
                 film = square(u) / gravity
                 if ti.static(thick):
                     film = ti.max(film, ti.sqrt(3.0 * f.kinematic[s] * length(u) / gravity))

@@ -16,7 +16,13 @@ VESSELS = 2
 """Pourer (0) and receiver (1)."""
 
 NEIGHBOURS = 72
-"""Entries in the half lists per particle of a scene; about 18 are used, and 45 by cohesion, which reaches farther."""
+"""Entries in the half lists per particle of a scene; about 18 are used."""
+
+EIGHT = 8
+"""So many numbers the processor takes at a time."""
+
+STRETCHES = 5
+"""A seat's own column and four behind it."""
 
 LIST_RESERVE = 2_000
 """Entries that one particle may add before the overflow check sees them; far above any packing."""
@@ -41,13 +47,17 @@ class FluidState:
         push: normal displacement given by each wall in this step [m].
         sag: how much lower each vessel's rim is for this particle [m], see `rims.py`.
         home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
-        cell, ranked: in which cell a particle is; particles in the order of cells, where they are not sorted.
+        cell: in which cell a particle is.
+        seated, seat, stretch: of `columns.py`: the particle in a seat, where it is in units of the reach, and among
+            whom its pairs are sought: from the first seat up to the one before the second, `STRETCHES` times a seat.
+        bonds, missing, lean, pulled: of cohesion, by seat, see `tension.py`.
         gradient, squares: of a pass over pairs, a vector and a number; of the density, what the constraint's gradients
             amount to, Σ|∇C|².
         sums: Σ∇W and Σ|∇W|² of the neighbours, without their common factor.
         place, move: position and scaled change of the multiplier; displacement [m], whose fourth means nothing.
         first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
-        pair: the kernel's slope between the two of a pair, where they were when the density was measured last.
+        pair, share: of each pair in the lists; numbers that lie side by side are worked out eight at a time. Of the
+            density, pair is the kernel's slope between the two, where they were when it was measured last.
     """
 
     def __init__(self, scenes: int, pool: int) -> None:
@@ -67,18 +77,26 @@ class FluidState:
         self.push = ti.Vector.field(VESSELS, ti.f32, shape=pool)
         self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=pool)
         self.home, self.home_copy, self.name, self.name_copy = (scalars(ti.i32) for _ in range(4))
-        self.cell, self.ranked = (scalars(ti.i32) for _ in range(2))
+        self.cell = scalars(ti.i32)
         self.gradient, self.squares = vectors(), scalars()
         self.sums, self.place, self.move = (ti.Vector.field(4, ti.f32, shape=pool) for _ in range(3))
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
         entries = pool * NEIGHBOURS + scenes * LIST_RESERVE
-        self.neighbour, self.pair = ti.field(ti.i32, shape=entries), ti.field(ti.f32, shape=entries)
+        self.neighbour = ti.field(ti.i32, shape=entries)
+        self.pair, self.share = (ti.field(ti.f32, shape=entries) for _ in range(2))
+        seats = pool + EIGHT * scenes
+        self.seated = ti.field(ti.i32, shape=seats)
+        self.stretch = ti.Vector.field(2, ti.i32, shape=seats * STRETCHES)
+        apart = ti.Layout.SOA  # each coordinate of all seats side by side
+        self.seat, self.lean, self.pulled = (ti.Vector.field(3, ti.f32, shape=seats, layout=apart) for _ in range(3))
+        self.bonds, self.missing = (ti.field(ti.f32, shape=seats) for _ in range(2))
         self.cell_start = ti.field(ti.i32, shape=pool * CELLS + scenes * (LEAST_CELLS + 2))
 
         arrays = set(vars(self))
         # Per scene: its place in the pools …
         self.begin = ti.field(ti.i32, shape=scenes)
         self.list_begin = ti.field(ti.i32, shape=scenes)
+        self.list_end = ti.field(ti.i32, shape=scenes)  # of the lists there are
         self.cells_begin = ti.field(ti.i32, shape=scenes)
         self.cells = ti.field(ti.i32, shape=scenes)
         # … constants of the liquid …
@@ -109,6 +127,7 @@ class FluidState:
         # … and what changes with time.
         self.time = ti.field(ti.f64, shape=scenes)
         self.dt = ti.field(ti.f32, shape=scenes)
+        self.fastest = ti.field(ti.f32, shape=scenes)  # speed of the fastest moving particle [m/s]
         self.waited = ti.field(ti.f32, shape=scenes)  # since viscosity acted [s]
         self.pull_waited = ti.field(ti.f32, shape=scenes)  # … and cohesion [s]
         self.open = ti.field(ti.i32, shape=scenes)  # 1: a step has begun, and waits for cohesion
@@ -126,6 +145,7 @@ class FluidState:
         self.grid_origin = ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS))
         self.grid_spacing = ti.field(ti.f32, shape=(scenes, VESSELS))
         self.plane_offset = ti.field(ti.i32, shape=(scenes, VESSELS))  # … of equivalent distances, same size
+        self.arm = ti.field(ti.f32, shape=scenes)  # farthest that the pourer's grid reaches from its origin [m]
         self.swing = ti.field(ti.f32, shape=(scenes, VESSELS))  # farthest that they carry a point in this step [m]
         self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]

@@ -40,8 +40,6 @@ liquid, and half as long again: every pass over them paid for it."""
 SMOOTHEST, ROUGHEST = 0.7, 3.7
 """Eigenvalues of the iteration matrix between which Chebyshev's polynomials damp: ROUGHEST is the largest that occurs
 (dense packing, h = 2.2 d); a smaller SMOOTHEST gives longer strides, and noise at rest."""
-SWING_ARM = 0.5
-"""Liquid is never farther from the pourer's origin than this [m]."""
 CONTACT = 0.2
 """Particles' centres keep that many spacings from solid; the density constraint keeps about half a spacing."""
 WARM = 0.3
@@ -69,6 +67,16 @@ def rotation(q):
     )
 
 
+@ti.func
+def received(f: ti.template(), cavities: ti.template(), s, x):
+    """1 if a point of the world lies in the receiver, or up to half a spacing above."""
+    y = to_vessel(f, s, 1, x, False)
+    inside = in_cavity(f, cavities, s, 1, y)
+    if inside == 0:
+        inside = in_cavity(f, cavities, s, 1, y - ti.Vector([0.0, 0.0, 0.5 * f.spacing[s]]))
+    return inside
+
+
 @ti.data_oriented
 class Stepper:
     """The solver's algorithm on a `FluidState`."""
@@ -91,15 +99,6 @@ class Stepper:
         q = ti.Vector([row[3], row[4], row[5], row[6]]).normalized()
         f.origin[s, 0] = ti.Vector([row[0], row[1], row[2]])
         f.turn[s, 0] = rotation(q)
-
-    @ti.func
-    def top_speed(self, s):
-        """Top speed of the moving particles [m/s]."""
-        f = self.state
-        fastest = ti.cast(0.0, ti.f32)
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            fastest = ti.max(fastest, square(f.v[i]))
-        return ti.sqrt(fastest)
 
     @ti.func
     def predict(self, s, dt, grids: ti.template(), thick: ti.template()):
@@ -256,21 +255,22 @@ class Stepper:
 
     @ti.func
     def classify(self, s, cavities: ti.template()):
-        """Where every moving particle is now. Half a spacing above its opening plane still belongs to the receiver."""
+        """Where every moving particle is now, and how fast the fastest one.
+
+        Half a spacing above its opening plane still belongs to the receiver.
+        """
         f = self.state
-        lift = ti.Vector([0.0, 0.0, 0.5 * f.spacing[s]])
         compressed = ti.cast(0.0, ti.f32)
+        fastest = ti.cast(0.0, ti.f32)
         inside = 0
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            fastest = ti.max(fastest, square(f.v[i]))
             if f.home[i] != ESCAPED:
                 x = f.x[i]
                 home = IN_FLIGHT
                 if f.phi[i][0] < FAR and in_cavity(f, cavities, s, 0, to_vessel(f, s, 0, x, False)) == 1:
                     home = IN_POURER
-                elif f.phi[i][1] < FAR and (
-                    in_cavity(f, cavities, s, 1, to_vessel(f, s, 1, x, False) - lift) == 1
-                    or in_cavity(f, cavities, s, 1, to_vessel(f, s, 1, x, False)) == 1
-                ):
+                elif f.phi[i][1] < FAR and received(f, cavities, s, x) == 1:
                     home = RECEIVED
                 elif x[2] < f.spill_level[s]:
                     home = SPILLED
@@ -279,6 +279,7 @@ class Stepper:
                 if f.density[i] > 0.95:
                     inside += 1
                     compressed += ti.max(f.density[i] - 1.0, 0.0)
+        f.fastest[s] = ti.sqrt(fastest)
         if inside > 0:
             f.compression[s] += compressed / inside
 
@@ -305,9 +306,8 @@ class Stepper:
     ):
         """One time step of one scene, up to cohesion, which has a kernel of its own: `conclude` does the rest."""
         f = self.state
-        fastest = self.top_speed(s)
         longest = ti.min(f.longest_step[s], PACE * ti.sqrt(f.spacing[s] / ti.max(f.gravity[s], 1e-3)))
-        dt = ti.min(ti.max(CFL * f.spacing[s] / (fastest + 1e-6), SHORTEST_STEP), longest)
+        dt = ti.min(ti.max(CFL * f.spacing[s] / (f.fastest[s] + 1e-6), SHORTEST_STEP), longest)
         if ti.static(thick):
             dt = ti.max(ti.min(dt, STIFFEST * f.spacing[s] ** 2 / f.kinematic[s]), SHORTEST_STEP)
         ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)
@@ -316,9 +316,10 @@ class Stepper:
         f.turn0[s, 0] = f.turn[s, 0]
         f.time[s] += dt
         self.place_pourer(s, f.time[s], poses)
-        # No point within SWING_ARM of the pourer's origin is carried farther than this in the step.
+        # No point of the pourer's grid is carried farther than this in the step: a difference of two rotations
+        # stretches nothing by more than 1/√2 of its Frobenius norm.
         turned = f.turn[s, 0] - f.turn0[s, 0]
-        f.swing[s, 0] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * SWING_ARM
+        f.swing[s, 0] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * (f.arm[s] / ti.sqrt(2.0))
         if ti.static(thick):
             flow(f, s, dt)
         self.predict(s, dt, grids, thick)

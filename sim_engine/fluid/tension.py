@@ -22,24 +22,24 @@ Source: ours; total variation as interfacial energy: Modica 1987; forces as exac
 
 import taichi as ti
 
+from sim_engine.fluid.columns import in_eights, take_seats
 from sim_engine.fluid.kernels import (
     BULK_BOND,
     HALF_ATTRACTION,
     attraction,
-    attraction_slope,
+    attraction_turn,
     bond,
     wall_attraction,
     wall_bond,
 )
-from sim_engine.fluid.neighbours import list_widely
-from sim_engine.fluid.state import VESSELS
+from sim_engine.fluid.state import STRETCHES, VESSELS
 from sim_engine.fluid.strength import RANGE
 from sim_engine.fluid.vectors import dot, length
 
 ALONE = 3.0
 """Weight of the bonds that are missing. At 1 drops lose their density, at 2 and range 2.8 oscillations decay faster."""
 CALM = 0.1
-"""So much attraction is left over by the disorder of the bulk: pairs of such particles are passed by."""
+"""So much attraction is left over by the disorder of the bulk, which is no surface."""
 BLUNT = 0.3
 """Rounds the energy off towards the bulk; the sharper, the shorter the intervals at which forces must act."""
 BONDED = 0.9
@@ -52,11 +52,14 @@ PLANE = HALF_ATTRACTION * RANGE**3
 
 
 @ti.func
-def pull(f: ti.template(), s, dt):
-    """Change all velocities by cohesion over dt. Leaves lists that reach farther than the other passes want."""
-    inv_h = 1.0 / (RANGE * f.spacing[s])
-    list_widely(f, s, RANGE * f.spacing[s])
-    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+def look_at_surface(f: ti.template(), s, seats, behind, inv_h):
+    """Sums over pairs, from which follows what each particle has of the surface.
+
+    Leaves the energy's derivatives by the two sums: by the one over attractions in `lean`, by the one over bonds, which
+    is negative and kept without its sign, in `missing`.
+    """
+    for k in range(seats, behind):
+        i = f.seated[k]
         bonds = ti.cast(0.0, ti.f32)
         lean = ti.Vector([0.0, 0.0, 0.0])
         for b in ti.static(range(VESSELS)):
@@ -65,66 +68,70 @@ def pull(f: ti.template(), s, dt):
                 bonds += RANGE**3 * wall_bond(u)
                 n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                 lean += RANGE**3 * wall_attraction(u) * n
-        f.squares[i] = bonds
-        f.gradient[i] = lean
-        f.dv[i] = ti.Vector([0.0, 0.0, 0.0])
-    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        xi = f.x[i]
+        f.bonds[k] = bonds
+        f.lean[k] = lean
+    for k in range(seats, behind):
+        x = f.seat[k]
         bonds = ti.cast(0.0, ti.f32)
         lean = ti.Vector([0.0, 0.0, 0.0])
-        for k in range(f.first[i], f.first[i] + f.count[i]):
-            j = f.neighbour[k]
-            r = (xi - f.x[j]) * inv_h
-            q = length(r) + 1e-9
-            u = ti.max(1.0 - q, 0.0)
-            w = bond(u)
-            g = (attraction(u) / q) * r
-            bonds += w
-            lean += g
-            f.squares[j] = f.squares[j] + w
-            f.gradient[j] = f.gradient[j] - g
-        f.squares[i] = f.squares[i] + bonds
-        f.gradient[i] = f.gradient[i] + lean
-    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        lean = f.gradient[i] / PLANE
+        for c in range(k * STRETCHES, (k + 1) * STRETCHES):
+            first, last = f.stretch[c][0], f.stretch[c][1]
+            for j in range(first, first + in_eights(last - first)):
+                r = x - f.seat[j]
+                u = ti.select(j < last, ti.max(1.0 - length(r), 0.0), 0.0)
+                w = bond(u)
+                g = attraction(u) * r
+                bonds += w
+                lean += g
+                f.bonds[j] = f.bonds[j] + w
+                f.lean[j] = f.lean[j] - g
+        f.bonds[k] = f.bonds[k] + bonds
+        f.lean[k] = f.lean[k] + lean
+    for k in range(seats, behind):
+        lean = f.lean[k] / PLANE
         size = length(lean) + 1e-9
         g = ti.max(size - CALM, 0.0)
-        lacking = ti.max(BONDED - f.squares[i] / WHOLE, 0.0)
+        lacking = ti.max(BONDED - f.bonds[k] / WHOLE, 0.0)
         energy = ti.sqrt(g * g + (ALONE * lacking) ** 2 + BLUNT**2)
-        # Derivatives of the energy by the two sums; the second one is negative, and kept without its sign.
-        f.gradient[i] = (g / (size * PLANE * energy)) * lean
-        f.dp[i] = ALONE**2 * lacking / (WHOLE * energy)
-        f.squares[i] = g + lacking
-    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        xi = f.x[i]
-        gi = f.gradient[i]
-        pi = f.dp[i]
+        f.lean[k] = (g / (size * PLANE * energy)) * lean
+        f.missing[k] = ALONE**2 * lacking / (WHOLE * energy)
+        f.pulled[k] = ti.Vector([0.0, 0.0, 0.0])
+
+
+@ti.func
+def pull(f: ti.template(), s, dt):
+    """Change all velocities by cohesion over dt."""
+    inv_h = 1.0 / (RANGE * f.spacing[s])
+    seats, behind = take_seats(f, s, RANGE * f.spacing[s])
+    look_at_surface(f, s, seats, behind, inv_h)
+    for k in range(seats, behind):
+        x = f.seat[k]
+        lean = f.lean[k]
+        missing = f.missing[k]
         force = ti.Vector([0.0, 0.0, 0.0])
-        calm = f.squares[i] == 0.0
-        for k in range(f.first[i], f.first[i] + f.count[i]):
-            j = f.neighbour[k]
-            if calm and f.squares[j] == 0.0:
-                continue
-            r = (xi - f.x[j]) * inv_h
-            q = length(r) + 1e-9
-            u = ti.max(1.0 - q, 0.0)
-            e = r / q
-            g = gi - f.gradient[j]
-            across = attraction(u) / q
-            along = (attraction_slope(u) - across) * dot(g, e) + (pi + f.dp[j]) * attraction(u)
-            pair = across * g + along * e
-            force += pair
-            f.dv[j] = f.dv[j] + pair
-        f.dv[i] = f.dv[i] - force
+        for c in range(k * STRETCHES, (k + 1) * STRETCHES):
+            first, last = f.stretch[c][0], f.stretch[c][1]
+            for j in range(first, first + in_eights(last - first)):
+                r = x - f.seat[j]
+                u = ti.select(j < last, ti.max(1.0 - length(r), 0.0), 0.0)
+                g = lean - f.lean[j]
+                across = attraction(u)
+                along = attraction_turn(u) * dot(g, r) + (missing + f.missing[j]) * across
+                pair = across * g + along * r
+                force += pair
+                f.pulled[j] = f.pulled[j] + pair
+        f.pulled[k] = f.pulled[k] - force
     if f.adhesion[s] != 0.0:
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        for k in range(seats, behind):
+            i = f.seated[k]
             for b in ti.static(range(VESSELS)):
                 u = ti.min(1.0 - f.phi[i][b] * inv_h, 1.0)
                 if u > 0.0:
                     n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
-                    f.dv[i] = f.dv[i] - f.adhesion[s] * wall_attraction(u) * n
+                    f.pulled[k] = f.pulled[k] - f.adhesion[s] * wall_attraction(u) * n
     strength = f.cohesion[s] * dt
     bound = LARGEST_PULL * f.spacing[s] / dt
-    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        change = strength * f.dv[i]
+    for k in range(seats, behind):
+        i = f.seated[k]
+        change = strength * f.pulled[k]
         f.v[i] = f.v[i] + ti.min(1.0, bound / (length(change) + 1e-9)) * change

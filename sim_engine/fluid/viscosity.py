@@ -14,9 +14,9 @@ Source: Schechter & Bridson 2012 (XSPH); Smagorinsky 1963, Lilly 1967; with part
 
 import taichi as ti
 
-from sim_engine.fluid.kernels import weight
+from sim_engine.fluid.kernels import decayed, weight
 from sim_engine.fluid.state import SUPPORT
-from sim_engine.fluid.vectors import dot, length, square
+from sim_engine.fluid.vectors import dot, square
 
 
 @ti.func
@@ -28,17 +28,25 @@ def relax(f: ti.template(), s, dt):
         f.dx[i] = ti.Vector([0.0, 0.0, 0.0])  # drift towards the neighbours' velocities
         f.squares[i] = 0.0
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        xi = f.x[i]
+        xi, vi = f.x[i], f.v[i]
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            r = xi - f.x[f.neighbour[k]]
+            f.pair[k] = square(r)
+            f.share[k] = ti.abs(dot(f.v[f.neighbour[k]] - vi, r))
+    for k in range(f.list_begin[s], f.list_end[s]):
+        r2 = f.pair[k]
+        w = weight(ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0))
+        parting = f.share[k] / (r2 + closest)
+        f.share[k] = w
+        f.pair[k] = w * decayed((f.viscosity[s] + f.eddies[s] * parting) * dt)
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         vi = f.v[i]
         drift = ti.Vector([0.0, 0.0, 0.0])
         total = ti.cast(0.0, ti.f32)
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
-            r = xi - f.x[j]
-            w = weight(ti.max(1.0 - length(r) * inv_h, 0.0))
-            u = f.v[j] - vi
-            parting = ti.abs(dot(u, r)) / (square(r) + closest)
-            towards = w * (1.0 - ti.exp(-(f.viscosity[s] + f.eddies[s] * parting) * dt)) * u
+            w = f.share[k]
+            towards = f.pair[k] * (f.v[j] - vi)
             total += w
             drift += towards
             f.squares[j] = f.squares[j] + w

@@ -138,38 +138,55 @@ def in_cavity(f: ti.template(), cavities: ti.template(), s, b, y):
 def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin, sag):
     """Where a particle ends that wants to go from y0 to y1 (vessel frame): y1, or slid along the wall it meets.
 
-    Sphere tracing, first along the way, then along what is left of it in the wall's tangent plane: |∇φ| ≤ 1, so that
-    strides of φ − skin never enter solid.
+    |∇φ| ≤ STRETCH, so that around each place there is a ball without solid. Where the balls around both ends cover the
+    way, as they do for what lies on a wall or runs along it, nothing is in between, and the end is set off the wall as
+    far as it has to be. Else the way is traced, first along itself, then along what is left of it in the wall's tangent
+    plane, in strides that never enter solid.
 
     Args:
         skin: distance kept from solid [m]; less where the particle is already closer.
     """
     y = y0
     way = y1 - y0
+    left = length(way)
     clear = skin
+    begun = ti.cast(0.0, ti.f32)
+    place = y0
+    looks = 0
     leg = 0
-    stride = 0
     while leg < 2:
-        left = length(way)
-        phi = distance(f, grids, s, b, y, sag)
-        if stride == 0:
+        look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, place, sag)
+        n = ti.Vector([look[0], look[1], look[2]])
+        phi = look[3]
+        if looks == 0:
+            begun = phi
             clear = ti.min(clear, 0.9 / STRETCH * ti.max(phi, 0.0))
-        free = phi / STRETCH - clear
-        if left <= free or left < 1e-9:
-            y += way
-            leg = 2
-        elif free < 1e-5 or stride >= TRACE_STEPS:
-            if leg == 0:
-                look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, sag)
-                n = ti.Vector([look[0], look[1], look[2]])
-                way -= ti.min(dot(way, n), 0.0) * n
-            clear *= 0.5
-            stride = 1
-            leg += 1
+            place = y1
+            if left <= phi / STRETCH - clear or left < 1e-9:
+                y = y1
+                leg = 2
+        elif looks == 1:
+            place = y0
+            if phi > 0.0 and begun + phi >= STRETCH * left:
+                y = y1 + ti.max(clear - phi, 0.0) * n
+                leg = 2
         else:
-            y += way * (free / left)
-            way *= 1.0 - free / left
-            stride += 1
+            free = phi / STRETCH - clear
+            if left <= free or left < 1e-9:
+                y += way
+                leg = 2
+            elif free < 1e-5 or looks > TRACE_STEPS:
+                if leg == 0:
+                    way -= ti.min(dot(way, n), 0.0) * n
+                clear *= 0.5
+                looks = 1
+                leg += 1
+            else:
+                y += way * (free / left)
+                way *= 1.0 - free / left
+            left = length(way)
+            place = y
+        looks += 1
     return y
 
 
@@ -178,9 +195,16 @@ def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1, sag):
     """1 if a straight step in the vessel frame goes through the middle of a wall. Samples, apart from the sweep."""
     way = y1 - y0
     far = length(way)
+    gone = ti.cast(0.0, ti.f32)
     hit = 0
-    samples = ti.min(ti.cast(far / (0.25 * f.wall[s, b]), ti.i32) + 2, 64)
-    for k in range(samples + 1):
-        if distance(f, grids, s, b, y0 + way * (k / samples), sag) < -0.35 * f.wall[s, b]:
+    looks = 0
+    while looks < 64:
+        phi = distance(f, grids, s, b, y0 + way * (gone / (far + 1e-12)), sag)
+        looks += 1
+        if phi < -0.35 * f.wall[s, b]:
             hit = 1
+            looks = 64
+        if gone >= far:
+            looks = 64
+        gone = ti.min(gone + ti.max(phi / STRETCH, ti.max(0.25 * f.wall[s, b], far / 48.0)), far)
     return hit

@@ -67,15 +67,26 @@ class Landing:
         return np.array([np.median(part) for part in np.array_split(self.away, PARTS)])
 
 
-def landing(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seed: int = 1) -> Landing:
+def landing(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seeds: int = 1) -> Landing:
     """Let a jet fall past a receiver that has been set aside.
 
     Args:
         simulator: of this process.
         speed: of the turn [deg/s].
         parameters: θ.
-        seed: of the initial positions.
+        seeds: so many pours, from other initial positions each, are taken together.
     """
+    pours = [_of_one(simulator, speed, parameters, seed) for seed in range(1, seeds + 1)]
+    times = np.concatenate([pour.times for pour in pours])
+    order = np.argsort(times, kind="stable")
+    away, aside, fast = (
+        np.concatenate([getattr(pour, name) for pour in pours])[order] for name in ("away", "aside", "speed")
+    )
+    return Landing(times[order], away, aside, fast)
+
+
+def _of_one(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seed: int) -> Landing:
+    """Of one pour; by frame, not in the order of time."""
     pour = Pour(CONE, speed, DISTANCE)
     scene = Scene("landing", POURER, CONE, Liquid(mass=0.1996))
     task = PourTask(scene, pour.action(FALL), parameters, seed, record_rate=50.0, pose_error=PoseError(y=ASIDE))
@@ -92,12 +103,11 @@ def landing(simulator: PourSimulator, speed: float, parameters: SimulationParame
     t = np.clip((w + np.sqrt(w**2 + 2.0 * GRAVITY * (a[:, 2] - level))) / GRAVITY, 0.0, span)
     u = (b - a) / span[:, None]
     away = a[:, 0] + u[:, 0] * t + 1e-3 * DISTANCE
-    order = np.argsort(frames.times[frame] + t)
-    return Landing((frames.times[frame] + t)[order], away[order], (a[:, 1] + u[:, 1] * t)[order], u[order, 0])
+    return Landing(frames.times[frame] + t, away, a[:, 1] + u[:, 1] * t, u[:, 0])
 
 
 def compared(
-    simulator: PourSimulator, numbers: tuple[int, ...], finest: int, parameters: SimulationParameters
+    simulator: PourSimulator, numbers: tuple[int, ...], finest: int, parameters: SimulationParameters, seeds: int = 1
 ) -> tuple[list[Measurement], Figure]:
     """Landing at some resolutions against that of the finest.
 
@@ -106,12 +116,14 @@ def compared(
         numbers: of particles.
         finest: number of particles of the reference.
         parameters: θ; its number of particles is replaced.
+        seeds: so many pours of each are taken together.
     """
     measurements: list[Measurement] = []
     curves: list[Series] = []
     for panel, speed in enumerate(SPEEDS):
         found = {
-            n: landing(simulator, speed, parameters.model_copy(update={"particles": n})) for n in (*numbers, finest)
+            n: landing(simulator, speed, parameters.model_copy(update={"particles": n}), seeds)
+            for n in (*numbers, finest)
         }
         reference = found[finest]
         for n in numbers:

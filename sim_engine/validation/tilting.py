@@ -121,7 +121,7 @@ def slow_tilt(
     particles: int,
     parameters: SimulationParameters,
     angles: tuple[float, ...] = ANGLES,
-    seed: int = 1,
+    seeds: int = 1,
 ) -> tuple[list[Measurement], list[Series]]:
     """Tilt a cup slowly and read what it keeps.
 
@@ -131,7 +131,7 @@ def slow_tilt(
         particles: N.
         parameters: θ; its number of particles is replaced.
         angles: at which to read, increasing [rad].
-        seed: of the initial positions.
+        seeds: means over so many loads, from other initial positions each.
     """
     from sim_engine.fluid.engine import engine
     from sim_engine.fluid.setup import POSE_STEP
@@ -140,13 +140,15 @@ def slow_tilt(
     d = spacing(volume, particles)
     motion, readings = slow_turn(vessel, volume, angles)
     poses = motion.sample(np.arange(0.0, motion.duration + 0.1, POSE_STEP))
-    local = fill(vessel, volume, particles, seed, parameters.wall_distance).astype(float)
-    start = local + poses[0, :3]  # upright at first
     times = np.arange(0.02, motion.duration, 0.02)
-    kept = np.empty(len(times))
+    kept = np.zeros(len(times))
     bottom = LIP_HEIGHT - 2.0 * vessel.bounding_sphere[1]
-    for k in run(start, d, Container.of(vessel), parameters, times, poses=poses, settling=0.15, spill_level=bottom):
-        kept[k] = engine().census()[ParticleState.IN_POURER] * d**3
+    cup = Container.of(vessel)
+    for seed in range(1, seeds + 1):
+        local = fill(vessel, volume, particles, seed, parameters.wall_distance).astype(float)
+        start = local + poses[0, :3]  # upright at first
+        for k in run(start, d, cup, parameters, times, poses=poses, settling=0.15, spill_level=bottom):
+            kept[k] += engine().census()[ParticleState.IN_POURER] * d**3 / seeds
     measurements = []
     for angle, reading in zip(angles, readings, strict=True):
         now = (times >= reading) & (times <= reading + READING)

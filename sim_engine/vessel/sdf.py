@@ -51,6 +51,11 @@ class SignedDistanceGrid:
         """Position of the last node, shape (3,) [m]."""
         return self.origin + self.spacing * (np.array(self.shape) - 1)
 
+    @property
+    def reach(self) -> float:
+        """Distance of the farthest node from the frame's origin [m]."""
+        return float(np.linalg.norm(np.maximum(np.abs(self.origin), np.abs(self.upper))))
+
     def axes(self) -> tuple[Floats, Floats, Floats]:
         """Node coordinates along x, y and z [m]."""
         x, y, z = (self.origin[i] + self.spacing * np.arange(n) for i, n in enumerate(self.shape))
