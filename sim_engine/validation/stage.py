@@ -158,3 +158,4 @@ def stir(add: Callable[[Floats], Floats]) -> None:
     v = f.v.to_numpy()
     v[:n] += add(f.x.to_numpy()[:n].astype(float)).astype(np.float32)
     f.v.from_numpy(v)
+    f.fastest[0] = float(np.linalg.norm(v[:n], axis=1).max())

@@ -91,16 +91,15 @@ def test_the_standard_pour_flows_as_that_of_infinitely_fine_particles(simulator:
     assert failures(measurements) == []
 
 
-AT_60 = pytest.mark.xfail(reason="183.3 mL in the mean of five loads, 182.2 to 184.4; 182.8 would be within 2 %")
-
-
 @pytest.mark.parametrize(
-    "angle", [pytest.param(0, marks=[AT_60, pytest.mark.slow]), pytest.param(1, marks=pytest.mark.slow), 2]
+    ("angle", "loads"), [pytest.param(0, 5, marks=pytest.mark.slow), pytest.param(1, 5, marks=pytest.mark.slow), (2, 1)]
 )
-def test_few_particles_are_held_back_by_a_lip_no_more_than_liquid_is(simulator: PourSimulator, angle: int) -> None:
+def test_few_particles_are_held_back_by_a_lip_no_more_than_liquid_is(
+    simulator: PourSimulator, angle: int, loads: int
+) -> None:
     """Within 2 % of the brimful volume at 60, 70 and 80°. With the rim as it is, 500 particles keep 7 to 26 mL more."""
     cup, angles, load = tilting.straight_cup(), tilting.ANGLES[angle : angle + 1], (200e-6, 130e-6, 80e-6)[angle]
-    measurements, _ = tilting.slow_tilt(cup, load, 500, suite.PLAIN, angles)
+    measurements, _ = tilting.slow_tilt(cup, load, 500, suite.PLAIN, angles, loads)
     assert failures(measurements) == []
 
 
@@ -285,8 +284,8 @@ def test_cases_are_found_by_name_and_a_wrong_name_lists_them() -> None:
 # What the solver did not reach when the case was written, by case: a case that begins to pass, or one that passes no
 # longer, fails the slow test, so that this list stays true.
 NOT_MET: dict[str, str] = {
-    "retention": "12.7 mL too much with 500 particles at 80°, 10.6 with 1,000 at 60°, 9.2 in the jug at 60°",
-    "landing": "the spread at 30 °/s is 1.1 mm more with 1,000 particles than with 10,000",
+    "retention": "12 mL too much with 500 particles at 80°, where 10 are allowed",
+    "landing": "the spread at 30 °/s is 1.2 mm more with 1,000 particles than with 10,000",
     "convergence": "a fast pour into a bowl splashes out the more the finer the particles are",
     "film": "films of two and three spacings are 16 and 22 % too fast",
     "tube": "no pressure holds a falling plug together",
