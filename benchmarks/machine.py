@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def describe() -> dict[str, Any]:
     """Machine, software and moment: without them a figure means nothing."""
-    from sim_engine.validation.suite import solver_fingerprint
+    from sim_engine.validation.sources import solver_fingerprint
 
     return {
         "processor": _processor(),

@@ -93,7 +93,7 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     from orchestrator.report.results import deployments_of
     from orchestrator.runs import create_run
     from orchestrator.stages import EVALUATION, stages_of
-    from sim_engine.validation.suite import solver_fingerprint
+    from sim_engine.validation.sources import solver_fingerprint
 
     ARMS[arm]()
     shipped = load_campaign(CAMPAIGN, laboratory)

@@ -27,7 +27,7 @@ def physics(
     from orchestrator.report import physics as report
     from orchestrator.report.table import PLAIN_WIDTH
     from sim_engine.pour import PourSimulator
-    from sim_engine.validation import suite
+    from sim_engine.validation import sources, suite
 
     if list_cases:
         for case in suite.CASES:
@@ -36,7 +36,7 @@ def physics(
     cases = _chosen(names)
     if write is not None and not write.is_dir():
         raise RefusalError(f"--write {write}: there is no such folder", BAD_INPUT)
-    fingerprint = suite.solver_fingerprint()
+    fingerprint = sources.solver_fingerprint()
     records: dict[str, dict[str, Any]] = {}
     simulator = PourSimulator()
     try:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from sim_engine.liquid import SimulationParameters
 from sim_engine.pour import PourSimulator
@@ -77,16 +75,6 @@ class Case:
             name = f"the solver ran to the end (1: yes); it stopped {fault}"
             measurements, figure = [at_least(name, 0.0, 1.0, criterion="yes", particles=0)], None
         return CaseResult(tuple(measurements), figure, time.process_time() - begun)
-
-
-def solver_fingerprint() -> str:
-    """Hash of the sources of the solver and its vessels: results with the same one belong together."""
-    root = Path(__file__).parent.parent
-    digest = hashlib.sha256()
-    for file in sorted([*root.glob("*.py"), *root.glob("fluid/*.py"), *root.glob("vessel/*.py")]):
-        digest.update(file.name.encode())
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def describe(parameters: SimulationParameters) -> str:

@@ -17,7 +17,7 @@ from orchestrator.cli import app
 from orchestrator.report import physics as report
 from orchestrator.report import style
 from orchestrator.report.style import INK
-from sim_engine.validation import suite
+from sim_engine.validation import sources, suite
 from sim_engine.validation.result import CaseResult, Figure, Measurement, Series, reported, within
 from tests.orchestrator.reported import strays
 
@@ -81,7 +81,7 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
     assert "1 of 2 criteria are met" in page
     assert "| height | 2,000 | 50 mm | 39.8 mm | within 2 % | **fails** |" in page
     assert (tmp_path / "images" / "validation-good.png").read_bytes()[:4] == b"\x89PNG"
-    monkeypatch.setattr(suite, "solver_fingerprint", lambda: "another")
+    monkeypatch.setattr(sources, "solver_fingerprint", lambda: "another")
     runner.invoke(app, ["physics", "good", "--write", str(tmp_path)])
     good, bad = (tmp_path / report.PAGE_NAME).read_text(encoding="utf-8").partition("## Bad")[::2]
     assert "Measured before" not in page
