@@ -30,7 +30,7 @@ PLAN: dict[str, tuple[str, ...]] = {
     "pour-10000": ("pour_speed.py", "--particles=10000", "--repeats=3", "--peer=1"),
     "scaling": ("scaling.py", "--repeats=1"),
     "scenes": ("batches.py",),
-    "start-up": ("start_up.py",),
+    "start-up": ("start_up.py", "--repeats=9"),
     "plan": ("plan_speed.py",),
     "validate": ("validate_cost.py",),
     "profile": ("profile_passes.py",),
