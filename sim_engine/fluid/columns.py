@@ -47,6 +47,8 @@ def take_seats(f: ti.template(), s, reach):
     behind = seats + f.moving[s]
     for k in range(behind, behind + EIGHT):
         f.seat[k] = ti.Vector([0.0, 0.0, 0.0])
+        f.lean[k] = ti.Vector([0.0, 0.0, 0.0])  # what a pour that diverged left there, times nothing, is no number
+        f.missing[k] = 0.0
     # cell_start[c] is where cell c ends now, so that it begins at cell_start[c − 1].
     for k in range(seats, behind):
         x = f.x[f.seated[k]]

@@ -11,6 +11,7 @@ import pytest
 import taichi as ti
 
 from sim_engine.fluid import (
+    columns,
     density,
     engine,
     kernels,
@@ -30,7 +31,7 @@ from sim_engine.fluid import (
 from sim_engine.fluid.engine import FluidEngine
 from sim_engine.pour import PourSimulator
 
-MODULES = density, engine, kernels, neighbours, newtonian, packing, rims, state, step, table, tension, vectors
+MODULES = columns, density, engine, kernels, neighbours, newtonian, packing, rims, state, step, table, tension, vectors
 FUNCTIONS = [
     function.__wrapped__
     for module in (*MODULES, viscosity, walls)
