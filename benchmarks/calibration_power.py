@@ -40,7 +40,7 @@ from orchestrator.config.load import load_campaign
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.fingerprint import fingerprint
 from orchestrator.flights import Flight, free_slots, next_to_tell
-from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour
+from orchestrator.plan import CalibrationPlan, CampaignPlan, MeasuredPour, RecordedPour
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.stages import (
     CALIBRATION,
@@ -53,7 +53,6 @@ from orchestrator.stages import (
 )
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
 from orchestrator.strategies.calibration.scorecard import DRAWS
 from orchestrator.strategies.protocol import Strategy

@@ -5,12 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-from orchestrator.requests import Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
-
-Order = Literal["logical", "completion"]
-"""The order in which outcomes are told; see `orchestrator.scheduler`."""
+from orchestrator.requests import Ask, Order, Outcome, Pour, Request, Simulate, Slots, Suggest
 
 _LOGICAL_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
 """What is told first when several are under way: quick things before slow ones, so that a free slot is never kept

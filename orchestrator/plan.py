@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from actors.optimizer.core.mismatch import Displacement
-from actors.optimizer.core.problem import Linear
+from actors.optimizer.core.problem import Linear, Point
 from actors.spec import LaboratorySpec
 from orchestrator.strategies.deployment.objectives import Objectives
 from orchestrator.strategies.settings import CalibrationSettings, DeploymentSettings, StrategySettings
@@ -16,7 +16,7 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import MINIMUM_POURED, Loss
 from sim_engine.marks import FREE
 from sim_engine.space import Space
-from sim_engine.task import Scene
+from sim_engine.task import PoseError, Scene
 
 Design = Literal["stratified", "active"]
 """How calibration pours are chosen: spread evenly, or each by what it will tell about deployment."""
@@ -48,6 +48,29 @@ class RecordedPour:
     def normalised_spillage(self) -> float | None:
         """r = spilled / poured, None where too little was poured for it."""
         return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
+
+
+@dataclass(frozen=True)
+class MeasuredPour:
+    """A weighed pour as calibration and evaluation need it.
+
+    Attributes:
+        spillage: r = spilled / poured; None below 5 % poured, where it is undefined.
+        poured: fraction of the load that left the pourer.
+        split: 'train', 'test' or 'transfer'.
+        scene: name of the one that it was made in; '' for the first of its calibration.
+    """
+
+    action: Action
+    spillage: float | None
+    poured: float
+    split: str = "train"
+    scene: str = ""
+
+    @classmethod
+    def from_record(cls, record: RecordedPour) -> MeasuredPour:
+        """From a row of a file of recorded pours."""
+        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split, record.scene)
 
 
 @dataclass(frozen=True)
@@ -291,3 +314,17 @@ class CampaignPlan:
     on_unknown: Annotated[Literal["ask", "repeat"], FREE] = "ask"
     resolved: Annotated[dict[str, Any], FREE] = field(default_factory=dict)
     laboratory_source: Annotated[Path | None, FREE] = field(default=None, compare=False)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One way in which a pour may go otherwise than planned.
+
+    Attributes:
+        error: of execution; None: as planned.
+        z: standardised errors, those of `Disturbances.errors`.
+    """
+
+    error: PoseError | None
+    parameters: SimulationParameters
+    z: Point

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from statistics import NormalDist
+from typing import Literal
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from sim_engine.action import Action
@@ -172,3 +173,7 @@ class Decision:
     text: str
     values: dict[str, float] = field(default_factory=dict)
     urgent: bool = False
+
+
+Order = Literal["logical", "completion"]
+"""The order in which outcomes are told; see `orchestrator.scheduler`."""

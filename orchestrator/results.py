@@ -6,37 +6,43 @@ A result is a value with a `kind`, declared beside the strategy that learns it; 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 
 from orchestrator.codec import from_json, to_json
 from orchestrator.errors import RunError
-from orchestrator.strategies.calibration.base import Calibrated
-from orchestrator.strategies.calibration.design import DesignPoured
-from orchestrator.strategies.calibration.evaluation import Scores
-from orchestrator.strategies.deployment.confirm import Confirmed
-from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.doors import STRATEGIES
 from orchestrator.strategies.learnt import Learnt
-from orchestrator.strategies.one_pour import OnePoured
-from orchestrator.strategies.repeats import Foreseen
-from orchestrator.study.strategies import FinalPoured, Tabled
 
 L = TypeVar("L", bound=Learnt)
 
 Results = Mapping[str, Learnt]
 """What the stages learnt, by their names, in order."""
 
-OURS = (DesignPoured, Calibrated, Scores, Deployed, Confirmed, Foreseen, OnePoured, Tabled, FinalPoured)
-"""The kinds that Decant itself comes with; strategies from other packages may bring their own."""
+DECLARED_IN = (
+    "orchestrator.strategies.calibration.design",
+    "orchestrator.strategies.calibration.base",
+    "orchestrator.strategies.calibration.evaluation",
+    "orchestrator.strategies.deployment.learnt",
+    "orchestrator.strategies.deployment.confirm",
+    "orchestrator.strategies.repeats",
+    "orchestrator.strategies.one_pour",
+    "orchestrator.study.strategies",
+)
+"""Modules that declare the kinds of results that Decant comes with, named by text: results know no strategy."""
 
 
 def kinds() -> tuple[type[Learnt], ...]:
     """All kinds: ours, and those of the packages whose strategies are installed."""
-    packages = {settings.__module__.partition(".")[0] for settings in STRATEGIES.all.values()}  # this loads them
+    strategies = resolve_name("orchestrator.strategies.doors:STRATEGIES").all.values()  # this loads them
+    packages = {settings.__module__.partition(".")[0] for settings in strategies}
+    for module in DECLARED_IN:
+        import_module(module)
+    ours = [found for module in DECLARED_IN for found in Learnt.KINDS.values() if found.__module__ == module]
     theirs = {found for found in Learnt.KINDS.values() if found.__module__.partition(".")[0] in packages}
-    return (*OURS, *sorted(theirs - set(OURS), key=lambda found: found.__name__))
+    return (*ours, *sorted(theirs - set(ours), key=lambda found: found.__name__))
 
 
 def encode_result(result: Learnt) -> dict[str, Any]:

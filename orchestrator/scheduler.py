@@ -29,12 +29,12 @@ from orchestrator.events import (
     StrategyProgressed,
     Watchers,
 )
-from orchestrator.flights import Flight, Order, free_slots, is_recorded, next_to_tell
+from orchestrator.flights import Flight, free_slots, is_recorded, next_to_tell
 from orchestrator.journal import Draft, Journal, Kind
 from orchestrator.journal_file import JournalError
 from orchestrator.lanes import Lanes
 from orchestrator.replay import StageHistory, replay, replayed_events
-from orchestrator.requests import Ask, Decision, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.requests import Ask, Decision, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.results import encode_result
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.protocol import Strategy

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orchestrator.errors import RunError
-from orchestrator.flights import Order
-from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, KnownSimulation, RecordSet
+from orchestrator.plan import CalibrationPlan, CampaignPlan, DeploymentPlan, KnownSimulation, MeasuredPour, RecordSet
+from orchestrator.requests import Order
 from orchestrator.results import Results, learnt_by
 from orchestrator.strategies.calibration.active import ActivePours
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured, MeasuredPour
+from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured
 from orchestrator.strategies.calibration.draws import drawn_benches
 from orchestrator.strategies.calibration.evaluation import ScoredPour, Scores, random_parameters
 from orchestrator.strategies.calibration.scorecard import DRAWS, Scorecard, shift_left_over

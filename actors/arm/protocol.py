@@ -271,3 +271,55 @@ class Arm(Protocol):
     def close(self) -> None:
         """Stop, and let the arm go. May be called again."""
         ...
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One link.
+
+    Attributes:
+        name: for people.
+        radius: [m].
+    """
+
+    name: str
+    radius: float
+
+
+class ArmFigure(Protocol):
+    """Where everything of an arm is, in the world of pours (`actors.arm.geometry`)."""
+
+    @property
+    def bars(self) -> tuple[Bar, ...]:
+        """The links, from the base to the tool; each as long as it always is."""
+        ...
+
+    @property
+    def home(self) -> tuple[float, ...]:
+        """Joints where it waits [rad]."""
+        ...
+
+    @property
+    def table(self) -> float:
+        """Height of the table [m]."""
+        ...
+
+    def ends(self, joints: FloatArray) -> FloatArray:
+        """Both ends of every bar, shape (..., bars, 2, 3) [m], for joints (..., n) [rad]."""
+        ...
+
+    def tool(self, joints: FloatArray) -> FloatArray:
+        """Poses of the tool centre point, shape (T, 7), for joints (T, n)."""
+        ...
+
+    def pourer(self, joints: FloatArray) -> FloatArray:
+        """Poses of the vessel in the hand, shape (T, 7), for joints (T, n)."""
+        ...
+
+    def tool_of(self, poses: FloatArray) -> FloatArray:
+        """Places of the tool centre point, shape (T, 3) [m], for poses (T, 7) of the vessel in the hand."""
+        ...
+
+    def executed(self, record: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+        """Times (T,) [s] and joints (T, n) [rad] of a pour's record (`Executed.record`); None where it has none."""
+        ...

@@ -1,13 +1,14 @@
 """Settings of arms: plain values that know which driver they are for, and what plans pours for it.
 
-Nothing heavy is imported before it is used: settings are read where nothing is started.
+Drivers and planners are named by text and imported when they are needed: settings are read where nothing is started.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from actors.arm.geometry import ArmLimits, Cell, Joints, Mount, Pose, Vector
@@ -17,9 +18,8 @@ from sim_engine.marks import FREE
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
-    from actors.arm.figure import ArmFigure
     from actors.arm.joint_path import PourPath
-    from actors.arm.protocol import PlannedPour
+    from actors.arm.protocol import ArmFigure, PlannedPour
 
 ArmModel = Literal["ur10", "ur10e"]
 
@@ -61,14 +61,10 @@ class ArmSpec(ABC):
 
     def paced(self, time_scale: float) -> ArmSpec:
         """The same arm in a virtual bench's time."""
-        from dataclasses import replace
-
         return replace(self, time_scale=time_scale)  # type: ignore[type-var]
 
     def announced(self, announcement: float) -> ArmSpec:
         """The same arm, which waits for so long between consent and movement [s]."""
-        from dataclasses import replace
-
         return replace(self, announcement=announcement)  # type: ignore[type-var]
 
     @property
@@ -163,29 +159,27 @@ class UrArmSpec(ArmSpec):
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
         """See `ArmSpec.driver`."""
-        from actors.arm.ur.accepted import AcceptedArm
-        from actors.arm.ur.driver import UrArm
-
-        return (UrArm, (self,)) if accepted is None else (AcceptedArm, (self, accepted))
+        if accepted is None:
+            return resolve_name("actors.arm.ur.driver:UrArm"), (self,)
+        return resolve_name("actors.arm.ur.accepted:AcceptedArm"), (self, accepted)
 
     def plan(self, scene: Scene, action: Action) -> PourPath:
         """See `ArmSpec.plan`."""
-        from actors.arm.path.plan import plan_path
-        from actors.bench.planning import plan_pour, vessel
-
-        return plan_path(plan_pour(scene, action), self, vessel(scene.pourer), vessel(scene.receiver))
+        plan_path = resolve_name("actors.arm.path.plan:plan_path")
+        planning = resolve_name("actors.bench.planning")
+        pourer, receiver = planning.vessel(scene.pourer), planning.vessel(scene.receiver)
+        path: PourPath = plan_path(planning.plan_pour(scene, action), self, pourer, receiver)
+        return path
 
     def figure(self) -> ArmFigure:
         """See `ArmSpec.figure`."""
-        from actors.arm.figure import LinkFigure
-
-        return LinkFigure(self)
+        figure: ArmFigure = resolve_name("actors.arm.figure:LinkFigure")(self)
+        return figure
 
     def missing(self) -> str | None:
         """See `ArmSpec.missing`."""
-        from actors.arm.ur.client import client_missing
-
-        return client_missing()
+        missing: str | None = resolve_name("actors.arm.ur.client:client_missing")()
+        return missing
 
     @property
     def title(self) -> str:
@@ -209,6 +203,5 @@ class UrArmSpec(ArmSpec):
 
     def look(self) -> ArmLook:
         """See `ArmSpec.look`."""
-        from actors.arm.ur.judge import UrLook
-
-        return UrLook.at(self)
+        look: ArmLook = resolve_name("actors.arm.ur.judge:UrLook").at(self)
+        return look

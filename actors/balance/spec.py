@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
+from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from actors.balance.dialects.dialect import Dialect, LineSettings
@@ -20,6 +21,9 @@ from sim_engine.marks import FREE
 
 AUTO = "auto"
 """Dialect that is found out."""
+
+SERIAL_EMULATOR = "actors.balance.virtual_serial.stand_in:SerialStandIn"
+"""Emulates a balance on a serial line of a virtual bench; a name, because drivers do not import emulators."""
 
 DRIFTING = 60.0
 """From a tare to the weighing after it, at most, on a bench of numbers [s of bench time]."""
@@ -207,15 +211,14 @@ class SerialBalanceSpec(BalanceDevice):
 
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
         """See `BalanceDevice.driver`."""
-        from actors.balance.serial_balance import SerialBalance
-
-        return SerialBalance, (self, name)
+        return resolve_name("actors.balance.serial_balance:SerialBalance"), (self, name)
 
     def stand_in(self) -> BalanceStandIn | None:
         """See `BalanceDevice.stand_in`."""
-        from actors.balance.virtual_serial.stand_in import SerialStandIn
-
-        return None if self.virtual is None else SerialStandIn(self, self.virtual)
+        if self.virtual is None:
+            return None
+        emulator: BalanceStandIn = resolve_name(SERIAL_EMULATOR)(self, self.virtual)
+        return emulator
 
     def look(self, *, tare: bool) -> list[Check]:
         """See `BalanceDevice.look`: the port first."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.figure import ArmFigure
+from actors.arm.protocol import ArmFigure
 from actors.protocols import PourProgress
 from orchestrator.monitor import shapes
 from orchestrator.monitor.films import Film, Films, Track

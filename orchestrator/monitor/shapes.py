@@ -14,7 +14,7 @@ from orchestrator.monitor.outlet import Columns, columns_of
 from orchestrator.report import style
 
 if TYPE_CHECKING:
-    from actors.arm.figure import ArmFigure
+    from actors.arm.protocol import ArmFigure
     from sim_engine.vessel.spec import VesselSpec
     from sim_engine.vessel.vessel import Vessel
 

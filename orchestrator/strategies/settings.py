@@ -8,39 +8,20 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from orchestrator.config.yaml.sections import Count, Section
+from orchestrator.config.yaml.sections import Complaints, Count, Section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from orchestrator.flights import Order
-    from orchestrator.plan import CalibrationPlan, DeploymentPlan
-    from orchestrator.strategies.calibration.design import MeasuredPour
-    from orchestrator.strategies.deployment.risk import Draw
+    from orchestrator.plan import CalibrationPlan, DeploymentPlan, Draw, MeasuredPour
+    from orchestrator.requests import Order
     from orchestrator.strategies.protocol import Strategy
     from sim_engine.liquid import SimulationParameters
     from sim_engine.space import Space
     from sim_engine.task import Scene
-
-
-class Complaints(Protocol):
-    """Takes what is wrong with settings, and knows where in the file they stand."""
-
-    def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
-        """Note a problem, unless something is wrong there already.
-
-        Args:
-            text: what is wrong, and what would be right.
-            at: keys from the section down to the place; none: the section itself.
-            key: point at the key and not at its value.
-            of: a key that it is about: nothing is noted if something is wrong with it, or below it.
-        """
-
-    @property
-    def any(self) -> bool:
-        """Whether something is wrong with these settings."""
 
 
 class StrategySettings(Section):
@@ -65,9 +46,8 @@ class StrategySettings(Section):
     @classmethod
     def unknown_tag(cls, word: str) -> str:
         """Which plug-in would have it, if it could be loaded."""
-        from orchestrator.strategies.doors import STRATEGIES
-
-        return next((str(broken) for broken in STRATEGIES.broken if broken.name == word), "")
+        strategies = resolve_name("orchestrator.strategies.doors:STRATEGIES")
+        return next((str(broken) for broken in strategies.broken if broken.name == word), "")
 
 
 class CalibrationSettings(StrategySettings):

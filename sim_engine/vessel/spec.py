@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import random
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny
@@ -113,9 +114,8 @@ class MeshShape(Shape):
 
     def build(self, spec: VesselSpec, *, use_cache: bool) -> Any:
         """See `Shape.build`."""
-        from sim_engine.vessel.mesh import build_mesh_vessel
-
-        return build_mesh_vessel(spec, use_cache=use_cache)
+        # Named by text: meshes are built of vessels, and vessels of shapes.
+        return resolve_name("sim_engine.vessel.mesh:build_mesh_vessel")(spec, use_cache=use_cache)
 
 
 def _shape(loaded: object, name: str) -> type[Shape]:

@@ -12,8 +12,8 @@ from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 from rich.console import Console
 
+from orchestrator.plan import MeasuredPour
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.learnt import Learnt

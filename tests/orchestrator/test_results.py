@@ -93,6 +93,6 @@ def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monk
 
     assert Scripted not in module.kinds()
     settings = type("Settings", (), {"__module__": Scripted.__module__})
-    monkeypatch.setattr(module, "STRATEGIES", SimpleNamespace(all={"scripted": settings}))
+    monkeypatch.setattr("orchestrator.strategies.doors.STRATEGIES", SimpleNamespace(all={"scripted": settings}))
     assert Scripted in module.kinds()
     assert "Scripted" in summary_schema()["$defs"]

@@ -6,7 +6,7 @@ import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -84,6 +84,24 @@ IN_FILE = Mark("a path, relative to the file that it is written in")
 
 FilePath = Annotated[Text, IN_FILE]
 """The path of a file or folder, relative to the file that names it."""
+
+
+class Complaints(Protocol):
+    """Takes what is wrong with settings, and knows where in the file they stand."""
+
+    def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
+        """Note a problem, unless something is wrong there already.
+
+        Args:
+            text: what is wrong, and what would be right.
+            at: keys from the section down to the place; none: the section itself.
+            key: point at the key and not at its value.
+            of: a key that it is about: nothing is noted if something is wrong with it, or below it.
+        """
+
+    @property
+    def any(self) -> bool:
+        """Whether something is wrong with these settings."""
 
 
 class Section(BaseModel):

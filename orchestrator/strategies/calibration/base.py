@@ -8,10 +8,9 @@ from typing import Generic, Literal, TypeVar, cast
 
 from actors.optimizer.core.problem import Point, Suggestion
 from orchestrator.errors import LearningError
-from orchestrator.plan import CalibrationPlan
+from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.strategies.asking import Questions
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.posterior import PosteriorFound
 from orchestrator.strategies.display import DisplayedMap, displayed_map
 from orchestrator.strategies.learnt import Learnt, Part

@@ -5,8 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 
+from orchestrator.plan import MeasuredPour
 from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import MeasuredPour
 
 
 def mean_predictor_discrepancy(train: Sequence[MeasuredPour], test: Sequence[MeasuredPour]) -> float | None:

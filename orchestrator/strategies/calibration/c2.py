@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Point
-from orchestrator.config.yaml.sections import PositiveCount
-from orchestrator.plan import CalibrationPlan
-from orchestrator.strategies.calibration.design import MeasuredPour, stratified
+from orchestrator.config.yaml.sections import Complaints, PositiveCount
+from orchestrator.plan import CalibrationPlan, MeasuredPour
+from orchestrator.strategies.calibration.design import stratified
 from orchestrator.strategies.calibration.o1 import BestOfDesign
 from orchestrator.strategies.calibration.settings import DesignSettings
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.settings import Complaints
 
 
 class C2Settings(DesignSettings):

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
-from orchestrator.config.yaml.sections import PositiveCount
-from orchestrator.plan import CalibrationPlan
+from orchestrator.config.yaml.sections import Complaints, PositiveCount
+from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.o1 import DiscrepancyOverPours
 from orchestrator.strategies.calibration.settings import DesignSettings, Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.settings import Complaints
 
 
 class C3Settings(DesignSettings):

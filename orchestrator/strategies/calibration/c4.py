@@ -9,13 +9,12 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from actors.optimizer.core.problem import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
-from orchestrator.config.yaml.sections import PositiveCount
+from orchestrator.config.yaml.sections import Complaints, PositiveCount
 from orchestrator.errors import LearningError
-from orchestrator.plan import CalibrationPlan
+from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, TriedOnce, described
 from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.posterior import (
     PosteriorFound,
     central,
@@ -25,7 +24,7 @@ from orchestrator.strategies.calibration.posterior import (
 )
 from orchestrator.strategies.calibration.settings import MOST_SIMULATIONS, Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.settings import CalibrationSettings, Complaints
+from orchestrator.strategies.settings import CalibrationSettings
 from orchestrator.strategies.trials import Trial
 from sim_engine.losses import MINIMUM_POURED
 

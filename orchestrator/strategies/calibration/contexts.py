@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from actors.optimizer.core.problem import Point
-from orchestrator.plan import CalibrationPlan
-from orchestrator.strategies.calibration.design import MeasuredPour
+from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.strategies.calibration.prior import actions_of_prior
 from sim_engine.action import Action
 from sim_engine.space import Axis, Space

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.optimizer.core.problem import Linear, Point
-from orchestrator.plan import RecordedPour
+from orchestrator.plan import MeasuredPour
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.calibration.prior import region_of
 from orchestrator.strategies.display import displayed_action
@@ -33,29 +33,6 @@ MAX_TRIES = 12
 
 MAX_DRAWS = 100
 """Points of a stratum of which none meets the constraints, before one from anywhere is taken."""
-
-
-@dataclass(frozen=True)
-class MeasuredPour:
-    """A weighed pour as calibration and evaluation need it.
-
-    Attributes:
-        spillage: r = spilled / poured; None below 5 % poured, where it is undefined.
-        poured: fraction of the load that left the pourer.
-        split: 'train', 'test' or 'transfer'.
-        scene: name of the one that it was made in; '' for the first of its calibration.
-    """
-
-    action: Action
-    spillage: float | None
-    poured: float
-    split: str = "train"
-    scene: str = ""
-
-    @classmethod
-    def from_record(cls, record: RecordedPour) -> MeasuredPour:
-        """From a row of a file of recorded pours."""
-        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split, record.scene)
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from orchestrator.plan import MeasuredPour
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.seeds import SeedStream

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
-from orchestrator.plan import CalibrationPlan
+from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION, Calibration, TriedOnPours, described
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.settings import DesignSettings
 from orchestrator.strategies.trials import Trial
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from orchestrator.plan import MeasuredPour
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Slots
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, Scores
 from orchestrator.strategies.progress import Progress
 from sim_engine.bands import left_over

@@ -6,8 +6,8 @@ from abc import abstractmethod
 from typing import Annotated, ClassVar, Self
 
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import PositiveCount
-from orchestrator.strategies.settings import CalibrationSettings, Complaints
+from orchestrator.config.yaml.sections import Complaints, PositiveCount
+from orchestrator.strategies.settings import CalibrationSettings
 
 Kappa = Annotated[float, Quantity("1", "2.0", 0.0, 100.0)]
 """κ of the lower confidence bound."""

@@ -9,16 +9,16 @@ from statistics import NormalDist
 from typing import Any, ClassVar, Literal
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
-from orchestrator.config.yaml.sections import Count, PositiveCount
-from orchestrator.plan import DeploymentPlan
+from orchestrator.config.yaml.sections import Complaints, Count, PositiveCount
+from orchestrator.plan import DeploymentPlan, Draw
 from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.deployment.risk import Disturbances, Draw, RiskSettings
+from orchestrator.strategies.deployment.risk import Disturbances, RiskSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
 from orchestrator.strategies.deployment.window import SafeWindow, WindowFound, WindowSettings
 from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.settings import Complaints, Premises
+from orchestrator.strategies.settings import Premises
 from orchestrator.strategies.sound import is_sound
 from orchestrator.strategies.trials import Trial
 from sim_engine.action import Action, described

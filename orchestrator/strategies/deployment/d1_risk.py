@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import Any
 
 from actors.optimizer.core.problem import Data, Point, Risk, Suggestion, SuggestProblem
-from orchestrator.plan import DeploymentPlan
+from orchestrator.plan import DeploymentPlan, Draw
 from orchestrator.requests import Failed, Outcome, Prediction, Request, Simulate
 from orchestrator.strategies.deployment.base import MAX_REFUSED, Deployment
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.learnt import RiskFound
-from orchestrator.strategies.deployment.risk import Disturbances, Draw
+from orchestrator.strategies.deployment.risk import Disturbances
 from orchestrator.strategies.deployment.window import SafeWindow
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters

@@ -6,19 +6,19 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from actors.optimizer.core.mismatch import Limit
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Count, CountOrFree
+from orchestrator.config.yaml.sections import Complaints, Count, CountOrFree
 from orchestrator.plan import DeploymentPlan
 from orchestrator.strategies.deployment.adaptive import IgnoranceSettings, RiskLimitSettings, Rules, StopSettings
 from orchestrator.strategies.deployment.prices import PricesSettings
 from orchestrator.strategies.deployment.settings import SearchSettings
 from orchestrator.strategies.deployment.trust import TrustOrAlways, TrustSettings
 from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.settings import Complaints, Premises
+from orchestrator.strategies.settings import Premises
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
-    from orchestrator.flights import Order
+    from orchestrator.requests import Order
 
 
 class D3Settings(SearchSettings):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from abc import abstractmethod
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from orchestrator.config.yaml.quantities import Quantity
@@ -16,7 +17,7 @@ from sim_engine.space import Space
 from sim_engine.task import Scene
 
 if TYPE_CHECKING:
-    from orchestrator.strategies.settings import Complaints
+    from orchestrator.config.yaml.sections import Complaints
 
 Vector = tuple[float, ...]
 """One number for each objective, smaller is better."""
@@ -59,9 +60,8 @@ class Objective(Section):
     @classmethod
     def unknown_tag(cls, word: str) -> str:
         """Which plug-in would have it, if it could be loaded."""
-        from orchestrator.strategies.doors import OBJECTIVES
-
-        return next((str(broken) for broken in OBJECTIVES.broken if broken.name == word), "")
+        objectives = resolve_name("orchestrator.strategies.doors:OBJECTIVES")
+        return next((str(broken) for broken in objectives.broken if broken.name == word), "")
 
 
 class Spillage(Objective):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Literal
 
@@ -13,8 +12,8 @@ import numpy as np
 from actors.optimizer.core.problem import Disturbance, Point, Risk
 from orchestrator.config.pose import PoseNoiseSection
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section
-from orchestrator.strategies.settings import Complaints
+from orchestrator.config.yaml.sections import Complaints, Section
+from orchestrator.plan import Draw
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
@@ -77,20 +76,6 @@ class RiskSettings(Section):
                 "risk",
                 key=True,
             )
-
-
-@dataclass(frozen=True)
-class Draw:
-    """One way in which a pour may go otherwise than planned.
-
-    Attributes:
-        error: of execution; None: as planned.
-        z: standardised errors, those of `Disturbances.errors`.
-    """
-
-    error: PoseError | None
-    parameters: SimulationParameters
-    z: Point
 
 
 class Disturbances:

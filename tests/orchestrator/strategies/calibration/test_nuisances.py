@@ -10,11 +10,10 @@ import pytest
 
 from orchestrator.config.load import load_campaign, load_parameters, load_posterior
 from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.plan import NormalPrior
+from orchestrator.plan import MeasuredPour, NormalPrior
 from orchestrator.publish import theta_file
 from orchestrator.strategies.calibration.base import described
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.draws import drawn_benches
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters

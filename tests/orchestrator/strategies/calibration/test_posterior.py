@@ -12,10 +12,10 @@ import pytest
 from actors.optimizer.core.problem import Posterior
 from orchestrator.config.load import load_discrepancy, load_parameters, load_posterior
 from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.plan import MeasuredPour
 from orchestrator.publish import theta_file
 from orchestrator.report.posterior import draw_posterior, posterior_lines
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.design import MeasuredPour
 from orchestrator.strategies.calibration.evaluation import ScoredPair, Scores
 from orchestrator.strategies.calibration.posterior import (
     PosteriorFound,

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from orchestrator.errors import LearningError
+from orchestrator.plan import MeasuredPour
 from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
 from orchestrator.stages import POURS, measured_pours
 from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour, choose_holdout, stratified
+from orchestrator.strategies.calibration.design import DesignedPours, choose_holdout, stratified
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
 from orchestrator.strategies.calibration.scorecard import Scorecard
 from sim_engine.liquid import SimulationParameters

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.plan import CalibrationPlan, DeploymentPlan
+from orchestrator.plan import CalibrationPlan, DeploymentPlan, MeasuredPour
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
 from orchestrator.strategies.calibration.c1 import UniformGrid
 from orchestrator.strategies.calibration.c2 import StratifiedSampling
 from orchestrator.strategies.calibration.c3 import BayesianCalibration
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour
+from orchestrator.strategies.calibration.design import DesignedPours
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
