@@ -10,7 +10,7 @@ import pytest
 
 from actors.balance.reading import LineError, Reading, Status
 from actors.balance.virtual_balance import Load
-from actors.contracts.balance import BalanceBench, BalanceContract
+from decant.testing import BalanceBench, BalanceContract
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import VesselSpec
 from tests.plugins.decant_example.balance import SpringBalance, SpringSpec

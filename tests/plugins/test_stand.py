@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from actors.arm.errors import ArmLostError, ArmStoppedError
 from actors.arm.motion_path import ExecutedMotion, MotionPath
-from actors.contracts.arm import ArmBench, ArmContract
 from actors.protocols import InvalidActionError
+from decant.testing import ArmBench, ArmContract
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import Liquid
 from sim_engine.task import Scene
