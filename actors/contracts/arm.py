@@ -23,7 +23,6 @@ import itertools
 import json
 import math
 import pickle
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,15 +34,13 @@ from numpy.typing import NDArray
 
 from actors.arm.errors import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.protocol import Arm, ArmState, Executed, PlannedPour
+from actors.contracts import PATIENCE, Call
 from sim_engine.sampled_motion import SampledMotion
 
 FloatArray = NDArray[np.float64]
 
 AT_ONCE = 2.0
 """Longest time that an answer may take which should come at once [s]; a starved machine needs a part of it."""
-
-PATIENCE = 60.0
-"""After which something that should have happened has not [s]."""
 
 CLOSE = math.radians(3.0)
 """How far a tilt may be from the one that was planned or measured independently [rad]."""
@@ -101,30 +98,6 @@ class ArmBench:
     cut: Callable[[], object] | None = None
     restore: Callable[[], object] | None = None
     lost_within: float = 30.0
-
-
-class Call(threading.Thread):
-    """A blocking call that goes on in a thread."""
-
-    def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
-        super().__init__(daemon=True)
-        self._call, self._arguments = call, arguments
-        self.value: Any = None
-        self.error: Exception | None = None
-        self.start()
-
-    def run(self) -> None:
-        """See `threading.Thread.run`."""
-        try:
-            self.value = self._call(*self._arguments)
-        except Exception as error:
-            self.error = error
-
-    def ended(self) -> Exception | None:
-        """Wait for its end; what it raised."""
-        self.join(PATIENCE)
-        assert not self.is_alive(), "the motion does not come back"
-        return self.error
 
 
 class ArmContract:
