@@ -116,7 +116,8 @@ class StrategyHarness:
         """
         waiting: list[Request] = []
         for _ in range(self.limit):
-            if strategy.finished:
+            finished = strategy.finished
+            if finished:
                 if waiting:
                     raise AssertionError(
                         f"the strategy reports that it has finished while {len(waiting)} requests are open, "
