@@ -1,4 +1,4 @@
-"""For the tests of your own plug-ins: contracts of arms and balances, and the harness of strategies.
+"""For the tests of your own plug-ins: contracts of arms and balances, and the harness of strategies::
 
     from decant.testing import ArmBench, ArmContract            # needs pytest
     from decant.testing import BalanceBench, BalanceContract    # needs pytest

@@ -1,4 +1,4 @@
-"""Runs a strategy against plain functions, in milliseconds and without actors: for the tests of its author.
+"""Runs a strategy against plain functions, in milliseconds and without actors: for the tests of its author::
 
     from decant.testing import StrategyHarness, check_strategy
 

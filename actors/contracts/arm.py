@@ -1,4 +1,4 @@
-"""What every arm has to do, as tests. A driver's author derives a class from `ArmContract` and runs pytest.
+"""What every arm has to do, as tests. A driver's author derives a class from `ArmContract` and runs pytest::
 
     class TestMyArm(ArmContract):
         @pytest.fixture

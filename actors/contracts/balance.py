@@ -1,4 +1,4 @@
-"""What every balance has to do, as tests. A driver's author derives a class from `BalanceContract` and runs pytest.
+"""What every balance has to do, as tests. A driver's author derives a class from `BalanceContract` and runs pytest::
 
     class TestMyBalance(BalanceContract):
         @pytest.fixture
