@@ -116,20 +116,24 @@ def calibrate(path: Path, options: RunOptions) -> None:
 
 
 def calibration_json(finished: Finished) -> dict[str, Any]:
-    """θ* and mean |r − c_s| by split: its own, that of its rivals: see `Scorecard`."""
+    """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see `Scorecard`."""
     from orchestrator.report.results import rival_scores
     from orchestrator.results import learnt_by
-    from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta
+    from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
     from orchestrator.strategies.calibration.base import Calibrated
     from orchestrator.strategies.calibration.evaluation import Scores
     from orchestrator.strategies.calibration.scorecard import CALIBRATED
 
     results = finished.result.results
-    theta, calibration = calibrated_theta(results).theta.model_dump(), learnt_by(results, CALIBRATION, Calibrated)
+    theta, calibration = calibrated_theta(results).theta, learnt_by(results, CALIBRATION, Calibrated)
     evaluation = learnt_by(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
     rivals = rival_scores(evaluation)
-    data: dict[str, Any] = {"theta": theta}
+    data: dict[str, Any] = {
+        "theta": deployed_theta(results).model_dump(),
+        "calibrated_theta": theta.model_dump(),
+        "calibration_gain": None if evaluation.gain is None else evaluation.gain.model_dump(mode="json"),
+    }
     for split in ("train", "test", "transfer"):
         data[f"{split}_discrepancy"] = ours.get(split)
         if split != "train":
@@ -287,7 +291,7 @@ def _run(
         live=live,
     )
     if finished.published.theta is not None:
-        mention(f"θ* is in {finished.published.theta}; use it with --parameters")
+        mention(f"the parameters to use are in {finished.published.theta}; give them with --parameters")
     return finished
 
 

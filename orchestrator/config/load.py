@@ -123,18 +123,18 @@ def _theta_model() -> type[_ThetaBase]:
 _Theta = _theta_model()
 
 THETA_KEYS = ("theta", "parameters")
-POSTERIOR_KEY = "posterior"
+POSTERIOR_KEY, RECOMMENDED_KEY = "posterior", "recommended"
 DISCREPANCY_KEY, SHIFT_KEY = "remaining_discrepancy", "shift"
 
 
-def has_posterior(path: Path) -> bool:
-    """Whether a file of θ has draws of a posterior.
+def predicts_with_posterior(path: Path) -> bool:
+    """Whether predictions with a file of θ draw from its posterior: it has one, and θ is the calibrated one.
 
     Raises:
         ConfigError: it is not YAML or JSON.
     """
     data = Document.read(resolved(path)).data
-    return isinstance(data, dict) and POSTERIOR_KEY in data
+    return isinstance(data, dict) and POSTERIOR_KEY in data and data.get(RECOMMENDED_KEY) != "uncalibrated"
 
 
 def load_discrepancy(path: Path) -> float | None:
