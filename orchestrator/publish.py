@@ -14,6 +14,7 @@ from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import regimes
 from orchestrator.report.campaign import draw_figures
+from orchestrator.report.names import receiver_names
 from orchestrator.report.record import read_record
 from orchestrator.report.results import evaluation_of, theta_of
 from orchestrator.report.run_page import REPORT_NAME, run_page
@@ -229,3 +230,14 @@ def worked_out(
     except (ValueError, OSError) as error:
         tell(f"note: whether something is not simulated could not be worked out: {error}")
         return {}
+
+
+def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning) -> list[str]:
+    """What is not simulated in a campaign's action spaces: lines for the user before it begins.
+
+    Args:
+        plan: of the campaign.
+        tell: called if that can't be worked out.
+    """
+    warnings = worked_out(lambda: regimes.campaign_warnings(plan), tell)
+    return regimes.lines(warnings, receiver_names(plan))

@@ -29,7 +29,7 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.spec import VesselSpec
 
 
-def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+def load_campaign(path: Path | str, laboratory: Path | str | None = None, seed: int | None = None) -> CampaignPlan:
     """The plan of a campaign file, with everything that it refers to.
 
     Args:
@@ -40,7 +40,8 @@ def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
-    return campaign_from(Document.read(resolved(path)), laboratory, seed)
+    other = None if laboratory is None else Path(laboratory)
+    return campaign_from(Document.read(resolved(Path(path))), other, seed)
 
 
 def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
@@ -66,13 +67,13 @@ def campaign_from(document: Document, laboratory: Path | None = None, seed: int 
     return plan
 
 
-def load_vessel(path: Path) -> VesselSpec:
+def load_vessel(path: Path | str) -> VesselSpec:
     """The vessel of a file (its shape is built and checked by `sim_engine.vessel`).
 
     Raises:
         ConfigError: anything is wrong with it.
     """
-    report = Report()
+    report, path = Report(), Path(path)
     if path.suffix.lower() in MESH_SUFFIXES:
         message = f"is a mesh; describe the vessel in a YAML file: {{name: {path.stem}, mesh: {path.name}, unit: mm}}"
         raise ConfigError([Problem(resolved(path), 0, 0, "", message)])
