@@ -69,6 +69,17 @@ def job_of(settings: Settings, item: Item, rig: Rig) -> Job:
     return job(plan, verb, given)
 
 
+def _warnings_of(plan: CampaignPlan) -> list[str]:
+    """All that is suspicious about a campaign, or not simulated. Takes a moment, and no event loop.
+
+    Raises:
+        JobError: it can't run.
+    """
+    found: list[str] = []
+    check_job(plan, warn=lambda problem: found.append(str(problem)))
+    return list(dict.fromkeys([*found, *not_simulated(plan, found.append)]))
+
+
 class Running:
     """One part of a campaign's run: from now until it rests.
 
@@ -100,7 +111,8 @@ class Running:
         begun = self.item.run is not None
         directory = await asyncio.to_thread(self._directory, work.plan)
         if not begun:
-            await asyncio.to_thread(self._warn, work.plan)
+            for text in await asyncio.to_thread(_warnings_of, work.plan):
+                self._log_warning(text)
         await self._common.warm.open()
         self.watching = Watching(work.plan)
         monitor = self._recording(work.plan, directory)
@@ -160,17 +172,6 @@ class Running:
             self.note_run(directory)
         live = self._common.live
         return recorder_of(plan, directory, self._log_warning, live if live is not None and live.alive else None)
-
-    def _warn(self, plan: CampaignPlan) -> None:
-        """Report once, at the beginning, all that is suspicious about a campaign.
-
-        Raises:
-            JobError: it can't run; it could when it was submitted.
-        """
-        found: list[str] = []
-        check_job(plan, warn=lambda problem: found.append(str(problem)))
-        for text in dict.fromkeys([*found, *not_simulated(plan, self._log_warning)]):
-            self._log_warning(text)
 
     def _log_warning(self, text: str) -> None:
         self._common.feed.tell("LogLine", {"level": "warning", "text": text, "stage": ""}, self.item.id)
