@@ -193,7 +193,8 @@ def _check(
         )
     found: list[str] = []
     check_job(campaign, as_written=as_written, warn=lambda problem: found.append(str(problem)))
-    for text in dict.fromkeys([*found, *not_simulated(campaign, _warn)]):
+    found.append("\n".join(not_simulated(campaign, found.append)))
+    for text in filter(None, dict.fromkeys(found)):
         _warn(text)
     check_laboratory(_laboratory(campaign, in_process), need_bench=any(stage.pours for stage in stages))
 

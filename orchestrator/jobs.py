@@ -98,7 +98,7 @@ def check_job(
     plan: CampaignPlan,
     *,
     as_written: bool = True,
-    warn: Callable[[Problem], object] = _nothing,
+    warn: Callable[[Problem], None] = _nothing,
     doing: Callable[[str], None] = _nothing,
 ) -> None:
     """Check all that can be checked before anything starts: draws of θ, vessels, loads, motions.
