@@ -103,14 +103,8 @@ def submit(
         if wanted != "plan":
             raise RefusalError("--parameters, --receiver and --iterations go with --verb plan", BAD_INPUT)
         plan = planning_plan(plan, parameters, receiver, iterations)
-        if plan.deployment is not None and plan.deployment.thetas:
-            raise RefusalError(
-                f"{path}: deployment.risk.theta: 'posterior': draws of θ don't travel to a daemon; 'decant plan' bears "
-                "them here",
-                BAD_INPUT,
-            )
     try:
-        text, files = pack(plan)
+        text, files = pack(plan, parameters)
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
     with talking(at) as client:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from actors.laboratory import check_laboratory
 from actors.protocols import LaboratoryError
-from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import resolved
 from orchestrator.daemon.packing import Files, PackingError, load_confined, pack, unpack
@@ -16,7 +15,7 @@ from orchestrator.daemon.running import job_of
 from orchestrator.daemon.settings import ANY_RIG, DESK, Rig, Settings
 from orchestrator.daemon.store import Item, Wish
 from orchestrator.errors import RunError
-from orchestrator.jobs import Job, JobError
+from orchestrator.jobs import Job, JobError, check_job
 
 
 class SubmissionError(RunError):
@@ -77,8 +76,7 @@ def _prepared(settings: Settings, submission: Submission, key: str, by: str) -> 
     anywhere = job_of(settings, draft, Rig(ANY_RIG))
     rig = _rig(settings, submission.rig, anywhere)
     work = anywhere if rig.source is None else job_of(settings, draft, rig)
-    if problems := check_campaign(work.plan):
-        raise SubmissionError("\n".join(str(problem) for problem in problems))
+    check_job(work.plan)
     check_laboratory(work.plan.laboratory, need_bench=work.pours)
     mode = "none" if rig.name == DESK else work.plan.laboratory.mode
     item = replace(draft, id=f"{plan.name[:40]}-{key}", rig=rig.name, mode=mode)

@@ -11,8 +11,8 @@ from orchestrator.strategies.calibration.baselines import mean_predictor_discrep
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, MeasuredPour, choose_holdout, stratified
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
-from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPair, ScoredPour, random_parameters
+from orchestrator.strategies.calibration.scorecard import JUSTIFIED, NOT_JUSTIFIED, Scorecard, calibration_gain
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of, replay
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
@@ -337,3 +337,51 @@ def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the
     same = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=TRUE_THETA)
     StrategyHarness(calibration_spill).run(same)
     assert "uncalibrated" not in same.result().discrepancy
+
+
+def pairs(*simulated: float | None) -> list[ScoredPair]:
+    """Pours that all spilled 0.5, with what was simulated of them."""
+    return [
+        ScoredPair(theta="one", split="train", scene="cup", measured=0.5, simulated=value, reason="")
+        for value in simulated
+    ]
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "uncalibrated", "recommended", "why"),
+    [
+        # gains 0.1, 0.1, 0.1, 0.2: 0.125 ± 0.025
+        ((0.4, 0.4, 0.4, 0.4), (0.3, 0.3, 0.3, 0.2), "calibrated", "gain 12.50 ± 2.50 points"),
+        ((0.3, 0.3, 0.3, 0.2), (0.4, 0.4, 0.4, 0.4), "uncalibrated", "gain -12.50 ± 2.50 points"),
+        # gains 0.3, −0.2, 0.1, −0.1: better in the mean, by less than its standard error
+        ((0.5, 0.3, 0.5, 0.4), (0.2, 0.5, 0.4, 0.5), "uncalibrated", "gain 2.50 ± 11.09 points"),
+        ((0.4, 0.4), (0.4, 0.4), "uncalibrated", "gain 0.00 ± 0.00 points"),
+        ((0.5, None, None), (0.1, None, None), "uncalibrated", "fewer than two pours could be compared"),
+        ((0.4, 0.4, 0.4), (None, 0.2, None), "calibrated", "with the uncalibrated parameters only 1 of 3 pours"),
+        ((None, 0.5, None), (0.4, 0.4, 0.4), "uncalibrated", "with θ* only 1 of 3 pours"),
+    ],
+)
+def test_theta_is_recommended_only_if_it_is_closer_to_the_pours_by_more_than_a_standard_error(
+    calibrated, uncalibrated, recommended, why
+):
+    gain = calibration_gain(pairs(*calibrated), pairs(*uncalibrated))
+    assert gain.recommended == recommended
+    assert gain.text.startswith(f"{JUSTIFIED if recommended == 'calibrated' else NOT_JUSTIFIED}: ")
+    assert why in gain.text
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_scorecard_says_at_its_end_whether_the_training_and_test_pours_justify_theta(swapped):
+    pours = [ScoredPour("cup", pour) for pour in measured(count=8, holdout=2)]
+    # a pour of another receiver, from which both are far, does not take part
+    pours.append(ScoredPour("cup", replace(pours[0].pour, spillage=1.0, split="transfer")))
+    plain = SimulationParameters(particles=4000, cohesion=0.0)
+    theta, other = (plain, TRUE_THETA) if swapped else (TRUE_THETA, plain)
+    card = Scorecard(theta, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=other)
+    assert card.result().gain is None
+    Play(calibration_spill)(card)
+    gain = card.result().gain
+    assert (gain.pours, gain.pairs) == (8, 8)
+    assert gain.recommended == ("uncalibrated" if swapped else "calibrated")
+    assert gain.gain == pytest.approx(gain.uncalibrated - gain.calibrated)
+    assert card.decisions[-1].text == gain.text
