@@ -379,7 +379,7 @@ def test_a_scorecard_says_at_its_end_whether_the_training_and_test_pours_justify
     theta, other = (plain, TRUE_THETA) if swapped else (TRUE_THETA, plain)
     card = Scorecard(theta, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=other)
     assert card.result().gain is None
-    Play(calibration_spill)(card)
+    StrategyHarness(calibration_spill).run(card)
     gain = card.result().gain
     assert (gain.pours, gain.pairs) == (8, 8)
     assert gain.recommended == ("uncalibrated" if swapped else "calibrated")
