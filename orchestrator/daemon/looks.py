@@ -71,7 +71,12 @@ def rigs_out(daemon: Supervisor) -> list[RigOut]:
         running = lane.running
         checkpoint = running.watching.checkpoint if running is not None and running.watching is not None else ""
         campaign = None if running is None else running.item.id
-        found.append(RigOut(name=name, mode=lane.rig.mode, campaign=campaign, checkpoint=checkpoint))
+        stop = daemon.emergencies.get(name)
+        found.append(
+            RigOut.model_validate(
+                {"name": name, "mode": lane.rig.mode, "campaign": campaign, "checkpoint": checkpoint, "emergency": stop}
+            )
+        )
     return found
 
 
