@@ -27,6 +27,7 @@ from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
 from orchestrator.errors import RunError
 from orchestrator.monitor.live import LiveView
+from orchestrator.state_directory import make_state_directory
 
 LEAVING = 10.0
 """Time that campaigns have to come to rest where Ray has died [s]; then those that don't pour are given up."""
@@ -54,6 +55,7 @@ class Supervisor:
     """
 
     def __init__(self, settings: Settings, live: LiveView | None = None) -> None:
+        make_state_directory(settings.state)
         settings.runs.mkdir(parents=True, exist_ok=True)
         settings.snapshots.mkdir(parents=True, exist_ok=True)
         self.settings = settings

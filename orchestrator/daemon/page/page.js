@@ -187,12 +187,13 @@ function showStops() {
   const { status, campaigns, up } = now;
   const byId = Object.fromEntries(campaigns.map((one) => [one.id, one]));
   const rigs = status.rigs.filter((rig) => rig.mode !== "none"), several = rigs.length > 1;
+  const mixed = new Set(rigs.map((rig) => rig.mode)).size > 1;
   const lines = rigs.map((rig) => [rig, byId[rig.campaign] || null, {
-    stopped: Boolean(status.emergency || rig.emergency), several, up, since: up ? "" : clock(now.seen / 1000),
+    stopped: Boolean(status.emergency || rig.emergency), several, mixed, up,
   }]);
   draw($("cells"), lines, (all) => all.map(([rig, campaign, how]) => cellLine(rig, campaign, how, acts)));
   $("bar").classList.toggle("several", several);
-  $("stop-all").textContent = several ? "EMERGENCY STOP: ALL RIGS" : "EMERGENCY STOP";
+  $("stop-all").textContent = several ? "EMERGENCY STOP ALL" : "EMERGENCY STOP";
   $("stop-all").disabled = !up;
 }
 
@@ -237,7 +238,7 @@ const acts = {
     await find();
   },
   stopRig: (rig) => stop(rig),
-  askClear: (rig) => { // 'No' takes the place of what was pressed, and has the focus: Enter, Escape and a second press are safe
+  askClear: (rig) => { // 'No' has the focus: Enter and Escape keep the stop
     const was = now.clearing;
     now.clearing = now.up ? rig : null;
     showEmergencies();

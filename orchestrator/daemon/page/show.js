@@ -50,12 +50,12 @@ export function lasting(seconds) {
 
 const MOVING = ["approach", "tilt", "hold", "return"];
 
-/** One rig in the header: its state and, if there are several, a stop of its own. `since`: last known, not current. */
-export function cellLine(rig, campaign, { stopped, several, up, since }, acts) {
+/** One rig in the header: its state and, if there are several, a stop of its own, and its mode if they differ. */
+export function cellLine(rig, campaign, { stopped, several, mixed, up }, acts) {
   const state = stopped ? el("strong", { class: "badge stopped" }, "STOPPED") : !campaign ? "idle" :
     MOVING.includes(rig.checkpoint) ? "arm moves" : stateText(campaign.state);
   return el("li", { class: rig.mode },
-    el("span", {}, el("b", {}, rig.name), several ? [" ", modeBadge(rig.mode)] : "", since ? ` last known at ${since}: ` : ": ", state),
+    el("span", {}, el("b", {}, rig.name), mixed ? [" ", modeBadge(rig.mode)] : "", up ? ": " : " (last known): ", state),
     several ? el("button", { type: "button", class: "emergency one", "data-key": `stop ${rig.name}`, disabled: !up,
       onclick: () => acts.stopRig(rig.name) }, `STOP ${rig.name}`) : null);
 }
