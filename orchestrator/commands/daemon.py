@@ -182,7 +182,8 @@ def show(key: str, *, at: At, as_json: bool) -> None:
         print(f"  now        {_standing(found)}")
         print(f"             {found['progress']['line']}")
     for pour in found["pours_made"]:
-        told = pour["measured"] or pour["state"]
+        told = pour["measured"] or {"unknown": "UNKNOWN"}.get(pour["state"], pour["state"])
+        told += f" ({pour['loss']})" if pour["state"] == "weighed" else ""
         predicted = f"  predicted {pour['predicted']}" if pour["predicted"] else ""
         print(f"  pour {pour['number']:<3d} into {pour['receiver']}  {pour['action']}{predicted}  → {told}")
     for deed in found["deeds"]:

@@ -112,6 +112,9 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
         except (ConfigError, RunError, KeyError):  # a rig that the settings don't name any more, say
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(request, daemon, item).model_dump()
+    if daemon.progress(item) is None:  # a run whose process was killed: its journal ends in the middle of the pour
+        for pour in pours:
+            pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
     deeds = daemon.store.deeds(item.id)
     return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "deeds": deeds})
 

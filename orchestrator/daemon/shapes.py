@@ -159,10 +159,15 @@ class PourOut(_Out):
     measured: str
     """'' while nobody knows."""
 
+    loss: str
+    """What `predicted` and `measured` are, such as 'spilled / poured': each loss has its own denominator."""
+
     spillage: float | None
-    """Share of the load that fell outside."""
+    """Share of the load that fell outside: spilled / loaded."""
 
     state: Literal["asked", "under way", "weighed", "failed", "unknown"]
+    """'unknown': it had begun when its run ended, and has no outcome; resuming the run asks about it."""
+
     time: float | None
 
 

@@ -21,11 +21,11 @@ async function refresh() {
   try {
     const [status, campaigns, questions] = await Promise.all([call("status"), call("campaigns?limit=60"), call("questions")]);
     Object.assign(now, { status, campaigns, questions, seen: Date.now() });
-    const shown = campaigns.find((one) => RUNNING.includes(one.state) && one.run) || campaigns.find((one) => one.run);
-    const detail = shown ? await call(`campaigns/${encodeURIComponent(shown.id)}`) : null;
-    const open = shown && !RUNNING.includes(shown.state) ? "UNKNOWN" : "under way";
-    now.pours = (detail ? detail.pours_made : []).filter((pour) => pour.state !== "asked").slice(-8).reverse()
-      .map((pour) => ({ ...pour, state: pour.state === "under way" ? open : pour.state }));
+    const running = campaigns.filter((one) => RUNNING.includes(one.state) && one.run);
+    const shown = running.length ? running : campaigns.filter((one) => one.run).slice(0, 1);
+    const details = await Promise.all(shown.map((one) => call(`campaigns/${encodeURIComponent(one.id)}`)));
+    now.pours = details.flatMap((one) => one.pours_made.map((pour) => ({ ...pour, campaign: one.name })))
+      .filter((pour) => pour.state !== "asked").sort((one, other) => other.time - one.time).slice(0, 8);
     show();
     link(true);
   } catch (error) {

@@ -169,14 +169,20 @@ function weights(question, names, send) {
 export function poursTable(pours) {
   if (!pours.length) return el("p", { class: "quiet" }, "None yet.");
   return el("table", {},
-    el("thead", {}, el("tr", {}, ["Pour", "Into", "Action", "Expected", "Measured", "Spilled"].map((head) =>
+    el("thead", {}, el("tr", {}, ["Campaign", "Pour", "Into", "Action", "Expected", "Measured", SPILLED].map((head) =>
       el("th", { scope: "col" }, head)))),
     el("tbody", {}, pours.map((pour) => el("tr", { class: pour.state.replace(" ", "-") },
-      cell("Pour", pour.number), cell("Into", pour.receiver), cell("Action", pour.action), cell("Expected", pour.predicted || "—"),
-      cell("Measured", pour.measured || pour.state), cell("Spilled", pour.spillage === null ? "—" : percent(pour.spillage))))));
+      cell("Campaign", pour.campaign), cell("Pour", pour.number), cell("Into", pour.receiver), cell("Action", pour.action),
+      cell("Expected", pour.predicted || "—", pour.predicted ? pour.loss : ""),
+      cell("Measured", pour.measured || stateText(pour.state), pour.state === "weighed" ? pour.loss : ""),
+      cell(SPILLED, pour.spillage === null ? "—" : percent(pour.spillage))))));
 }
 
-const cell = (head, text) => el("td", { "data-head": head }, String(text));
+const SPILLED = "Spilled / loaded";
+
+/** A cell; `meaning` says what its value is. */
+const cell = (head, text, meaning = "") =>
+  el("td", { "data-head": head }, String(text), meaning ? el("span", { class: "meaning" }, ` ${meaning}`) : null);
 
 export function queueList(items, paused, acts) {
   return [

@@ -305,6 +305,29 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
         assert len(rows) == len(found["pours_made"]) == 3
         assert f"{100 * found['pours_made'][-1]['spillage']:.2f} %" in rows[0]
         assert found["pours_made"][-1]["predicted"] in rows[0]
+        heads = page.locator("#pours thead th").all_inner_texts()
+        assert (heads[0], heads[-1]) == ("Campaign", "Spilled / loaded")
+        cells = page.locator("#pours tbody tr").first.locator("td").all_inner_texts()
+        assert cells[0] == "cup"
+        assert cells[5].split("\n")[-1].strip() == "(spilled + retained) / loaded"
+
+
+def test_a_pour_without_outcome_reads_unknown_while_its_question_is_open(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        key = lab.do(lab.served.submit())
+        lab.do(lab.served.pouring())
+        page.goto(lab.address())
+        pour = page.locator("#pours tbody tr").first
+        pour.get_by_text("under way").wait_for()
+        page.get_by_role("button", name="Stop the motion").click()
+        page.get_by_role("button", name="Stop the motion").click()
+        pour.get_by_text("UNKNOWN").wait_for()
+        lab.do(lab.served.until(key, "unknown"))
+        lab.do(lab.served.post(f"/campaigns/{key}/resume"))
+        lab.do(lab.served.question())
+        page.get_by_role("button", name="Lost: nobody knows").wait_for()
+        assert page.locator("#pours").get_by_text("UNKNOWN").count() == 1
+        assert page.locator("#pours").get_by_text("under way").count() == 0
 
 
 def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
