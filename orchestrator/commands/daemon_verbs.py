@@ -216,7 +216,10 @@ _VERBS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
     "pause": (pause, ("decant pause quickstart-3f2a1c", "decant pause   # the queue")),
     "resume": (resume, ("decant resume quickstart-3f2a1c", "decant resume   # the queue")),
     "stop": (stop, ("decant stop quickstart-3f2a1c",)),
-    "abort": (abort, ("decant abort quickstart-3f2a1c", "decant abort --all", "decant abort --rig left", "decant abort --clear")),
+    "abort": (
+        abort,
+        ("decant abort quickstart-3f2a1c", "decant abort --all", "decant abort --rig left", "decant abort --clear"),
+    ),
     "answer": (answer, ("decant answer", "decant answer 7 done", "decant answer 8 weighed 3.2 0.4")),
     "arm": (arm, ("decant arm narrow-1b2c3d",)),
     "move": (move, ("decant move narrow-1b2c3d --first",)),

@@ -66,9 +66,7 @@ class _Read:
         return [dict(pour) for pour in self._pours.values()]
 
     def on(self, directory: Path) -> None:
-        kinds = [
-            *(Kind.REQUESTED, Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED, Kind.CAMPAIGN_STATE)
-        ]
+        kinds = [*(Kind.REQUESTED, Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED, Kind.CAMPAIGN_STATE)]
         with JournalReader(directory / JOURNAL_NAME) as journal:
             for entry in journal.entries(after=self._last, kinds=kinds):
                 self._take(entry)

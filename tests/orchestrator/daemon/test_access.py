@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import base64
+import http.client
 import itertools
+import json
 import os
+import socket
 import stat
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from orchestrator.catalogue.index import Catalogue
 from orchestrator.catalogue.registry import enter
 from orchestrator.daemon.auth import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
+from orchestrator.daemon.guard import DRAIN
 from orchestrator.daemon.packing import PackingError, unpack
 from tests.orchestrator.daemon.browsing import on_port
 from tests.orchestrator.daemon.served import Served, held, run, serving
@@ -206,10 +209,9 @@ def test_a_link_in_a_root_does_not_lead_out_of_it(tmp_path: Path) -> None:
 def test_a_disk_error_is_refused_without_paths_of_the_server(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path) as served:
-            (tmp_path / "state/campaigns").chmod(0o500)
-            if os.access(tmp_path / "state/campaigns", os.W_OK):  # root writes everywhere
-                (tmp_path / "state/campaigns").rmdir()
-                (tmp_path / "state/campaigns").write_text("not a folder")
+            snapshots = tmp_path / "state/campaigns"
+            snapshots.rmdir()
+            snapshots.symlink_to(tmp_path / "nothing" / "there")
             told = await served.post("/campaigns", {"text": "name: x\nseed: 1\n"}, status=422)
             assert_no_place_of_the_server(told["detail"], tmp_path)
 
@@ -252,19 +254,28 @@ def test_ten_megabytes_are_not_read(tmp_path: Path) -> None:
 def test_a_body_that_is_too_large_is_answered_before_the_connection_closes(
     tmp_path: Path, megabytes: int, known_length: bool
 ) -> None:
-    """Over a real socket: a reset would lose the answer."""
-    piece = b"x" * 1_000_000
-
-    def pieces() -> Iterator[bytes]:
-        yield from itertools.repeat(piece, megabytes)
-
+    """Over a real socket, with a client that sends everything before it reads: a reset would lose the answer."""
+    body = itertools.repeat(b"x" * 1_000_000, megabytes)
     with on_port(tmp_path) as lab:
-        headers = lab.served.headers()
-        body: Any = piece * megabytes if known_length else pieces()
-        answer = httpx.post(f"{lab.url}/api/v1/campaigns", headers=headers, content=body, timeout=60, trust_env=False)
-        assert answer.status_code == 413
-        assert "more than 4 MB are not read" in answer.json()["detail"]
-        assert httpx.get(f"{lab.url}/healthz", trust_env=False).status_code == 200
+        connection = http.client.HTTPConnection(lab.url.removeprefix("http://"), timeout=60)
+        headers = lab.served.headers() | ({"Content-Length": str(megabytes * 1_000_000)} if known_length else {})
+        connection.request("POST", "/api/v1/campaigns", body, headers, encode_chunked=not known_length)
+        answer = connection.getresponse()
+        assert answer.status == 413
+        assert "more than 4 MB are not read" in json.loads(answer.read())["detail"]
+        connection.close()
+
+
+def test_a_client_that_waits_for_100_continue_is_refused_at_once(tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        host, _, port = lab.url.removeprefix("http://").partition(":")
+        with socket.create_connection((host, int(port)), timeout=DRAIN / 2) as connection:
+            connection.sendall(
+                f"POST /api/v1/campaigns HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Length: 900000000\r\n"
+                "Expect: 100-continue\r\n\r\n".encode()
+            )
+            with connection.makefile("rb") as answer:
+                assert answer.read().startswith(b"HTTP/1.1 413 ")  # to the end: the connection is closed, too
 
 
 def test_another_name_for_this_machine_is_not_answered(tmp_path: Path) -> None:
