@@ -274,8 +274,10 @@ def abort(key: str | None, *, everything: bool, clear: bool, rig: str | None, at
         client.post("/emergency-stop/clear" if clear else "/emergency-stop", {"rig": rig or ""})
     of = f" of {rig}" if rig else ""
     option = f" --rig {rig}" if rig else ""
-    print(f"emergency stop{of} cleared: what was given up rests until it is resumed" if clear else
-          f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant abort --clear{option}'")  # fmt: skip
+    if clear:
+        print(f"emergency stop{of} cleared: what was given up rests until it is resumed")
+    else:
+        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant abort --clear{option}'")
 
 
 def answer(number: int | None, text: str, *, at: At) -> None:
