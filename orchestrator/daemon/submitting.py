@@ -77,8 +77,8 @@ def _without_places(text: str, settings: Settings, folder: Path) -> str:
     named = {folder, folder.resolve(), *settings.roots}
     for place in sorted(map(str, named), key=len, reverse=True):
         text = text.replace(f"{place}/", "").replace(place, "the campaign")
-    for place in {settings.state, settings.state.resolve()}:  # may hold spaces, which _PATH takes for an end
-        text = text.replace(f"{place}/", "/-/")
+    for state in {settings.state, settings.state.resolve()}:  # may hold spaces, which _PATH takes for an end
+        text = text.replace(f"{state}/", "/-/")
     return _PATH.sub(r"\1", text)
 
 
