@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,10 +58,27 @@ def prepare(settings: Settings, submission: Submission, key: str, by: str) -> It
         return _prepared(settings, submission, key, by)
     except (ConfigError, PackingError, JobError, LaboratoryError, RunError, OSError) as error:
         shutil.rmtree(folder, ignore_errors=True)
-        raise SubmissionError(str(error).replace(f"{folder}/", "").replace(str(folder), "the campaign")) from None
+        raise SubmissionError(_without_places(str(error), settings, folder)) from None
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+_PATH = re.compile(r"(?<![\w./~])/(?:[^\s/'\":;,()\[\]]+/)+([^\s/'\":;,()\[\]]+)")
+"""An absolute path of two parts or more; the group is its last part."""
+
+
+def _without_places(text: str, settings: Settings, folder: Path) -> str:
+    """A message without the paths of this machine: who submits from elsewhere may not learn where things are.
+
+    Files of the campaign are named as the campaign names them, others by their last part.
+    """
+    named = {folder, folder.resolve(), *settings.roots}
+    for place in sorted(map(str, named), key=len, reverse=True):
+        text = text.replace(f"{place}/", "").replace(place, "the campaign")
+    for state in {settings.state, settings.state.resolve()}:  # may hold spaces, which _PATH takes for an end
+        text = text.replace(f"{state}/", "/-/")
+    return _PATH.sub(r"\1", text)
 
 
 def _prepared(settings: Settings, submission: Submission, key: str, by: str) -> Item:
