@@ -97,6 +97,8 @@ class _Parser:
             function = self._function()
             if self._word.kind != "end of text":
                 raise self._unexpected("nothing more")
+            if function.parameters:
+                raise ScriptError(f"program '{function.name}' must not have parameters", function.line)
             return function
         body, line = [], self._word.line
         while self._word.kind != "end of text":
