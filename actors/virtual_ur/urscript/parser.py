@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.lexer import Word, words
 from actors.virtual_ur.urscript.tree import (
@@ -311,10 +313,12 @@ class _Parser:
 
 
 def _number(word: Word) -> int | float:
-    if word.text[:2] in ("0x", "0X"):
-        return int(word.text, 16)
-    if word.text.isdigit():
+    hexadecimal = word.text[:2] in ("0x", "0X")
+    if hexadecimal or word.text.isdigit():
         if len(word.text) > 18:
             raise ScriptError("a number with too many digits", word.line)
-        return int(word.text)
-    return float(word.text)
+        return int(word.text, 16 if hexadecimal else 10)
+    value = float(word.text)
+    if not isfinite(value):
+        raise ScriptError("a number that is too large", word.line)
+    return value
