@@ -2,9 +2,10 @@
 
     python benchmarks/control_period.py [--seconds 30] [--runs 3] [--cores 2] [--simulators 2] [--json]
 
-A UR10e in real time at 500 Hz moves to and fro while a client reads it at 500 Hz; simulators pour again and again on the
-same cores, each in a session of its own and as nice as those of a campaign. The controller reports its latest wake-up
-itself, so that a client's own delays are left out. Both settings alternate, so that other work on the machine meets both.
+A UR10e in real time at 500 Hz moves to and fro while a client reads it at 500 Hz; simulators pour again and again on
+the same cores, each in a session of its own and as nice as those of a campaign. The controller reports its latest
+wake-up itself, so that a client's own delays are left out. Both settings alternate, so that other work on the machine
+meets both. `stolen_ms` is what a hypervisor kept from all cores meanwhile, against which no priority helps.
 """
 
 from __future__ import annotations
@@ -88,16 +89,18 @@ def measure(seconds: float, *, prioritised: bool) -> dict[str, Any]:
             client.sendall(rtde.package(rtde.REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2)))
             client.sendall(rtde.package(rtde.SETUP_OUTPUTS, struct.pack(">d", 500.0) + b"timestamp,actual_q,actual_qd"))
             client.sendall(rtde.package(rtde.START, b""))
-            end = time.monotonic() + seconds
+            before, end = psutil.cpu_times().steal, time.monotonic() + seconds
             while time.monotonic() < end:
                 client.recv(65536)
         timing = controller.fault("state", patience=30.0)["timing"]
+        stolen = psutil.cpu_times().steal - before
     return {
         "priority": timing["priority"],
         "longest_gap_ms": round(1e3 * (timing["worst"] + PERIOD), 1),
         "late_percent": round(100.0 * timing["late"] * PERIOD / timing["wall"], 3),
         "dropped_ms": round(1e3 * timing["dropped"], 1),
         "cpu_percent": round(100.0 * timing["cpu"], 1),
+        "stolen_ms": round(1e3 * stolen),
     }
 
 
@@ -122,7 +125,7 @@ def main() -> None:
                 rows.append({"run": run + 1, **measure(chosen.seconds, prioritised=prioritised)})
                 say(str(rows[-1]))
     if chosen.json:
-        show({"machine": describe(), "settings": vars(chosen), "rows": rows})
+        show({"machine": describe(), "settings": vars(chosen), "rows": rows}, True)
         return
     for priority in dict.fromkeys(row["priority"] for row in rows):
         gaps = [row["longest_gap_ms"] for row in rows if row["priority"] == priority]

@@ -1,9 +1,9 @@
 """Which values clients may read and write over RTDE, and what they mean here.
 
 Names, types and versions: the manufacturer's RTDE guide. Fields that came after the software modelled here (3.15, 5.12)
-are not found: `collision_detection_ratio` (5.15), `time_scale_source` (5.17), `actual_current_as_torque` (5.23), energies,
-accelerations of the tool, …. The guide gives no version for `tcp_offset`, encoders and configurable inputs and outputs;
-they are assumed to have come with the e-Series.
+are not found: `collision_detection_ratio`, `time_scale_source`, `actual_current_as_torque`, energies, accelerations of
+the tool and others. For `tcp_offset`, encoders and configurable inputs and outputs no version could be found; they are
+assumed to have come with the e-Series.
 """
 
 from __future__ import annotations
