@@ -197,8 +197,8 @@ DOCUMENTED = {
     "VECTOR3D": "elbow_position elbow_velocity payload_cog",
     "INT32": "safety_status tool_output_voltage",
     "UINT32": "robot_status_bits safety_status_bits analog_io_types euromap67_input_bits euromap67_output_bits "
-    "tool_mode tool_analog_input_types output_bit_registers0_to_31 output_bit_registers32_to_63 input_bit_registers0_to_31 "
-    "input_bit_registers32_to_63 script_control_line",
+    "tool_mode tool_analog_input_types output_bit_registers0_to_31 output_bit_registers32_to_63 "
+    "input_bit_registers0_to_31 input_bit_registers32_to_63 script_control_line",
 }
 """What else the manufacturer documents for both generations of controllers, registers left out."""
 
