@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import faulthandler
 import os
+import signal
 import time
 import traceback
 from collections import deque
@@ -224,8 +225,8 @@ async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG)
     """Wait for a parent process to end: by its standard input, which ends with it, and by its number.
 
     The pipe alone isn't enough: a grandchild that was forked may hold its other end open. Neither is noticed by an
-    interpreter that hangs; so a thread without Python in it ends the process, with a traceback, unless it is put
-    off again and again.
+    interpreter that hangs; so an alarm signal, which needs no Python, ends the process with a traceback unless it is
+    put off again and again. A thread that does the same would have to be waited for each time, and has no priority.
 
     Args:
         parent: its number.
@@ -242,8 +243,9 @@ async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG)
 
     with contextlib.suppress(OSError):  # not every standard input can be waited for: /dev/null can't
         loop.add_reader(0, readable)
+    faulthandler.register(signal.SIGALRM, chain=True)  # the traceback, and then what ends a process by default
     while not gone.is_set() and os.getppid() == parent:
-        faulthandler.dump_traceback_later(hung, exit=True)
+        signal.setitimer(signal.ITIMER_REAL, hung)
         try:
             await asyncio.wait_for(gone.wait(), interval)
         except TimeoutError:
