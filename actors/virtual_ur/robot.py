@@ -196,6 +196,20 @@ class Robot:
         return cached  # type: ignore[return-value]
 
     @property
+    def elbow_velocity(self) -> Vector:
+        """Measured velocity of the elbow, which the first two joints move [m/s]."""
+        if self.qd == _ZERO:
+            return 0.0, 0.0, 0.0
+        elbow = self.kinematics.axes(self.q)[1][2]
+        x, y, z, *_ = self.kinematics.velocity(self.q, (self.qd[0], self.qd[1], 0.0, 0.0, 0.0, 0.0), elbow)
+        return x, y, z
+
+    @property
+    def deviation(self) -> float:
+        """Largest distance of a joint from its target [rad]."""
+        return max(abs(a - b) for a, b in zip(self.q, self.mover.q, strict=True))
+
+    @property
     def target_tool_speed(self) -> Pose:
         """Targeted velocity of the tool centre point [m/s], [rad/s]."""
         if self.mover.qd == _ZERO:
