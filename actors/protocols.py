@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from sim_engine.errors import DecantError
 from sim_engine.outcome import PourMeasurement
 from sim_engine.simulated import RecordedFrames, SimulatedPour
 from sim_engine.task import PourTask, Scene
 
 
-class LaboratoryError(Exception):
+class LaboratoryError(DecantError):
     """Something in the laboratory can't do what was asked; the text is for the person who can mend it."""
 
 

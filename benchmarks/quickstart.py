@@ -3,7 +3,7 @@
     python benchmarks/quickstart.py [--seeds 20] [--first 101] [--arms shipped ...] [--laboratory FILE]
                                     [--into build/quickstart] [--write]
 
-The shipped campaign as it is; only θ* is not held against test pours, which the deployment does not hear of. A seed is
+The shipped campaign as it is; only random θ are not scored, which the deployment does not depend on. A seed is
 a process of its own that ends with this one. Every simulated pour of a seed is kept under `--into`, by what was asked
 and the solver that answered, so that the arms of a seed share their calibration and whatever else they both ask for,
 pour for pour the same; finished runs are kept there, too, and an interrupted comparison goes on. `--write` makes no
@@ -92,7 +92,6 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     from orchestrator.campaign import run_campaign
     from orchestrator.report.results import deployments_of
     from orchestrator.runs import create_run
-    from orchestrator.stages import EVALUATION, stages_of
     from sim_engine.validation.sources import solver_fingerprint
 
     ARMS[arm]()
@@ -101,13 +100,11 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
         content: dict[str, Any] = {**shipped.resolved, "seed": seed, "outputs": {"directory": folder, "rrd": False}}
         content["laboratory"]["bench"]["time_scale"] = 3000  # nobody watches; the numbers are the same
+        content["calibration"]["random_baseline"] = 0
         campaign = build_campaign(content, folder)
-        stages = tuple(stage for stage in stages_of(campaign) if stage.name != EVALUATION)
         spec = replace(campaign.laboratory, in_process=True)
         result = asyncio.run(
-            run_campaign(
-                campaign, open_laboratory(spec, need_bench=True, kept=pool), create_run(campaign), stages=stages
-            )
+            run_campaign(campaign, open_laboratory(spec, need_bench=True, kept=pool), create_run(campaign))
         )
         asyncio.run(pool.close())
     (found,) = deployments_of(result.results).values()

@@ -13,15 +13,17 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.pour_rows import Answer, Row, answers, pour_row
 from orchestrator.publish import Published, report_on
 from orchestrator.publish import publish as write
-from orchestrator.report.results import deployments_of, predictions_of, theta_of
+from orchestrator.report.results import deployments_of, gain_of, predictions_of, recommended_theta_of, theta_of
 from orchestrator.report.units import loss_of_pour
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
 from orchestrator.results import Results
 from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.evaluation import CalibrationGain
 from orchestrator.strategies.deployment.learnt import Recommended
 from orchestrator.strategies.display import displayed_action
 from sim_engine.extras import require
+from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
 from sim_engine.spread import Spread
 
@@ -58,6 +60,19 @@ class Run:
     def calibrated(self) -> CalibratedTheta | None:
         """θ*, what is expected of it and which other θ fit; None where nothing was calibrated."""
         return theta_of(self.results)
+
+    @property
+    def theta(self) -> SimulationParameters | None:
+        """The θ to simulate with: θ*, or the uncalibrated one if the pours do not justify θ*.
+
+        None without a calibration.
+        """
+        return recommended_theta_of(self.results)
+
+    @property
+    def calibration_gain(self) -> CalibrationGain | None:
+        """Whether the weighed pours justify θ*, in numbers and words (`text`); None where that was not compared."""
+        return gain_of(self.results)
 
     @property
     def recommended(self) -> dict[str, Recommended]:

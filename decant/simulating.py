@@ -11,6 +11,7 @@ from orchestrator.config.campaign.assignments import assigned_action
 from orchestrator.config.campaign.check import check_vessels
 from orchestrator.config.load import load_vessel
 from orchestrator.plan import CampaignPlan
+from sim_engine.errors import InvalidArgumentError, InvalidSceneError
 from sim_engine.liquid import SimulationParameters
 from sim_engine.simulated import SimulatedPour
 from sim_engine.spread import Spread, spreads
@@ -69,14 +70,18 @@ def simulate(
         receiver: another vessel, or its file.
         theta: simulation parameters; the campaign's unless given.
         seed: of the first pour's initial positions; those that follow have the next ones.
-        seeds: how many.
+        seeds: how many, 1 or more.
 
     Raises:
-        ValueError: the action is not complete, or the vessels touch, don't hold the load, or can't be built.
+        ConfigError: the receiver's file is wrong.
+        ValueError: `seeds` is below 1, the action is not complete, or the vessels touch, don't hold the load, or can't
+            be built (each is a `DecantError`).
     """
     from orchestrator.commands.single import scene_to_simulate
     from sim_engine.pour import PourSimulator
 
+    if seeds < 1:
+        raise InvalidArgumentError(f"seeds={seeds!r}: should be 1 or more")
     scene, space = scene_to_simulate(campaign)
     if receiver is not None:
         vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver))
@@ -85,7 +90,7 @@ def simulate(
         [f"{name}={value}" for name, value in (action or {}).items()], fixed=scene.fixed, space=space
     )
     if problems := check_vessels(scene, campaign.source):
-        raise ValueError("\n".join(map(str, problems)))
+        raise InvalidSceneError("\n".join(map(str, problems)))
     parameters = campaign.parameters if theta is None else theta
     tasks = [
         PourTask(scene.drawn(seed + i), chosen, parameters, seed + i, FRAME_RATE if i == 0 else 0.0)

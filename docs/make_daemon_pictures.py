@@ -233,7 +233,13 @@ def draw(browser: Browser, lab: Lab) -> None:
     lab.call(f"questions/{number}/answer", {"answer": "yes"}, "POST")
     until(lambda: lab.checkpoint() == "tilt")
     lab.call("emergency-stop", {"reason": "the tray slipped"}, "POST")
-    picture(browser, lab, "emergency-tablet", "tablet", lambda page: page.get_by_text("Clear it").click())
+    picture(
+        browser,
+        lab,
+        "emergency-tablet",
+        "tablet",
+        lambda page: page.get_by_role("button", name="Clear the stop").click(),
+    )
 
 
 if __name__ == "__main__":

@@ -18,6 +18,9 @@ from nbclient import NotebookClient
 DOCS = Path(__file__).resolve().parent
 PAGE, NOTEBOOK = DOCS / "library.md", DOCS / "library.ipynb"
 
+CELL = re.compile(r"^\S*/ipykernel_\d+/\d+\.py:\d+: ", flags=re.MULTILINE)
+"""Where a warning was issued: a file of the kernel, which has another name each time."""
+
 SHOWN = re.compile(r"^(.*)\.savefig\(.*\)$", flags=re.MULTILINE)
 
 
@@ -57,6 +60,8 @@ def _joined(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]
     """What a cell printed in one piece; in how many it came is chance."""
     joined: list[nbformat.NotebookNode] = []
     for output in outputs:
+        if output.output_type == "stream":
+            output.text = CELL.sub("", output.text)
         last = joined[-1] if joined else None
         if last is not None and output.output_type == last.output_type == "stream" and output.name == last.name:
             last.text += output.text

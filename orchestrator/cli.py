@@ -103,7 +103,7 @@ _campaign_verb(
     "calibrate",
     """Only calibrate: find the θ whose simulated spills match the weighed ones (C1 to C4), scored on unseen pours.
 
-θ* goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
+The recommended θ goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
 """,
     "decant calibrate configs/campaigns/recorded.yaml --json",
     "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",

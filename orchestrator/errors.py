@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from sim_engine.errors import DecantError
 
-class RunError(Exception):
+
+class RunError(DecantError):
     """A run can't begin or go on. The text is for the person who can mend it.
 
     Attributes:

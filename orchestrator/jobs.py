@@ -1,19 +1,28 @@
-"""What a verb makes of a campaign: its plan, the stages that are to run, and whether the run can be resumed.
+"""What a verb makes of a campaign: its plan, the stages that are to run, and the checks before they may.
 
 The command line, the daemon and notebooks share it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from orchestrator.errors import RunError
 from orchestrator.plan import CampaignPlan
-from orchestrator.stages import StageDefinition, calibration_stages, deployment_stages, prediction_stages, stages_of
+from orchestrator.stages import (
+    POSTERIOR_DRAWS,
+    StageDefinition,
+    calibration_stages,
+    deployment_stages,
+    prediction_stages,
+    stages_of,
+)
 
 if TYPE_CHECKING:
+    from orchestrator.config.yaml.errors import Problem
     from sim_engine.liquid import SimulationParameters
     from sim_engine.vessel.spec import VesselSpec
 
@@ -25,8 +34,8 @@ PLANNED = "-plan"
 """Behind the name of a campaign that is planned alone."""
 
 
-class JobError(RunError):
-    """The campaign has not what the verb needs."""
+class JobError(RunError, ValueError):
+    """The campaign can't run as it is asked to; the text has everything that is wrong."""
 
     exit_code = 2
 
@@ -49,8 +58,100 @@ class Job:
         return any(stage.pours for stage in self.stages)
 
 
-def job(plan: CampaignPlan, verb: Verb = "run") -> Job:
+@dataclass(frozen=True)
+class GivenTheta:
+    """θ that a campaign is planned with, of a calibration or written by hand.
+
+    Attributes:
+        theta: the θ itself.
+        draws: of its posterior; empty where none is known, or the campaign's risk bears none.
+        left_over: shift that the calibration left (`sim_engine.bands`); None where it is not known.
+    """
+
+    theta: SimulationParameters
+    draws: tuple[SimulationParameters, ...] = ()
+    left_over: float | None = None
+
+
+def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
+    """θ from a file, such as the `theta.json` of a calibration.
+
+    Args:
+        path: of the file.
+        plan: whose θ has what the file does not name; if its risk bears draws of a posterior, the file needs them.
+
+    Raises:
+        ConfigError: anything is wrong with the file.
+    """
+    from orchestrator.config.load import load_discrepancy, load_parameters, load_posterior
+
+    needed = plan.deployment is not None and plan.deployment.settings.needs_posterior
+    draws = load_posterior(path, POSTERIOR_DRAWS, plan.parameters) if needed else ()
+    return GivenTheta(load_parameters(path, plan.parameters), draws, load_discrepancy(path))
+
+
+def _nothing(told: object) -> None:
+    """Default of a callback."""
+
+
+def check_job(
+    plan: CampaignPlan,
+    *,
+    as_written: bool = True,
+    warn: Callable[[Problem], None] = _nothing,
+    doing: Callable[[str], None] = _nothing,
+) -> None:
+    """Check all that can be checked before anything starts: draws of θ, vessels, loads, motions.
+
+    Args:
+        plan: of the work.
+        as_written: its vessels are those of its file.
+        warn: called with everything that is suspicious, but not wrong.
+        doing: called with the step that is being done.
+
+    Raises:
+        JobError: with everything that is wrong.
+    """
+    from orchestrator.config.campaign.check import check_campaign
+
+    problems = [str(one) for one in check_campaign(plan, as_written=as_written, warn=warn, doing=doing)]
+    if (problem := _lacking_posterior(plan)) is not None:
+        problems.append(problem)
+    if problems:
+        raise JobError("\n".join(problems))
+
+
+def _lacking_posterior(plan: CampaignPlan) -> str | None:
+    """Draws of θ that deployment is to bear are given, or made by the campaign's own calibration; else the problem."""
+    from orchestrator.strategies.doors import calibrations
+
+    if plan.deployment is None or not plan.deployment.settings.needs_posterior or plan.deployment.thetas:
+        return None
+    if plan.calibration is not None and plan.calibration.settings.makes_posterior:
+        return None
+    known = [name for name, settings in calibrations().items() if settings().makes_posterior]
+    has = "has no calibration"
+    if plan.calibration is not None and plan.calibration.strategy not in known:
+        has = f"calibrates with {plan.calibration.strategy}"
+    elif plan.calibration is not None:
+        return (
+            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which no surrogate makes that "
+            "takes actions for noise; write 'calibration: {averaging: context}', or 'theta: best'"
+        )
+    return (
+        f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which only {' and '.join(known)} "
+        f"makes, and this campaign {has}; calibrate with {known[0]}, write 'theta: best', or use decant plan "
+        "--parameters with the theta.json of a calibration"
+    )
+
+
+def job(plan: CampaignPlan, verb: Verb = "run", given: GivenTheta | None = None) -> Job:
     """The work that a verb asks for.
+
+    Args:
+        plan: of the campaign.
+        verb: what to do with it.
+        given: to 'plan': θ in place of the campaign's.
 
     Raises:
         JobError: the campaign has no section for it.
@@ -64,7 +165,9 @@ def job(plan: CampaignPlan, verb: Verb = "run") -> Job:
             # The deployment stays out: its vessels need not be there yet.
             return Job(replace(plan, deployment=None), calibration_stages(plan.calibration))
         case "plan":
-            plan = planned(plan)
+            plan = (
+                planned(plan) if given is None else planned(plan, given.theta, None, None, given.draws, given.left_over)
+            )
             assert plan.deployment is not None
             stages = deployment_stages(plan, plan.deployment)
             return Job(plan, [*stages, *prediction_stages(plan, plan.deployment, PREDICTION_SEEDS)])
@@ -105,7 +208,7 @@ def planned(
     if deployment.settings.needs_posterior and not thetas:
         raise JobError(
             f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration by "
-            "C4, or a calibration in the same run"
+            "C4 (in a program: theta), or a calibration in the same run"
         )
     scenes = deployment.scenes
     if receiver is not None:

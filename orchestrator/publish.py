@@ -14,6 +14,7 @@ from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import regimes
 from orchestrator.report.campaign import draw_figures
+from orchestrator.report.names import receiver_names
 from orchestrator.report.record import read_record
 from orchestrator.report.results import evaluation_of, theta_of
 from orchestrator.report.run_page import REPORT_NAME, run_page
@@ -23,7 +24,7 @@ from orchestrator.run_result import CampaignResult
 from orchestrator.runs import VERSIONS
 from orchestrator.strategies.calibration.base import CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
-from orchestrator.strategies.calibration.scorecard import shift_left_over
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED, recommended_theta, shift_left_over
 
 W = TypeVar("W")
 
@@ -59,7 +60,7 @@ class Published:
 
     Attributes:
         figures: by name.
-        theta: the file of θ*, for `--parameters`; None where nothing was calibrated.
+        theta: the file of the recommended θ, for `--parameters`; None where nothing was calibrated.
         report: the page about the run, for people; None where it could not be written.
     """
 
@@ -174,14 +175,21 @@ def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory:
 
 
 def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str, Any]:
-    """What `theta.json` holds: θ*, what it left over, and where it is known the posterior as weighted θ, each complete.
+    """What `theta.json` holds: the recommended θ, what it left over, and where it is known the posterior of θ.
+
+    The posterior is a list of weighted θ, each complete. If the uncalibrated θ is recommended, `calibrated` has θ* and
+    `recommended` is 'uncalibrated', so that predictions do not draw from the posterior unless they are asked to.
 
     Args:
         found: by the calibration.
         scored: θ* on the weighed pours; None: nobody knows what it left over.
     """
     theta = found.theta.model_dump()
-    data: dict[str, Any] = {"theta": theta}
+    data: dict[str, Any] = {"theta": recommended_theta(found.theta, scored).model_dump()}
+    if scored is not None and scored.gain is not None:
+        data |= {"recommended": scored.gain.recommended, "why": scored.gain.text}
+        if scored.gain.recommended == UNCALIBRATED:
+            data["calibrated"] = theta
     left = None if scored is None else shift_left_over(scored, len(found.searched))
     if left is not None:
         data["remaining_discrepancy"] = {"shift": left}
@@ -222,3 +230,14 @@ def worked_out(
     except (ValueError, OSError) as error:
         tell(f"note: whether something is not simulated could not be worked out: {error}")
         return {}
+
+
+def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning) -> list[str]:
+    """What is not simulated in a campaign's action spaces: lines for the user before it begins.
+
+    Args:
+        plan: of the campaign.
+        tell: called if that can't be worked out.
+    """
+    warnings = worked_out(lambda: regimes.campaign_warnings(plan), tell)
+    return regimes.lines(warnings, receiver_names(plan))

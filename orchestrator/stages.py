@@ -19,7 +19,7 @@ from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, DesignPoured
 from orchestrator.strategies.calibration.draws import drawn_benches
 from orchestrator.strategies.calibration.evaluation import ScoredPour, Scores, random_parameters
-from orchestrator.strategies.calibration.scorecard import DRAWS, Scorecard, shift_left_over
+from orchestrator.strategies.calibration.scorecard import DRAWS, Scorecard, recommended_theta, shift_left_over
 from orchestrator.strategies.deployment.confirm import Confirmation
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.deployment.learnt import Deployed
@@ -125,7 +125,7 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
         measured = {prior.name: prior.mean for prior in plan.parameter_prior}
-        plain = SimulationParameters.from_values(plan.fixed_parameters | measured) if rivals else None
+        plain = SimulationParameters.from_values(plan.fixed_parameters | measured)
         drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
         return Scorecard(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain, drawn=drawn)
 
@@ -150,7 +150,7 @@ def _stand_in(plan: CalibrationPlan) -> Calibrated:
 
 
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
-    """One stage for each receiver, all with the calibrated θ (the plan's where nothing is calibrated).
+    """One stage for each receiver, all with the recommended θ (the plan's where nothing is calibrated).
 
     Each is followed by one that pours what was recommended again, where the plan asks for that.
     """
@@ -268,8 +268,18 @@ def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
 
 
 def _theta(plan: CampaignPlan, results: Results) -> SimulationParameters:
-    """The calibrated θ; the plan's where nothing was calibrated."""
-    return calibrated_theta(results).theta if CALIBRATION in results else plan.parameters
+    """The θ that calibration recommends; the plan's where nothing was calibrated."""
+    return deployed_theta(results) if CALIBRATION in results else plan.parameters
+
+
+def deployed_theta(results: Results) -> SimulationParameters:
+    """The θ to deploy with: θ*, or the uncalibrated one if the weighed pours do not justify θ*.
+
+    Raises:
+        RunError: the calibration found no θ*.
+    """
+    scores = learnt_by(results, EVALUATION, Scores) if EVALUATION in results else None
+    return recommended_theta(calibrated_theta(results).theta, scores)
 
 
 def calibrated_theta(results: Results) -> CalibratedTheta:

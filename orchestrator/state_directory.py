@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 
 VARIABLE = "DECANT_STATE"
@@ -26,6 +27,22 @@ def state_directory() -> Path:
         return Path.home() / ".local" / "state" / "decant"
     except RuntimeError:
         raise OSError(f"this user has no home directory; set {VARIABLE} to a folder for Decant's state") from None
+
+
+def make_state_directory(path: Path) -> None:
+    """Make the state directory, or take one that exists, and let only its owner read it (0700).
+
+    It holds tokens, campaigns and results. Call this before anything is written there. A directory of another user is
+    left as it is: its mode is that user's decision.
+
+    Raises:
+        OSError: it can't be made.
+    """
+    path.mkdir(parents=True, exist_ok=True, mode=0o700)
+    found = path.stat()
+    mode = stat.S_IMODE(found.st_mode)
+    if mode & 0o077 and found.st_uid == os.geteuid():
+        path.chmod(mode & 0o700)
 
 
 def use_state_directory(path: Path) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import ctypes
 from typing import Literal
 
+from sim_engine.errors import DecantError
+
 Backend = Literal["cpu", "cuda"]
 
 BACKENDS: tuple[Backend, ...] = ("cpu", "cuda")
 
 
-class BackendError(RuntimeError):
+class BackendError(DecantError, RuntimeError):
     """A backend was asked for that is not there."""
 
 

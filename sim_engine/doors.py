@@ -14,10 +14,12 @@ from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
+from sim_engine.errors import DecantError
+
 T = TypeVar("T")
 
 
-class DoorError(LookupError):
+class DoorError(DecantError, LookupError):
     """Nothing usable is registered under a name: unknown, or of a plug-in that can't be loaded."""
 
 

@@ -1,9 +1,20 @@
-"""Why a pour can't be simulated. Light: importing this starts nothing."""
+"""The base of Decant's errors, and why a pour can't be simulated. Light: importing this starts nothing."""
 
 from __future__ import annotations
 
 
-class InvalidSceneError(ValueError):
+class DecantError(Exception):
+    """Base of all errors that Decant's public functions raise on purpose; the text is for the user.
+
+    Errors of files that can't be opened, read or written remain Python's (`OSError`).
+    """
+
+
+class InvalidArgumentError(DecantError, ValueError):
+    """An argument of a public function can't be used; the text says which, and what would be right."""
+
+
+class InvalidSceneError(DecantError, ValueError):
     """The pour can't be made at all: the vessels touch, or the load does not fit. Nothing was simulated."""
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 
+from sim_engine.errors import DecantError
+
 EXTRAS = {
     "ray": "lab",
     "serial": "lab",
@@ -24,7 +26,7 @@ EXTRAS = {
 """Importable name → extra."""
 
 
-class MissingExtraError(ImportError):
+class MissingExtraError(DecantError, ImportError):
     """A package that belongs to an extra is not installed; the text says what to install."""
 
 

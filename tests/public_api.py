@@ -1,4 +1,5 @@
-"""What others build on, as text: names of `import decant` with their signatures, entry-point groups, contracts.
+"""What others build on, as text: names of `import decant` and `decant.testing` with
+their signatures, entry-point groups.
 
 `python -m tests.public_api` writes it to tests/public-api.txt.
 """
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import decant
+from decant import testing
 
 ROOT = Path(__file__).parent.parent
 KEPT = Path(__file__).with_name("public-api.txt")
@@ -21,6 +23,7 @@ KEPT = Path(__file__).with_name("public-api.txt")
 def public_api() -> str:
     """One line for each name, sorted."""
     lines = [line for name in decant.__all__ for line in _lines(f"decant.{name}", getattr(decant, name))]
+    lines += [line for name in testing.__all__ for line in _lines(f"decant.testing.{name}", getattr(testing, name))]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines += [
         f"entry point {group}: {name}" for group, names in project["entry-points"].items() for name in sorted(names)
@@ -34,9 +37,9 @@ def _lines(name: str, value: Any) -> list[str]:
         return [line for n in own if not n.startswith("_") for line in _lines(f"{name}.{n}", getattr(value, n))]
     if inspect.isclass(value):
         return [_class_line(name, value), *_members(name, value)]
-    if callable(value):
+    if inspect.isfunction(value):
         return [f"{name}{inspect.signature(value)}"]
-    return [f"{name} = {value}"]
+    return [f"{name}: {type(value).__name__}"]
 
 
 def _class_line(name: str, cls: type) -> str:

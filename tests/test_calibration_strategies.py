@@ -17,8 +17,8 @@ from actors.optimizer.core.propose import propose
 from orchestrator.config.load import load_campaign
 from orchestrator.plan import CampaignPlan
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.strategy_harness import outcome_of
 from sim_engine.action import Action
-from tests.orchestrator.play import outcome_of
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 

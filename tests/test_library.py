@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 import decant
+from orchestrator.requests import Simulate
 from tests.depth import THOROUGH
 
 ROOT = Path(__file__).parents[1]
@@ -120,3 +121,180 @@ def test_a_built_campaign_names_the_place_of_what_is_wrong_in_it() -> None:
     content = decant.load_campaign(decant.shipped("campaigns/quickstart.yaml")).resolved
     with pytest.raises(decant.ConfigError, match="simulatons"):
         decant.build_campaign({**content, "calibration": {**content["calibration"], "simulatons": 3}})
+
+
+USER = """
+from pathlib import Path
+
+import decant
+
+
+def action(path: str, table: list[dict[str, float | str]]) -> dict[str, float | None]:
+    campaign = decant.load_campaign(path)
+    campaign = decant.load_campaign(Path(path), laboratory="twin.yaml", seed=3)
+    seen: list[decant.Event] = []
+    try:
+        calibrated = decant.calibrate(campaign, table, watch=[seen.append])
+        planned = decant.plan(campaign, decant.load_vessel("mug.yaml"), theta=calibrated, seeds=2)
+    except (decant.ConfigError, decant.AssignmentError, decant.RunError) as error:
+        raise SystemExit(1) from error
+    except decant.DecantError:
+        raise
+    theta: decant.SimulationParameters | None = calibrated.theta
+    print(theta, decant.shipped("campaigns/quickstart.yaml"), decant.events.StageOpened)
+    return planned.recommended["mug"].action
+
+
+decant.open_runs("misspelt")  # type: ignore[attr-defined]
+"""
+
+
+def test_a_program_of_a_user_passes_a_strict_type_check_and_misspelt_names_do_not(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(USER, encoding="utf-8")
+    command = [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--cache-dir", str(tmp_path / "cache")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([*command, str(program)], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
+    from orchestrator.codec import CodecError
+    from orchestrator.jobs import JobError
+    from orchestrator.journal_file import JournalError
+    from sim_engine.backend import BackendError
+    from sim_engine.doors import DoorError
+    from sim_engine.errors import InvalidSceneError
+    from sim_engine.vessel.errors import VesselError
+
+    before: dict[type[Exception], type[Exception]] = {
+        decant.AssignmentError: ValueError,
+        decant.ConfigError: Exception,
+        decant.InvalidArgumentError: ValueError,
+        decant.LaboratoryError: Exception,
+        decant.MissingExtraError: ImportError,
+        decant.RunError: Exception,
+        BackendError: RuntimeError,
+        CodecError: ValueError,
+        DoorError: LookupError,
+        InvalidSceneError: ValueError,
+        JobError: ValueError,
+        JournalError: decant.RunError,
+        VesselError: ValueError,
+    }
+    assert all(issubclass(error, decant.DecantError) and issubclass(error, old) for error, old in before.items())
+    named = [getattr(decant, name) for name in decant.__all__ if name.endswith("Error")]
+    assert len(named) == 7
+    assert all(issubclass(error, decant.DecantError) for error in named)
+
+
+def small(folder: Path, **changes: Any) -> decant.CampaignPlan:
+    """The quickstart with runs in a folder of the test; its sections with other values."""
+    content = dict(decant.load_campaign(decant.shipped("campaigns/quickstart.yaml")).resolved)
+    content["outputs"] = {"directory": str(folder / "runs"), "rrd": False, "figures": False}
+    for name, section in changes.items():
+        content[name] = section
+    content = {name: section for name, section in content.items() if section is not None}
+    return decant.build_campaign(content, folder)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda plan: decant.plan(plan, seeds=0), "seeds=0: should be 1 or more"),
+        (lambda plan: decant.plan(plan, iterations=0), "iterations=0: should be 1 or more"),
+        (lambda plan: decant.simulate(plan, seeds=0), "seeds=0: should be 1 or more"),
+        (lambda plan: decant.simulate(plan, {"angular_velocity": "3 kg"}), "angular_velocity"),
+        (lambda plan: decant.calibrate(plan, "pours.csv"), "should be a pandas.DataFrame or a list of dicts, not str"),
+        (lambda plan: decant.calibrate(plan, [1, 2]), "every row should be a dict"),
+        (lambda plan: decant.find_runs(since="yesterday"), "'yesterday' is not a date"),
+    ],
+)
+def test_an_argument_that_can_not_be_used_is_one_clear_error_and_leaves_no_run(
+    tmp_path: Path, call: Any, said: str
+) -> None:
+    with pytest.raises(decant.DecantError, match=re.escape(said)) as refused:
+        call(small(tmp_path))
+    assert isinstance(refused.value, ValueError)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_refused_table_leaves_no_run_and_names_the_place_of_its_error(tmp_path: Path) -> None:
+    row = {"angular_velocity_deg_s": 20, "max_angle_deg": 110, "poured_g": 198, "retained_g": 2, "split": "train"}
+    rows = [{**row, "spilled_g": 1.2}, {**row, "spilled_g": "much"}]
+    with pytest.raises(decant.ConfigError, match=r"pours\.csv:3:\d+") as refused:
+        decant.calibrate(small(tmp_path), rows)
+    assert "much" in str(refused.value)
+    assert not (tmp_path / "runs").exists()
+
+
+RISK = {"measure": "cvar", "level": 0.9, "theta": "posterior", "pose_error": {"x": "3 mm"}}
+
+
+def risky(folder: Path, *, calibration: bool = True) -> decant.CampaignPlan:
+    """A campaign whose deployment bears draws of θ."""
+    plan = decant.load_campaign(decant.shipped("campaigns/quickstart.yaml"))
+    kept = {key: plan.resolved["deployment"][key] for key in ("receiver", "motion", "actions")}
+    kept = {key: value for key, value in kept.items() if value is not None}
+    changes: dict[str, Any] = {"deployment": {"strategy": "D1", **kept, "risk": RISK}}
+    if not calibration:
+        changes["simulator"] = {"parameters": {"particles": 500}}
+        changes["calibration"] = None
+    return small(folder, **changes)
+
+
+@pytest.fixture
+def fake_simulators(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Campaigns of the library with simulators that make numbers up."""
+    from functools import partial
+
+    from actors.laboratory import open_laboratory
+    from tests.actors.conftest import make_fake
+
+    monkeypatch.setattr("decant.driving.open_laboratory", partial(open_laboratory, make=make_fake()))
+
+
+def test_draws_of_theta_that_no_calibration_makes_are_refused_before_a_run_begins(tmp_path: Path) -> None:
+    with pytest.raises(decant.RunError, match="this campaign has no calibration") as refused:
+        decant.run(risky(tmp_path, calibration=False))
+    assert isinstance(refused.value, ValueError)
+    with pytest.raises(decant.DecantError, match=r"needs --parameters, .*\(in a program: theta\)"):
+        decant.plan(risky(tmp_path))
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_campaign_that_bears_draws_of_theta_is_planned_with_those_of_a_calibration(
+    tmp_path: Path, fake_simulators: None
+) -> None:
+    import json
+
+    rows = [{"theta": {"friction": friction}, "weight": 1.0} for friction in (0.1, 0.3)]
+    theta = tmp_path / "theta.json"
+    theta.write_text(json.dumps({"theta": {"friction": 0.2}, "posterior": rows}), encoding="utf-8")
+    seen: set[float] = set()
+
+    def watch(event: decant.Event) -> None:
+        request = getattr(event, "request", None)
+        if isinstance(request, Simulate):
+            seen.add(request.parameters.friction)
+
+    planned = decant.plan(risky(tmp_path), theta=theta, iterations=2, seeds=2, watch=[watch])
+    assert planned.recommended
+    assert {0.1, 0.3} <= seen <= {0.1, 0.2, 0.3}
+
+
+def test_a_run_of_the_library_is_recorded_and_warns_as_one_of_the_command_line(
+    tmp_path: Path, fake_simulators: None
+) -> None:
+    pytest.importorskip("rerun")
+    content = dict(small(tmp_path).resolved)
+    content["outputs"] = {**content["outputs"], "rrd": True}
+    actions = {**content["deployment"]["actions"], "x_offset": ["150 mm", "300 mm"]}
+    content["deployment"] = {**content["deployment"], "actions": actions}
+    campaign = decant.build_campaign(content, tmp_path)
+    with pytest.warns(UserWarning, match="x_offset"):
+        planned = decant.plan(campaign, iterations=2, seeds=2)
+    recording = planned.directory / "campaign.rrd"
+    assert planned.published is not None
+    assert planned.published.recording == recording
+    assert recording.stat().st_size > 1000

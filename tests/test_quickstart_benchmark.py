@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from orchestrator.strategy_harness import SCENE
 from sim_engine.liquid import SimulationParameters
 from sim_engine.task import PourTask
 from tests.actors.conftest import make_fake
-from tests.orchestrator.play import SCENE
 
 
 @pytest.fixture

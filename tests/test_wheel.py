@@ -31,6 +31,43 @@ importlib.util.find_spec = lambda name, package=None: None if name in {sorted(EX
 """As if no extra were installed."""
 
 
+HARNESS = """
+from decant.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
+from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.deployment.d2 import D2Settings
+from sim_engine.losses import Loss
+
+def spill(action, theta, rng):
+    return abs(action.x_offset - 0.12)
+
+def make():
+    plan = DeploymentPlan(D2Settings(pours=3), (SCENE,), ACTIONS, Loss())
+    return plan.settings.build(plan, SCENE, THETA, 1)
+
+check_strategy(make, spill)
+print(len(StrategyHarness(spill).run(make()).pours), "pours")
+"""
+"""What the author of a strategy tests it with."""
+
+CONTRACT = """
+import pytest
+from actors.arm.numbers import NumbersArm, NumbersSpec
+from decant.testing import ACTIONS, SCENE, ArmBench, ArmContract
+
+class TestMyArm(ArmContract):
+    @pytest.fixture
+    def bench(self):
+        spec = NumbersSpec(time_scale=20.0)
+        arm = NumbersArm(spec)
+        path = spec.plan(SCENE, SCENE.action(ACTIONS.decode([0.8, 0.5]) | {"max_angle": 1.7}))
+        yield ArmBench(arm, path, time_scale=20.0)
+        arm.close()
+"""
+"""What the author of an arm tests it with."""
+
+A_FEW = "who_it_is or whole_pour or lost_during"
+
+
 def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
@@ -73,6 +110,29 @@ def test_the_wheel_carries_every_shipped_file_and_no_tests(wheel: Path) -> None:
         assert {f"orchestrator/configs/{path.relative_to(ROOT / 'configs')}" for path in files} <= names
     assert {"decant/__init__.py", "decant/py.typed"} <= names
     assert not [name for name in names if name.split("/")[0] in ("tests", "benchmarks", "docs")]
+
+
+def test_authors_of_plug_ins_test_them_with_what_the_wheel_carries(wheel: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "site")
+    (tmp_path / "test_my_arm.py").write_text(CONTRACT, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+
+    def python(*arguments: str) -> str:
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=280
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    where = "import decant.testing, orchestrator.strategy_harness as h; print(decant.testing.__file__, h.__file__)"
+    assert python("-c", where).split() == [
+        str(tmp_path / "site" / name) for name in ("decant/testing.py", "orchestrator/strategy_harness.py")
+    ]
+    assert "3 pours" in python("-c", HARNESS)
+    reported = python("-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
+    assert "2 passed, 1 skipped" in reported
+    assert "ArmBench.cut is missing" in reported
 
 
 def test_every_package_of_an_extra_is_declared_in_it() -> None:
@@ -133,3 +193,16 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
     done = decant("plan", *campaign, "--iterations", "2", "--seeds", "2", "--in-process")
     assert done.returncode == 0, done.stderr
     assert "decant[lab]" in decant("run", "lab/campaigns/quickstart.yaml").stderr
+
+    def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [python, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+        )
+
+    done = run_python("-c", HARNESS)
+    assert "3 pours" in done.stdout, done.stderr
+    assert "pip install pytest" in run_python("-c", "from decant.testing import ArmContract").stderr
+    subprocess.run([python, "-m", "pip", "install", "-q", "pytest"], check=True, cwd=tmp_path, timeout=600)
+    (tmp_path / "test_my_arm.py").write_text(CONTRACT, encoding="utf-8")
+    done = run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
+    assert "2 passed, 1 skipped" in done.stdout, done.stdout + done.stderr

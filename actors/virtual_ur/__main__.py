@@ -29,6 +29,9 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--joints", help="six joint positions to begin with [deg], separated by commas")
     parser.add_argument("--local", action="store_true", help="begin in local control: programs are ignored")
     parser.add_argument("--fault-port", type=int, default=0, help="port for faults; any free one by default")
+    parser.add_argument(
+        "--normal-priority", action="store_true", help="don't let the clock go before other work on the machine"
+    )
     parser.add_argument("--parent", type=int, help="end when this process does, or when standard input ends")
     chosen = parser.parse_args(given)
     given_joints: str | None = chosen.joints
@@ -63,7 +66,7 @@ async def serve(chosen: argparse.Namespace) -> None:
         remote=not chosen.local,
         joints=chosen.joints,
     )
-    host = Host(controller, chosen.address)
+    host = Host(controller, chosen.address, prioritised=not chosen.normal_priority)
     await host.open()
     faults = FaultServer(host)
     fault_port = await faults.open(chosen.fault_port)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from enum import IntEnum
 
@@ -113,19 +114,28 @@ class Controller:
         return self.runtime is RuntimeState.PLAYING
 
     def upload(self, text: str) -> None:
-        """Run a program; one that runs is ended. What can't be run is refused with a message."""
+        """Run a program; one that runs is ended. What can't be run is refused with a message, whatever is wrong."""
         try:
-            self.begin(translate(text, self.known_commands))
-        except ScriptError as error:
+            translated = translate(text, self.known_commands)
+        except Exception as error:
             self.refuse(error)
+        else:
+            self.begin(translated)
 
-    def refuse(self, error: ScriptError) -> None:
-        """Say why a program can't be run."""
+    def refuse(self, error: Exception) -> None:
+        """Report why a program can't be run; what is not a `ScriptError` is a defect here, and is logged as one."""
+        if not isinstance(error, ScriptError):
+            traceback.print_exception(error)
+            error = ScriptError(f"internal error of the controller: {error}")
         self.tell("exception", f"compile error: {error.text}", error.line)
 
     def begin(self, translated: Translated) -> None:
         """Run a program that has been translated; see `upload`."""
-        program = Program(translated, self._commands)
+        try:
+            program = Program(translated, self._commands)
+        except Exception as error:
+            self.refuse(error)
+            return
         if program.secondary:
             if len(self.secondary) >= MOST_SECONDARY:
                 self.tell("key", f"program {program.name} not started: {MOST_SECONDARY} secondary programs run already")
@@ -145,6 +155,12 @@ class Controller:
         self.program = program
         self.runtime = RuntimeState.PLAYING
         self.tell("key", f"program {program.name} started")
+
+    @property
+    def control_line(self) -> int:
+        """Line of the program that moves the arm; 0 if none does."""
+        holder = self.robot.mover.holder
+        return 0 if self.program is None or holder is None else self.program.line_of(holder)
 
     @property
     def local(self) -> bool:

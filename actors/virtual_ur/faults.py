@@ -11,6 +11,7 @@ from typing import Any
 from actors.virtual_ur.controller import Watcher
 from actors.virtual_ur.host import Host
 from actors.virtual_ur.power import RobotMode
+from actors.virtual_ur.robot import TRACKING_LAG
 from actors.virtual_ur.safety import Plane, SafetyConfiguration
 
 LONGEST_LINE = 100_000
@@ -41,6 +42,7 @@ class Faults:
             "refuse": self.refuse,
             "reboot": self.reboot,
             "noise": self.noise,
+            "lag": self.lag,
             "slider": self.slider,
             "remote": self.remote,
             "checksum": self.checksum,
@@ -207,6 +209,13 @@ class Faults:
     def noise(self, sigma: float = 0.0) -> None:
         """Measured joint positions get noise [rad]."""
         self._controller.robot.noise = max(0.0, _finite(sigma))
+
+    def lag(self, seconds: float = TRACKING_LAG) -> None:
+        """The joints follow their targets with this time constant [s], as weak ones do; healthy ones by default."""
+        value = _finite(seconds)
+        if value <= 0.0:
+            raise ValueError("a time constant is above 0 s")
+        self._controller.robot.lag = value
 
     def slider(self, fraction: float, **when: Any) -> None:
         """Someone moves the speed slider."""

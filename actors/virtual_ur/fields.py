@@ -1,4 +1,10 @@
-"""Which values clients may read and write over RTDE, and what they mean here."""
+"""Which values clients may read and write over RTDE, and what they mean here.
+
+Names, types and versions: the manufacturer's RTDE guide. Fields that came after the software modelled here (3.15, 5.12)
+are not found: `collision_detection_ratio`, `time_scale_source`, `actual_current_as_torque`, energies, accelerations of
+the tool and others. For `tcp_offset`, encoders and configurable inputs and outputs no version could be found; they are
+assumed to have come with the e-Series.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +18,14 @@ from actors.virtual_ur.wire.recipes import Field
 _ZERO6 = (0.0,) * 6
 _RUNNING, _POWER_OFF, _IDLE = 253, 239, 255
 _TEMPERATURES = (31.0, 32.0, 32.0, 34.0, 35.0, 36.0)
+_DIGITAL_OUTPUTS, _SINKING = 0, 1
+"""Modes of the tool's outputs: digital outputs rather than power, and NPN."""
+
+_CURRENT_WINDOW = (5.0, 5.0, 4.0, 2.5, 2.5, 2.5)
+"""Allowed deviations from the target currents [A]. Plausible, not measured."""
+
+_DEVIATION_LIMIT = 0.2
+"""Deviation of a joint from its target that a real controller stops for [rad]. Plausible, not measured."""
 
 
 def output_fields(controller: Controller) -> dict[str, Field]:
@@ -35,8 +49,8 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "target_moment": ("VECTOR6D", slow.torques),
         "actual_q": ("VECTOR6D", lambda: robot.q),
         "actual_qd": ("VECTOR6D", lambda: robot.qd),
-        "actual_qdd": ("VECTOR6D", lambda: mover.qdd),
         "actual_current": ("VECTOR6D", slow.currents),
+        "actual_current_window": ("VECTOR6D", lambda: _CURRENT_WINDOW if power.powered else _ZERO6),
         "actual_moment": ("VECTOR6D", slow.torques),
         "joint_control_output": ("VECTOR6D", slow.currents),
         "actual_TCP_pose": ("VECTOR6D", lambda: robot.pose),
@@ -62,7 +76,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "actual_digital_output_bits": ("UINT64", lambda: signals.digital_out),
         "runtime_state": ("UINT32", lambda: controller.runtime),
         "elbow_position": ("VECTOR3D", lambda: robot.kinematics.axes(robot.q)[1][2]),
-        "elbow_velocity": ("VECTOR3D", lambda: (0.0, 0.0, 0.0)),
+        "elbow_velocity": ("VECTOR3D", lambda: robot.elbow_velocity),
         "robot_status_bits": ("UINT32", status_bits),
         "safety_status_bits": ("UINT32", lambda: safety.status_bits),
         "analog_io_types": ("UINT32", lambda: sum(int(v) << (2 + i) for i, v in enumerate(signals.analog_voltage))),
@@ -71,6 +85,10 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "standard_analog_output0": ("DOUBLE", lambda: signals.analog_reading(0)),
         "standard_analog_output1": ("DOUBLE", lambda: signals.analog_reading(1)),
         "io_current": ("DOUBLE", lambda: 0.0),
+        "euromap67_input_bits": ("UINT32", lambda: 0),
+        "euromap67_output_bits": ("UINT32", lambda: 0),
+        "euromap67_24V_voltage": ("DOUBLE", lambda: 0.0),
+        "euromap67_24V_current": ("DOUBLE", lambda: 0.0),
         "tool_mode": ("UINT32", lambda: _RUNNING if power.powered else _POWER_OFF),
         "tool_analog_input_types": ("UINT32", lambda: 0),
         "tool_analog_input0": ("DOUBLE", lambda: 0.0),
@@ -86,10 +104,21 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "payload": ("DOUBLE", lambda: robot.payload),
         "payload_cog": ("VECTOR3D", lambda: robot.cog),
         "payload_inertia": ("VECTOR6D", lambda: robot.inertia),
+        "script_control_line": ("UINT32", lambda: controller.control_line),
+        "joint_position_deviation_ratio": ("DOUBLE", lambda: robot.deviation / _DEVIATION_LIMIT),
     }
     if controller.model.e_series:
-        readers["ft_raw_wrench"] = ("VECTOR6D", lambda: _ZERO6)
-        readers["tcp_offset"] = ("VECTOR6D", lambda: robot.tcp)
+        readers |= {
+            "ft_raw_wrench": ("VECTOR6D", lambda: _ZERO6),
+            "tcp_offset": ("VECTOR6D", lambda: robot.tcp),
+            "tool_output_mode": ("UINT8", lambda: _DIGITAL_OUTPUTS),
+            "tool_digital_output0_mode": ("UINT8", lambda: _SINKING),
+            "tool_digital_output1_mode": ("UINT8", lambda: _SINKING),
+            "actual_configurable_digital_input_bits": ("UINT64", lambda: signals.digital_in >> 8 & 0xFF),
+            "actual_configurable_digital_output_bits": ("UINT64", lambda: signals.digital_out >> 8 & 0xFF),
+            "encoder0_raw": ("INT32", lambda: 0),
+            "encoder1_raw": ("INT32", lambda: 0),
+        }
     for i in range(REGISTERS):
         readers[f"output_int_register_{i}"] = ("INT32", _entry(registers.output_int, i))
         readers[f"output_double_register_{i}"] = ("DOUBLE", _entry(registers.output_double, i))

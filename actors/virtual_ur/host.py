@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import faulthandler
 import os
+import signal
 import time
 import traceback
 from collections import deque
@@ -26,6 +27,42 @@ SLOWEST_WAKE = 0.002
 MOST_BEHIND = 0.1
 """Wall time that the clock may fall behind before it lets the rest go [s]: a controller never catches up in a rush."""
 
+LONGEST_WAKE = 0.05
+"""Wall time after which a wake-up with more cycles to do serves the ports first [s]."""
+
+REAL_TIME = 1
+"""Real-time priority of the clock's thread: the lowest one, which is above all work that is not real-time."""
+
+NICENESS = -10
+"""Of the clock's thread where it may not be real-time [nice]."""
+
+
+def raise_priority() -> str:
+    """Let the calling thread run before other work on the machine, as far as the system permits.
+
+    Neither the process's other threads nor its children get the real-time priority.
+
+    Returns:
+        What was granted: 'real-time', 'nice -10' or 'normal'.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # macOS has no such call
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(REAL_TIME))
+        return "real-time"
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+        return f"nice {NICENESS}"
+    return "normal"
+
+
+def lower_priority() -> str:
+    """Give back what `raise_priority` got. Returns 'normal'."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with contextlib.suppress(OSError):
+        if os.getpriority(os.PRIO_PROCESS, 0) < 0:
+            os.setpriority(os.PRIO_PROCESS, 0, 0)
+    return "normal"
+
 
 @dataclass
 class Timing:
@@ -37,6 +74,7 @@ class Timing:
         worst: latest wake-up [s].
         dropped: wall time that was let go because the process was too far behind [s].
         busy: processor time used by this process [s]; `since` the start of the clock [s of wall time].
+        priority: of the clock's thread; see `raise_priority`.
     """
 
     ticks: int = 0
@@ -45,8 +83,9 @@ class Timing:
     dropped: float = 0.0
     started: float = 0.0
     busy_at_start: float = 0.0
+    priority: str = "normal"
 
-    def report(self) -> dict[str, float]:
+    def report(self) -> dict[str, float | str]:
         """For people and tests."""
         wall = max(time.monotonic() - self.started, 1e-9)
         return {
@@ -56,6 +95,7 @@ class Timing:
             "dropped": self.dropped,
             "wall": wall,
             "cpu": (time.process_time() - self.busy_at_start) / wall,
+            "priority": self.priority,
         }
 
 
@@ -65,9 +105,11 @@ class Host:
     Args:
         controller: what is hosted.
         address: of all ports.
+        prioritised: its clock goes before other work on the machine, where the system permits it. Not in time that is
+            scaled up: there the clock takes much of a core.
     """
 
-    def __init__(self, controller: Controller, address: str) -> None:
+    def __init__(self, controller: Controller, address: str, *, prioritised: bool = False) -> None:
         self.controller = controller
         self.address = address
         self.timing = Timing()
@@ -82,6 +124,8 @@ class Host:
         self._opening: asyncio.Task[None] | None = None
         self._clock: asyncio.TimerHandle | None = None
         self._next = 0.0
+        self._worked = self._woke = 0.0
+        self._prioritised = prioritised and controller.time_scale <= 1.0
 
     # ---- ports
 
@@ -132,8 +176,11 @@ class Host:
 
     def start(self) -> None:
         """Let time pass."""
+        if self._prioritised:
+            self.timing.priority = raise_priority()
         self.timing.started, self.timing.busy_at_start = time.monotonic(), time.process_time()
-        self._next = asyncio.get_running_loop().time()
+        self._next = self._woke = asyncio.get_running_loop().time()
+        self._worked = time.thread_time()
         self._wake()
 
     def _wake(self) -> None:
@@ -144,11 +191,16 @@ class Host:
         if behind > 2.0 * max(period, SLOWEST_WAKE):
             self.timing.late += 1
         self.timing.worst = max(self.timing.worst, behind)
+        worked = time.thread_time()
         if behind > MOST_BEHIND:
             self.timing.dropped += behind - MOST_BEHIND
             self._next = now - MOST_BEHIND
+            if self.timing.priority != "normal" and worked - self._worked > 0.5 * (now - self._woke):
+                # It is late by its own work, a program's, say: others would get no processor time at all.
+                self.timing.priority = lower_priority()
+        self._worked, self._woke = worked, now
         try:
-            while self._next <= now:
+            while self._next <= now and loop.time() < now + LONGEST_WAKE:
                 self._next += period
                 if not self.halted:
                     self.timing.ticks += 1
@@ -173,8 +225,8 @@ async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG)
     """Wait for a parent process to end: by its standard input, which ends with it, and by its number.
 
     The pipe alone isn't enough: a grandchild that was forked may hold its other end open. Neither is noticed by an
-    interpreter that hangs; so a thread without Python in it ends the process, with a traceback, unless it is put
-    off again and again.
+    interpreter that hangs; so an alarm signal, which needs no Python, ends the process with a traceback unless it is
+    put off again and again. A thread that does the same would have to be waited for each time, and has no priority.
 
     Args:
         parent: its number.
@@ -191,8 +243,9 @@ async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG)
 
     with contextlib.suppress(OSError):  # not every standard input can be waited for: /dev/null can't
         loop.add_reader(0, readable)
+    faulthandler.register(signal.SIGALRM, chain=True)  # the traceback, and then what ends a process by default
     while not gone.is_set() and os.getppid() == parent:
-        faulthandler.dump_traceback_later(hung, exit=True)
+        signal.setitimer(signal.ITIMER_REAL, hung)
         try:
             await asyncio.wait_for(gone.wait(), interval)
         except TimeoutError:

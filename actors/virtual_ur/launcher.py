@@ -50,6 +50,7 @@ class VirtualController:
         state: str = "running",
         local: bool = False,
         joints: Sequence[float] | None = None,
+        prioritised: bool = True,
         patience: float = START_TIME,
     ) -> VirtualController:
         """Start the process and wait until all its ports are open.
@@ -62,6 +63,7 @@ class VirtualController:
             state: of power, 'running', 'idle' or 'off'.
             local: begin in local control.
             joints: six positions to begin with [rad]; a pose in the middle of its reach by default.
+            prioritised: its clock goes before other work on the machine; see docs/virtual-ur.md, "Control period".
             patience: longest wait [s].
 
         Raises:
@@ -71,6 +73,7 @@ class VirtualController:
         command += ["--time-scale", repr(float(time_scale)), "--state", state, "--parent", str(os.getpid())]
         command += [] if frequency is None else ["--frequency", repr(float(frequency))]
         command += ["--local"] if local else []
+        command += [] if prioritised else ["--normal-priority"]
         command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
         with tempfile.TemporaryFile() as complaints:  # a pipe that nobody reads would fill up and hang the process
             process = subprocess.Popen(

@@ -14,7 +14,7 @@ from actors.virtual_ur.poses import IDENTITY, Transform, Vector, compose, distan
 from actors.virtual_ur.safety import SafetyConfiguration
 
 TRACKING_LAG = 0.004
-"""Time constant with which the joints follow their targets [s]. Plausible, not measured."""
+"""Time constant with which healthy joints follow their targets [s]. Plausible, not measured."""
 
 STEADY = 1e-4
 """Joint speed below which the arm counts as steady [rad/s]."""
@@ -42,6 +42,7 @@ class Robot:
     Attributes:
         q, qd: what the joints measure, noise included [rad], [rad/s].
         noise: standard deviation of the measured positions [rad].
+        lag: time constant with which the joints follow their targets [s].
         payload: [kg]; `cog` [m], `inertia` [kg m²].
         gravity: direction in the base's frame [m/s²].
         recent: measured positions of the last cycles.
@@ -59,6 +60,7 @@ class Robot:
         self.inertia: Pose = (0.0,) * 6
         self.gravity: Vector = (0.0, 0.0, 9.82)
         self.noise = 0.0
+        self.lag = TRACKING_LAG
         self._random = random.Random(0)
         self._true = q
         self.q, self.qd = q, self.mover.qd
@@ -131,7 +133,7 @@ class Robot:
     def _follow(self, now: float, dt: float, moves: bool) -> None:
         target, true = self.mover.q, self._true
         if moves or true != target:
-            share = 1.0 - exp(-dt / TRACKING_LAG)
+            share = 1.0 - exp(-dt / self.lag)
             there = [a + share * (b - a) for a, b in zip(true, target, strict=True)]
             if all(abs(a - b) < 1e-9 for a, b in zip(there, target, strict=True)):
                 there = list(target)
@@ -192,6 +194,20 @@ class Robot:
         if cached is None:
             cached = self._cache["tool_speed"] = self.kinematics.velocity(self.q, self.qd, self.frame[1])
         return cached  # type: ignore[return-value]
+
+    @property
+    def elbow_velocity(self) -> Vector:
+        """Measured velocity of the elbow, which the first two joints move [m/s]."""
+        if self.qd == _ZERO:
+            return 0.0, 0.0, 0.0
+        elbow = self.kinematics.axes(self.q)[1][2]
+        x, y, z, *_ = self.kinematics.velocity(self.q, (self.qd[0], self.qd[1], 0.0, 0.0, 0.0, 0.0), elbow)
+        return x, y, z
+
+    @property
+    def deviation(self) -> float:
+        """Largest distance of a joint from its target [rad]."""
+        return max(abs(a - b) for a, b in zip(self.q, self.mover.q, strict=True))
 
     @property
     def target_tool_speed(self) -> Pose:

@@ -79,7 +79,7 @@ class Uploads:
     async def _upload_apart(self, text: str, sender: Sender) -> None:
         try:
             translated = await self._translate_apart(text)
-        except ScriptError as error:
+        except Exception as error:
             self._controller.refuse(error)
             return
         if sender.privileged:
@@ -88,14 +88,17 @@ class Uploads:
             sender.refuse()
 
     async def _translate_apart(self, text: str) -> Translated:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "actors.virtual_ur.urscript",
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.DEVNULL,
-        )
+        try:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-m",
+                "actors.virtual_ur.urscript",
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.DEVNULL,
+            )
+        except OSError as error:
+            raise ScriptError(f"no process to translate it could be started: {error}") from error
         try:
             asked = question(text, self._controller.known_commands)
             answer, _ = await asyncio.wait_for(process.communicate(asked), PATIENCE)

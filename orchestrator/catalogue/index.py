@@ -22,7 +22,7 @@ from orchestrator.catalogue.remarks import REMARKS_NAME
 from orchestrator.errors import RunError
 from orchestrator.journal import JOURNAL_NAME
 from orchestrator.pour_rows import Row
-from orchestrator.state_directory import state_directory
+from orchestrator.state_directory import make_state_directory, state_directory
 from orchestrator.states import RESTING
 
 INDEX_NAME = "catalogue.sqlite"
@@ -68,7 +68,7 @@ class Catalogue:
         """Why the index is kept in memory alone, where it can't be written; empty otherwise."""
         path = self.state / INDEX_NAME
         try:
-            self.state.mkdir(parents=True, exist_ok=True)
+            make_state_directory(self.state)
             try:
                 self._connection = _opened(str(path))
             except sqlite3.DatabaseError as error:

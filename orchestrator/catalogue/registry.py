@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from orchestrator.journal import JOURNAL_NAME
-from orchestrator.state_directory import state_directory
+from orchestrator.state_directory import make_state_directory, state_directory
 
 LIST_NAME = "runs.txt"
 
@@ -41,7 +41,7 @@ def enter(directories: Iterable[Path], state: Path | None = None) -> None:
         OSError: it can't be written.
     """
     path = (state or state_directory()) / LIST_NAME
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_state_directory(path.parent)
     lines = "".join(f"{directory.absolute()}\n" for directory in directories)
     # One write to a file opened for appending: two runs that begin at the same moment don't mix their lines.
     descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -12,6 +12,7 @@ from typing import Any
 
 from orchestrator.catalogue.index import Catalogue, CatalogueError
 from orchestrator.pour_rows import Row
+from sim_engine.errors import InvalidArgumentError
 
 _AGO = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 _DATES = (("%Y-%m-%dT%H:%M:%S", 0), ("%Y-%m-%dT%H:%M", 60), ("%Y-%m-%d", 86_400), ("%Y-%m", -1), ("%Y", -12))
@@ -160,7 +161,9 @@ def moment(text: str, *, end: bool = False, now: datetime | None = None) -> floa
             with contextlib.suppress(ValueError):
                 begin = datetime.strptime(text.strip().replace(" ", "T"), form)
                 return (_after(begin, lasts) if end else begin).timestamp()
-    raise ValueError(f"'{text}' is not a date: write 2030-03-01, 2030-03, '2030-03-01 14:30', or 7d for 7 days ago")
+    raise InvalidArgumentError(
+        f"'{text}' is not a date: write 2030-03-01, 2030-03, '2030-03-01 14:30', or 7d for 7 days ago"
+    )
 
 
 def _after(begin: datetime, lasts: int) -> datetime:
@@ -184,7 +187,7 @@ def searching(
         ValueError: a date or a mode is none.
     """
     if mode is not None and mode.lower() not in MODES:
-        raise ValueError(f"mode '{mode}' is not one of {', '.join(MODES)}")
+        raise InvalidArgumentError(f"mode '{mode}' is not one of {', '.join(MODES)}")
     return Search(
         words=tuple(words),
         since=None if since is None else moment(since),

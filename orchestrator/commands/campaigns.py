@@ -19,8 +19,6 @@ from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, men
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
     from orchestrator.stages import StageDefinition
-    from sim_engine.liquid import SimulationParameters
-    from sim_engine.vessel.spec import VesselSpec
 
 
 _TOLD = {
@@ -65,40 +63,10 @@ def run(path: Path, options: RunOptions) -> None:
 
     plan = read_campaign(path, options.laboratory, options.seed)
     check_campaign_can_run(plan)
-    _check_posterior(plan)
     finished = _run(plan, "run", path, options)
     if options.as_json:
         summary = summary_json(finished.published.summary)
         print_json({"run": finished.result.directory.name, "report": finished.published.report, **summary})
-
-
-def _check_posterior(plan: CampaignPlan) -> None:
-    """Draws of θ that deployment is to bear are made by its own calibration.
-
-    Raises:
-        RefusalError: it makes none (exit code 2).
-    """
-    from orchestrator.strategies.doors import calibrations
-
-    if plan.deployment is None or not plan.deployment.settings.needs_posterior:
-        return
-    if plan.calibration is None or not plan.calibration.settings.makes_posterior:
-        known = [name for name, settings in calibrations().items() if settings().makes_posterior]
-        has = "has no calibration"
-        if plan.calibration is not None and plan.calibration.strategy not in known:
-            has = f"calibrates with {plan.calibration.strategy}"
-        elif plan.calibration is not None:
-            raise RefusalError(
-                f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which no surrogate makes that "
-                "takes actions for noise; write 'calibration: {averaging: context}', or 'theta: best'",
-                BAD_INPUT,
-            )
-        raise RefusalError(
-            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which only {' and '.join(known)} "
-            f"makes, and this campaign {has}; calibrate with {known[0]}, write 'theta: best', or use decant plan "
-            "--parameters with the theta.json of a calibration",
-            BAD_INPUT,
-        )
 
 
 def calibrate(path: Path, options: RunOptions) -> None:
@@ -116,20 +84,24 @@ def calibrate(path: Path, options: RunOptions) -> None:
 
 
 def calibration_json(finished: Finished) -> dict[str, Any]:
-    """θ* and mean |r − c_s| by split: its own, that of its rivals: see `Scorecard`."""
+    """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see `Scorecard`."""
     from orchestrator.report.results import rival_scores
     from orchestrator.results import learnt_by
-    from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta
+    from orchestrator.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
     from orchestrator.strategies.calibration.base import Calibrated
     from orchestrator.strategies.calibration.evaluation import Scores
     from orchestrator.strategies.calibration.scorecard import CALIBRATED
 
     results = finished.result.results
-    theta, calibration = calibrated_theta(results).theta.model_dump(), learnt_by(results, CALIBRATION, Calibrated)
+    theta, calibration = calibrated_theta(results).theta, learnt_by(results, CALIBRATION, Calibrated)
     evaluation = learnt_by(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
     rivals = rival_scores(evaluation)
-    data: dict[str, Any] = {"theta": theta}
+    data: dict[str, Any] = {
+        "theta": deployed_theta(results).model_dump(),
+        "calibrated_theta": theta.model_dump(),
+        "calibration_gain": None if evaluation.gain is None else evaluation.gain.model_dump(mode="json"),
+    }
     for split in ("train", "test", "transfer"):
         data[f"{split}_discrepancy"] = ours.get(split)
         if split != "train":
@@ -221,35 +193,28 @@ def plan_pour(
 
 def planning_plan(
     plan: CampaignPlan,
-    parameters: Path | SimulationParameters | None,
-    receiver: Path | VesselSpec | None,
+    parameters: Path | None,
+    receiver: Path | None,
     iterations: int | None,
 ) -> CampaignPlan:
     """A campaign turned into D1 without pours, and its record.
 
     Args:
-        parameters: θ to plan with, or a file with it; the campaign's unless given.
-        receiver: another vessel than the campaign's, or its file.
+        parameters: file of the θ to plan with; the campaign's unless given.
+        receiver: file of another vessel than the campaign's.
         iterations: as the campaign says unless given.
 
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
-    from orchestrator.config.load import load_discrepancy, load_parameters, load_posterior, load_vessel
+    from orchestrator.config.load import load_vessel
     from orchestrator.config.yaml.errors import ConfigError
-    from orchestrator.jobs import JobError, planned
-    from orchestrator.stages import POSTERIOR_DRAWS
+    from orchestrator.jobs import GivenTheta, JobError, planned, read_theta
 
-    theta = None if isinstance(parameters, Path) else parameters
-    thetas: tuple[SimulationParameters, ...] = ()
-    left_over = None
     with Refused(ConfigError, JobError):
-        if isinstance(parameters, Path):
-            theta, left_over = load_parameters(parameters, plan.parameters), load_discrepancy(parameters)
-            if plan.deployment is not None and plan.deployment.settings.needs_posterior:
-                thetas = load_posterior(parameters, POSTERIOR_DRAWS, plan.parameters)
-        vessel = load_vessel(receiver) if isinstance(receiver, Path) else receiver
-        return planned(plan, theta, vessel, iterations, thetas, left_over)
+        given = GivenTheta(plan.parameters) if parameters is None else read_theta(parameters, plan)
+        vessel = None if receiver is None else load_vessel(receiver)
+        return planned(plan, given.theta, vessel, iterations, given.draws, given.left_over)
 
 
 def _run(
@@ -287,7 +252,7 @@ def _run(
         live=live,
     )
     if finished.published.theta is not None:
-        mention(f"θ* is in {finished.published.theta}; use it with --parameters")
+        mention(f"the parameters to use are in {finished.published.theta}; give them with --parameters")
     return finished
 
 

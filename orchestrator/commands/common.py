@@ -25,6 +25,7 @@ from orchestrator.commands.waiting import Waiting
 if TYPE_CHECKING:
     from actors.protocols import Laboratory
     from orchestrator.monitor.live import LiveView
+    from orchestrator.monitor.monitor import RerunMonitor
     from orchestrator.plan import CampaignPlan
     from orchestrator.publish import Published
     from orchestrator.run_result import CampaignResult
@@ -50,17 +51,17 @@ def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> No
     Raises:
         RefusalError: with everything that is wrong, exit code 2.
     """
-    from orchestrator.config.campaign.check import check_campaign
+    from orchestrator.jobs import JobError, check_job
 
     warned: list[str] = []
-    with Waiting() as doing:
-        problems = check_campaign(
-            plan, as_written=as_written, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing
-        )
-    for text in dict.fromkeys(warned):
-        mention(text)
-    if problems:
-        raise RefusalError("\n".join(str(problem) for problem in problems), BAD_INPUT)
+    try:
+        with Refused(JobError), Waiting() as doing:
+            check_job(
+                plan, as_written=as_written, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing
+            )
+    finally:
+        for text in dict.fromkeys(warned):
+            mention(text)
 
 
 def check_laboratory_answers(
@@ -176,12 +177,11 @@ def run_in_front_of_people(
     from orchestrator.commands.people import asked_about_unknown_pours, person_at_the_terminal
     from orchestrator.errors import RunError
     from orchestrator.events import Watcher
-    from orchestrator.monitor.monitor import RerunMonitor
+    from orchestrator.monitor.live import can_record, recorder_of
     from orchestrator.progress import ProgressDisplay
-    from orchestrator.publish import publish
+    from orchestrator.publish import not_simulated, publish
     from orchestrator.report.table import print_summary
     from orchestrator.stages import stages_of
-    from sim_engine.extras import installed
 
     chosen = tuple(stages_of(plan) if stages is None else stages)
     pouring = any(stage.pours for stage in chosen)
@@ -190,20 +190,17 @@ def run_in_front_of_people(
     )
     mention(f"run {directory}  ({spec.mode} bench)" if pouring else f"run {directory}")
     if not resume:
-        _warn_of_what_is_not_simulated(plan)
+        for line in not_simulated(plan, say):
+            mention(line)
     monitor: RerunMonitor | None = None
     result: CampaignResult | None = None
     try:
         display = ProgressDisplay(plan, quiet=is_quiet())
         operator = person_at_the_terminal(spec, display.paused) if pouring else None
         laboratory = open_laboratory(spec, need_bench=pouring, brief=brief, operator=operator)
-        if plan.outputs.rrd and not installed("rerun"):
-            say("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
-        elif plan.outputs.rrd:
-            if live is not None:
-                mention(f"live view: {live.open()}")
-            path = directory / "campaign.rrd"
-            monitor = RerunMonitor(path, plan) if live is None else live.watcher_for(plan, directory)
+        if live is not None and can_record(plan):
+            mention(f"live view: {live.open()}")
+        monitor = recorder_of(plan, directory, say, live)
         with display:
             watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]
 
@@ -257,16 +254,6 @@ def _way_on(directory: Path, again: str, not_resumed: str) -> str:
     if not (directory / JOURNAL_NAME).is_file():
         return "\nnothing had begun"
     return f"\n{not_resumed} is in {directory}. {again}" if not_resumed else f"\nwhat is done so far is kept: {again}"
-
-
-def _warn_of_what_is_not_simulated(plan: CampaignPlan) -> None:
-    """Once at the beginning, of all action spaces."""
-    from orchestrator.publish import worked_out
-    from orchestrator.report import regimes
-    from orchestrator.report.names import receiver_names
-
-    for line in regimes.lines(worked_out(lambda: regimes.campaign_warnings(plan), say), receiver_names(plan)):
-        mention(line)
 
 
 async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, resumable: bool) -> CampaignResult:

@@ -103,14 +103,8 @@ def submit(
         if wanted != "plan":
             raise RefusalError("--parameters, --receiver and --iterations go with --verb plan", BAD_INPUT)
         plan = planning_plan(plan, parameters, receiver, iterations)
-        if plan.deployment is not None and plan.deployment.thetas:
-            raise RefusalError(
-                f"{path}: deployment.risk.theta: 'posterior': draws of θ don't travel to a daemon; 'decant plan' bears "
-                "them here",
-                BAD_INPUT,
-            )
     try:
-        text, files = pack(plan)
+        text, files = pack(plan, parameters)
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
     with talking(at) as client:
@@ -133,9 +127,10 @@ def list_campaigns(*, at: At, as_json: bool) -> None:
     if as_json:
         print_json({"status": status, "campaigns": campaigns, "questions": questions})
         return
-    if status["emergency"]:
-        stopped = status["emergency"]
-        say(f"EMERGENCY STOP by {stopped['by']}, {_clock(stopped['time'])}: {stopped['reason'] or 'no reason given'}")
+    stops = [("", status["emergency"]), *((f" of {rig['name']}", rig["emergency"]) for rig in status["rigs"])]
+    for of, stop in stops:
+        if stop:
+            say(f"EMERGENCY STOP{of} by {stop['by']}, {_clock(stop['time'])}: {stop['reason'] or 'no reason given'}")
     for problem in status["problems"]:
         say(f"problem: {problem}")
     if status["queue_paused"]:
@@ -181,7 +176,8 @@ def show(key: str, *, at: At, as_json: bool) -> None:
         print(f"  now        {_standing(found)}")
         print(f"             {found['progress']['line']}")
     for pour in found["pours_made"]:
-        told = pour["measured"] or pour["state"]
+        told = pour["measured"] or {"unknown": "UNKNOWN"}.get(pour["state"], pour["state"])
+        told += f" ({pour['loss']})" if pour["state"] == "weighed" else ""
         predicted = f"  predicted {pour['predicted']}" if pour["predicted"] else ""
         print(f"  pour {pour['number']:<3d} into {pour['receiver']}  {pour['action']}{predicted}  → {told}")
     for deed in found["deeds"]:
@@ -257,18 +253,25 @@ def act(key: str | None, what: str, *, at: At) -> None:
         print(f"{found['id']}: {found['state']}, wanted: {found['wish']}")
 
 
-def abort(key: str | None, *, everything: bool, clear: bool, at: At) -> None:
-    """Stop the motion of one campaign, or of all of them."""
-    if sum((key is not None, everything, clear)) != 1:
-        raise RefusalError("name one campaign, or --all for the emergency stop, or --clear to end one", BAD_INPUT)
+def abort(key: str | None, *, everything: bool, clear: bool, rig: str | None, at: At) -> None:
+    """Stop the motion of one campaign, of one rig, or of all of them."""
+    if sum((key is not None, everything, clear or rig is not None)) != 1:
+        raise RefusalError(
+            "name one campaign, or --all for the emergency stop, or --rig for that of one rig, or --clear to end one",
+            BAD_INPUT,
+        )
     with talking(at) as client:
         if key is not None:
             found = client.post(f"/campaigns/{key}/abort")
             print(f"{found['id']}: {found['state']}, wanted: {found['wish']}")
             return
-        found = client.post("/emergency-stop/clear" if clear else "/emergency-stop", None if clear else {})
-    print("emergency stop cleared: what was given up rests until it is resumed" if clear else
-          "EMERGENCY STOP: everything was given up; nothing begins before 'decant abort --clear'")  # fmt: skip
+        client.post("/emergency-stop/clear" if clear else "/emergency-stop", {"rig": rig or ""})
+    of = f" of {rig}" if rig else ""
+    option = f" --rig {rig}" if rig else ""
+    if clear:
+        print(f"emergency stop{of} cleared: what was given up rests until it is resumed")
+    else:
+        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant abort --clear{option}'")
 
 
 def answer(number: int | None, text: str, *, at: At) -> None:

@@ -145,6 +145,9 @@ def abort(
         bool, typer.Option("--all", help="Emergency stop: every arm, everything given up, latched until --clear.")
     ] = False,
     clear: Annotated[bool, typer.Option("--clear", help="Clear the emergency stop, once all is safe.")] = False,
+    rig: Annotated[
+        str | None, typer.Option("--rig", help="Emergency stop of this rig alone; with --clear: clear that one.")
+    ] = None,
     url: Url = None,
     state: State = None,
 ) -> None:
@@ -154,7 +157,7 @@ def abort(
     """
     from orchestrator.commands import daemon as verb
 
-    call(verb.abort, key, everything=everything, clear=clear, at=(url, state))
+    call(verb.abort, key, everything=everything, clear=clear, rig=rig, at=(url, state))
 
 
 def answer(
@@ -213,7 +216,10 @@ _VERBS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
     "pause": (pause, ("decant pause quickstart-3f2a1c", "decant pause   # the queue")),
     "resume": (resume, ("decant resume quickstart-3f2a1c", "decant resume   # the queue")),
     "stop": (stop, ("decant stop quickstart-3f2a1c",)),
-    "abort": (abort, ("decant abort quickstart-3f2a1c", "decant abort --all", "decant abort --clear")),
+    "abort": (
+        abort,
+        ("decant abort quickstart-3f2a1c", "decant abort --all", "decant abort --rig left", "decant abort --clear"),
+    ),
     "answer": (answer, ("decant answer", "decant answer 7 done", "decant answer 8 weighed 3.2 0.4")),
     "arm": (arm, ("decant arm narrow-1b2c3d",)),
     "move": (move, ("decant move narrow-1b2c3d --first",)),

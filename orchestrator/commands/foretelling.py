@@ -46,7 +46,7 @@ class Foretelling:
     """θ of a prediction.
 
     Attributes:
-        theta: θ* of the file, or the campaign's θ.
+        theta: that of the file, or the campaign's.
         drawn: draws of the posterior that simulations take turns with; empty: θ alone.
         discrepancy: shift that the calibration left (`sim_engine.bands`); None where nobody knows.
     """
@@ -100,13 +100,19 @@ def foretelling(plan: CampaignPlan, parameters: Path | None, thetas: int | None,
     Args:
         plan: whose θ has what the file does not name.
         parameters: theta.json of a calibration, or somebody's own file; None: the campaign's θ.
-        thetas: draws of the posterior; None: as many as `seeds` where the file has a posterior; 0: θ* alone.
+        thetas: draws of the posterior; None: as many as `seeds` where the file has a posterior and recommends
+            the calibrated θ; 0: θ alone.
         seeds: simulations of a pour.
 
     Raises:
         RefusalError: something is wrong with the file, or it has no posterior that was asked for (exit code 2).
     """
-    from orchestrator.config.load import has_posterior, load_discrepancy, load_parameters, load_posterior
+    from orchestrator.config.load import (
+        load_discrepancy,
+        load_parameters,
+        load_posterior,
+        predicts_with_posterior,
+    )
     from orchestrator.config.yaml.errors import ConfigError
 
     if parameters is None:
@@ -116,6 +122,6 @@ def foretelling(plan: CampaignPlan, parameters: Path | None, thetas: int | None,
     with Refused(ConfigError):
         theta = load_parameters(parameters, plan.parameters)
         if thetas is None:
-            thetas = seeds if has_posterior(parameters) else 0
+            thetas = seeds if predicts_with_posterior(parameters) else 0
         drawn = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
         return Foretelling(theta, drawn, load_discrepancy(parameters))

@@ -63,7 +63,9 @@ def read_study(path: Path) -> StudyPlan:
 
     with Refused(ConfigError):
         plan = load_study(path)
-    deployment = plan.deployments[0].plan if plan.deployments else None
+    deployment = None
+    if plan.deployments:  # the cells take draws of θ from the cells of calibrations
+        deployment = replace(plan.deployments[0].plan, thetas=(plan.base.parameters,))
     check_campaign_can_run(replace(plan.base, source=plan.source, deployment=deployment))
     return plan
 

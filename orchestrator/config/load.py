@@ -29,7 +29,7 @@ from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.spec import VesselSpec
 
 
-def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+def load_campaign(path: Path | str, laboratory: Path | str | None = None, seed: int | None = None) -> CampaignPlan:
     """The plan of a campaign file, with everything that it refers to.
 
     Args:
@@ -40,7 +40,8 @@ def load_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
     Raises:
         ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
     """
-    return campaign_from(Document.read(resolved(path)), laboratory, seed)
+    other = None if laboratory is None else Path(laboratory)
+    return campaign_from(Document.read(resolved(Path(path))), other, seed)
 
 
 def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
@@ -66,13 +67,13 @@ def campaign_from(document: Document, laboratory: Path | None = None, seed: int 
     return plan
 
 
-def load_vessel(path: Path) -> VesselSpec:
+def load_vessel(path: Path | str) -> VesselSpec:
     """The vessel of a file (its shape is built and checked by `sim_engine.vessel`).
 
     Raises:
         ConfigError: anything is wrong with it.
     """
-    report = Report()
+    report, path = Report(), Path(path)
     if path.suffix.lower() in MESH_SUFFIXES:
         message = f"is a mesh; describe the vessel in a YAML file: {{name: {path.stem}, mesh: {path.name}, unit: mm}}"
         raise ConfigError([Problem(resolved(path), 0, 0, "", message)])
@@ -123,18 +124,18 @@ def _theta_model() -> type[_ThetaBase]:
 _Theta = _theta_model()
 
 THETA_KEYS = ("theta", "parameters")
-POSTERIOR_KEY = "posterior"
+POSTERIOR_KEY, RECOMMENDED_KEY = "posterior", "recommended"
 DISCREPANCY_KEY, SHIFT_KEY = "remaining_discrepancy", "shift"
 
 
-def has_posterior(path: Path) -> bool:
-    """Whether a file of θ has draws of a posterior.
+def predicts_with_posterior(path: Path) -> bool:
+    """Whether predictions with a file of θ draw from its posterior: it has one, and θ is the calibrated one.
 
     Raises:
         ConfigError: it is not YAML or JSON.
     """
     data = Document.read(resolved(path)).data
-    return isinstance(data, dict) and POSTERIOR_KEY in data
+    return isinstance(data, dict) and POSTERIOR_KEY in data and data.get(RECOMMENDED_KEY) != "uncalibrated"
 
 
 def load_discrepancy(path: Path) -> float | None:

@@ -99,7 +99,7 @@ async def _readiness(daemon: Daemon, response: Response) -> HealthOut:
     """Simulators are up, and nothing has to be mended. Needs no token, and says no more than that."""
     problems = [] if daemon.warm.ready else ["simulators are starting"]
     problems += [f"problem: {key}" for key in daemon.problems]
-    if daemon.emergency is not None:
+    if daemon.emergency is not None or daemon.emergencies:
         problems.append("emergency stop")
     if daemon.stopping:
         problems.append("ending")

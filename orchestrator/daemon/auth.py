@@ -15,9 +15,10 @@ from enum import IntEnum
 from pathlib import Path
 
 from orchestrator.errors import RunError
+from orchestrator.state_directory import make_state_directory
 
 FAILURES, WINDOW = 10, 60.0
-"""Wrong tokens that one address may show within so many seconds, before it is not listened to for as long."""
+"""Wrong tokens that one address may show within so many seconds; further wrong ones are refused for as long."""
 
 _ADDRESSES = 1000
 """Addresses that are remembered at a time."""
@@ -41,7 +42,7 @@ class TokenFileError(RunError):
 
 
 class TooManyFailuresError(Exception):
-    """An address has shown too many wrong tokens; `wait` is how long it is not listened to [s]."""
+    """An address has shown too many wrong tokens; `wait` is how long its wrong ones are refused [s]."""
 
     def __init__(self, wait: float) -> None:
         super().__init__(f"too many wrong tokens from this address; try again in {wait:.0f} s")
@@ -82,24 +83,25 @@ class Tokens:
             _make(path)
         self._known = _read(path)
 
-    def person(self, token: str, address: str, *, always: bool = False) -> Person | None:
+    def person(self, token: str, address: str) -> Person | None:
         """Who shows a token; None: nobody does.
+
+        A token that is known is accepted whatever else its address has shown: wrong tokens of one program never bar
+        another one next to it. Known tokens are long and random, so that guessing is hopeless at any rate.
 
         Args:
             token: as shown.
             address: from which.
-            always: also where the address is not listened to: for stopping, which nobody may be kept from.
 
         Raises:
-            TooManyFailuresError: this address has shown too many wrong ones.
+            TooManyFailuresError: the token is wrong, and this address has shown too many wrong ones before.
         """
-        if not always:
-            self._check(address)
         shown, found = _digest(token), None
         for known, person in self._known:  # all of them, so that the time taken tells nothing
             if hmac.compare_digest(known, shown):
                 found = person
         if found is None:
+            self._check(address)
             self._note_failure(address)
         return found
 
@@ -132,7 +134,7 @@ def token_of(path: Path, role: Role) -> str | None:
 
 
 def _make(path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    make_state_directory(path.parent)
     lines = ["# ROLE NAME TOKEN, one a line. Keep this file to yourself; 'decant serve' reads it when it starts.\n"]
     lines += [f"{role.name.lower()} {role.name.lower()} {secrets.token_urlsafe(32)}\n" for role in reversed(Role)]
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

@@ -11,16 +11,17 @@ from typing import Annotated
 from fastapi import APIRouter, HTTPException, Path, Request
 
 from orchestrator.daemon.arming import NotArmedError, arm, what_moves
-from orchestrator.daemon.guard import Admin, Anybody, Daemon, Operator, Stopper
+from orchestrator.daemon.guard import Admin, Daemon, Operator, Viewer
 from orchestrator.daemon.looks import campaign_out, found_item, status
 from orchestrator.daemon.people import AnswerError, question_json
 from orchestrator.daemon.shapes import (
     AnswerIn,
     ArmIn,
     CampaignOut,
+    ClearIn,
+    EmergencyIn,
     MoveIn,
     QuestionOut,
-    ReasonIn,
     StatusOut,
     SubmissionIn,
     WhatMovesOut,
@@ -53,19 +54,19 @@ async def submit(request: Request, daemon: Daemon, person: Operator, body: Submi
 
 
 @router.post("/campaigns/{key}/pause", operation_id="pause")
-async def pause(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
+async def pause(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
     """Come to rest at the next checkpoint: a pour that has begun is finished and weighed."""
     return _done(request, daemon, key, lambda: daemon.pause(key, person.name))
 
 
 @router.post("/campaigns/{key}/stop", operation_id="stop")
-async def stop(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
+async def stop(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
     """As pause; then what came of it so far is published, and it does not go on by itself."""
     return _done(request, daemon, key, lambda: daemon.stop(key, person.name))
 
 
 @router.post("/campaigns/{key}/abort", operation_id="abort")
-async def abort(request: Request, daemon: Daemon, person: Stopper, key: str) -> CampaignOut:
+async def abort(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
     """Stop the motion. What is tilted is brought upright once somebody agrees; again: it is left as it is."""
     found_item(daemon, key)
     with _refusing():
@@ -151,17 +152,35 @@ async def resume_queue(request: Request, daemon: Daemon, person: Operator) -> St
 
 
 @router.post("/emergency-stop", operation_id="emergency_stop")
-async def emergency_stop(request: Request, daemon: Daemon, person: Anybody, body: ReasonIn | None = None) -> StatusOut:
-    """Stop every arm, give up everything, take nothing new until it is cleared. Whoever may look may do it."""
-    await daemon.emergency_stop(person.name, "" if body is None else body.reason)
+async def emergency_stop(
+    request: Request, daemon: Daemon, person: Viewer, body: EmergencyIn | None = None
+) -> StatusOut:
+    """Stop every arm, or that of one rig; give up its work, and take nothing new there until it is cleared.
+
+    A viewer's token is enough.
+    """
+    body = body or EmergencyIn()
+    with _known_rig(body.rig):
+        await daemon.emergency_stop(person.name, body.reason, body.rig)
     return await status(request, daemon, person)
 
 
 @router.post("/emergency-stop/clear", operation_id="clear")
-async def clear(request: Request, daemon: Daemon, person: Admin) -> StatusOut:
-    """Take work again. What was given up rests until somebody resumes it."""
-    daemon.clear(person.name)
+async def clear(request: Request, daemon: Daemon, person: Admin, body: ClearIn | None = None) -> StatusOut:
+    """Take work again, at one rig or at all. What was given up rests until somebody resumes it."""
+    rig = "" if body is None else body.rig
+    with _known_rig(rig):
+        daemon.clear(person.name, rig)
     return await status(request, daemon, person)
+
+
+@contextlib.contextmanager
+def _known_rig(rig: str) -> Iterator[None]:
+    """A rig that the settings do not name is 404."""
+    try:
+        yield
+    except KeyError:
+        raise HTTPException(404, f"there is no rig '{rig}'") from None
 
 
 @router.post("/shutdown", status_code=202, operation_id="shutdown")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
@@ -17,6 +19,10 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 
 BEARER = HTTPBearer(auto_error=False, description="A token of the file 'tokens' in the daemon's state directory.")
+
+
+DRAIN = 10.0
+"""Longest time that the rest of a refused body is read and dropped [s]."""
 
 
 class TooLargeError(Exception):
@@ -44,16 +50,18 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
+        expects = b"100-continue" in headers.get(b"expect", b"").lower()
         host = headers.get(b"host", b"").decode("latin-1")
         name = host if host.startswith("[") and host.endswith("]") else host.rpartition(":")[0] or host
         if self._names is not None and name not in self._names:
-            await _refuse(send, 421, "this daemon is reached as 127.0.0.1 or localhost, and not by another name")
+            text = "this daemon is reached as 127.0.0.1 or localhost, and not by another name"
+            await _refuse(receive, send, 421, text, drain=not expects)
             return
         length = headers.get(b"content-length", b"0")
         if length.isdigit() and int(length) > self._limit:
-            await _refuse(send, 413, self._too_large)
+            await _refuse(receive, send, 413, self._too_large, drain=not expects)
             return
-        read, refused = 0, False
+        read, started = 0, False
 
         async def counted() -> Message:
             nonlocal read
@@ -64,37 +72,47 @@ class Guard:
             return message
 
         async def answered(message: Message) -> None:
-            nonlocal refused
-            if read <= self._limit:
+            nonlocal started
+            if started or read <= self._limit:  # an answer to a body that is too large is replaced by 413
+                started = True
                 await send(message)
-            elif not refused:  # whatever else would be said about a body that was not read to its end
-                refused = True
-                await _refuse(send, 413, self._too_large)
 
-        await self._app(scope, counted, answered)
+        try:
+            await self._app(scope, counted, answered)
+        except TooLargeError:
+            if started:
+                raise
+        if not started and read > self._limit:
+            await _refuse(receive, send, 413, self._too_large)
 
     @property
     def _too_large(self) -> str:
         return f"more than {self._limit / 1e6:g} MB are not read (listen: body in the daemon's settings)"
 
 
-async def _refuse(send: Send, status: int, detail: str) -> None:
+async def _refuse(receive: Receive, send: Send, status: int, detail: str, *, drain: bool = True) -> None:
+    """Answer, then read and drop the rest of the body: closed with unread data, the client gets a reset, no answer.
+
+    Args:
+        drain: whether there is a rest; a client that expects 100-continue sends none after a refusal.
+    """
     from orchestrator.daemon.encode import text
 
     body = text({"detail": detail}).encode()
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode()),
                (b"connection", b"close")]  # fmt: skip
     await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+    await send({"type": "http.response.body", "body": body, "more_body": True})
+    if drain:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(DRAIN):
+                while (await receive()).get("more_body", False):
+                    pass
+    await send({"type": "http.response.body", "body": b""})
 
 
-def needs(role: Role, *, always: bool = False) -> Callable[..., Awaitable[Person]]:
-    """A dependency: who asks, if they may.
-
-    Args:
-        role: that it takes.
-        always: for stopping, from which nobody is kept by others' wrong tokens.
-    """
+def needs(role: Role) -> Callable[..., Awaitable[Person]]:
+    """A dependency: who asks, if the token's role is enough."""
 
     async def person(
         request: Request, shown: Annotated[HTTPAuthorizationCredentials | None, Depends(BEARER)]
@@ -104,7 +122,7 @@ def needs(role: Role, *, always: bool = False) -> Callable[..., Awaitable[Person
         if shown is None:
             raise HTTPException(401, "a token is needed: 'Authorization: Bearer TOKEN'", {"WWW-Authenticate": "Bearer"})
         try:
-            found = tokens.person(shown.credentials, address, always=always)
+            found = tokens.person(shown.credentials, address)
         except TooManyFailuresError as error:
             raise HTTPException(429, str(error), {"Retry-After": str(int(error.wait) + 1)}) from None
         if found is None:
@@ -126,8 +144,3 @@ Daemon = Annotated[Supervisor, Depends(the_daemon)]
 Viewer = Annotated[Person, Depends(needs(Role.VIEWER))]
 Operator = Annotated[Person, Depends(needs(Role.OPERATOR))]
 Admin = Annotated[Person, Depends(needs(Role.ADMIN))]
-Stopper = Annotated[Person, Depends(needs(Role.OPERATOR, always=True))]
-"""Whoever stops a campaign: heard also where others from the same address have shown wrong tokens."""
-
-Anybody = Annotated[Person, Depends(needs(Role.VIEWER, always=True))]
-"""Whoever pulls the emergency stop."""

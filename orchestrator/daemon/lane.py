@@ -39,9 +39,8 @@ class Whole(Protocol):
     stopping: bool
     suspect: bool
 
-    @property
-    def emergency(self) -> dict[str, Any] | None:
-        """The emergency stop that is latched."""
+    def is_stopped(self, rig: str) -> bool:
+        """Whether an emergency stop is latched that holds for a rig."""
         ...
 
     @property
@@ -67,7 +66,7 @@ class Lane:
         self._daemon, self.rig, self._common = daemon, rig, common
         self.running: Running | None = None
         self.wake = asyncio.Event()
-        self.latched = daemon.emergency is not None
+        self.latched = daemon.is_stopped(rig.name)
         self._background: set[asyncio.Task[None]] = set()
         self._resting = asyncio.Event()
         self._resting.set()

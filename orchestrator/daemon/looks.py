@@ -71,7 +71,12 @@ def rigs_out(daemon: Supervisor) -> list[RigOut]:
         running = lane.running
         checkpoint = running.watching.checkpoint if running is not None and running.watching is not None else ""
         campaign = None if running is None else running.item.id
-        found.append(RigOut(name=name, mode=lane.rig.mode, campaign=campaign, checkpoint=checkpoint))
+        stop = daemon.emergencies.get(name)
+        found.append(
+            RigOut.model_validate(
+                {"name": name, "mode": lane.rig.mode, "campaign": campaign, "checkpoint": checkpoint, "emergency": stop}
+            )
+        )
     return found
 
 
@@ -107,6 +112,9 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
         except (ConfigError, RunError, KeyError):  # a rig that the settings don't name any more, say
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(request, daemon, item).model_dump()
+    if daemon.progress(item) is None:  # a run whose process was killed: its journal ends in the middle of the pour
+        for pour in pours:
+            pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
     deeds = daemon.store.deeds(item.id)
     return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "deeds": deeds})
 

@@ -40,7 +40,10 @@ class _Collector:
         yield words
         single = {
             "decant_questions_open": ("Questions that wait for an answer.", len(daemon.store.questions())),
-            "decant_emergency_stop": ("Whether the emergency stop is latched.", daemon.emergency is not None),
+            "decant_emergency_stop": (
+                "Whether an emergency stop is latched.",
+                daemon.emergency is not None or bool(daemon.emergencies),
+            ),
             "decant_queue_paused": ("Whether no campaign is begun.", daemon.queue_paused),
             "decant_simulators": ("Simulators in the pool.", daemon.warm.size),
             "decant_events_last": ("Number of the newest event.", daemon.feed.last),

@@ -20,7 +20,8 @@ from orchestrator.journal import JOURNAL_NAME
 from orchestrator.journal_file import whole_copy
 from orchestrator.plan import CampaignPlan
 
-CAMPAIGN = "campaign.yaml"
+CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
+"""The campaign's file, and the file of the θ that it is planned with (`orchestrator.jobs.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100
@@ -33,11 +34,12 @@ class PackingError(ValueError):
     """What was submitted can't be unpacked; the text says why."""
 
 
-def pack(plan: CampaignPlan) -> tuple[str, Files]:
+def pack(plan: CampaignPlan, theta: Path | None = None) -> tuple[str, Files]:
     """A campaign that was loaded, as text and files.
 
     Args:
         plan: as loaded from its files.
+        theta: file of the θ to plan it with, such as the `theta.json` of a calibration; None: the campaign's θ.
 
     Returns:
         The campaign's text (JSON, which is YAML), in which paths are those of the files.
@@ -50,6 +52,8 @@ def pack(plan: CampaignPlan) -> tuple[str, Files]:
     resolved = dict(plan.resolved)
     resolved["outputs"] = {k: v for k, v in resolved.get("outputs", {}).items() if k != "directory"}
     table = _packed(resolved, files)
+    if theta is not None:
+        files[THETA] = _coded(theta.read_bytes())
     return json.dumps(table, indent=1, ensure_ascii=False) + "\n", files
 
 

@@ -18,6 +18,7 @@ from orchestrator.report.names import receiver_name
 from orchestrator.report.run_page import REPORT_NAME as REPORT
 from orchestrator.report.units import is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.requests import Failed, Pour, Poured
+from orchestrator.states import RESTING, State
 
 __all__ = ["REPORT", "Pours", "summary_of"]
 
@@ -65,13 +66,19 @@ class _Read:
         return [dict(pour) for pour in self._pours.values()]
 
     def on(self, directory: Path) -> None:
-        kinds = [Kind.REQUESTED, Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED]
+        kinds = [*(Kind.REQUESTED, Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED, Kind.CAMPAIGN_STATE)]
         with JournalReader(directory / JOURNAL_NAME) as journal:
             for entry in journal.entries(after=self._last, kinds=kinds):
                 self._take(entry)
                 self._last = entry.seq
 
     def _take(self, entry: Entry) -> None:
+        if entry.kind == Kind.CAMPAIGN_STATE:
+            if entry.body["after"] in (*RESTING, State.PREPARING):  # the process that poured has ended
+                for pour in self._pours.values():
+                    if pour["state"] == "under way":
+                        pour["state"] = "unknown"
+            return
         key = entry.body["id"]
         if entry.kind == Kind.REQUESTED:
             if entry.body["request"]["type"] == Pour.__name__:
@@ -97,6 +104,7 @@ def _asked(plan: CampaignPlan, stage: str, pour: Pour) -> dict[str, Any]:
         "action": style.display_values({name: getattr(pour.action, name) for name in names}),
         "predicted": predicted,
         "measured": "",
+        "loss": unit_of_pour(plan, pour).meaning,
         "spillage": None,
         "state": "asked",
         "time": None,

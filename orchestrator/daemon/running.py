@@ -14,22 +14,21 @@ from actors.protocols import Laboratory, LaboratoryError, Stoppable
 from actors.warm import WarmSimulators
 from orchestrator.campaign import run_campaign
 from orchestrator.daemon.feed import Feed
-from orchestrator.daemon.packing import CAMPAIGN, load_confined
+from orchestrator.daemon.packing import CAMPAIGN, THETA, load_confined
 from orchestrator.daemon.people import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.settings import Rig, Settings
 from orchestrator.daemon.store import Item, Store
 from orchestrator.daemon.watching import Watching
 from orchestrator.events import CampaignStateChanged, Watcher
-from orchestrator.jobs import Job, Verb, job
+from orchestrator.jobs import Job, Verb, check_job, job, read_theta
 from orchestrator.journal import JOURNAL_NAME, JournalReader
-from orchestrator.monitor.live import RECORDING, LiveView
+from orchestrator.monitor.live import LiveView, recorder_of
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.plan import CampaignPlan
-from orchestrator.publish import publish
+from orchestrator.publish import not_simulated, publish
 from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.runs import create_run
 from orchestrator.states import State
-from sim_engine.extras import installed
 
 MOVING = ("approach", "tilt", "hold", "return")
 """Checkpoints of a pour during which the arm moves."""
@@ -63,10 +62,22 @@ def job_of(settings: Settings, item: Item, rig: Rig) -> Job:
     """
     folder = settings.snapshots / item.id
     plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
+    given = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=replace(plan.outputs, directory=settings.runs))
     verb: Verb = item.verb  # type: ignore[assignment]  # written by us
-    return job(plan, verb)
+    return job(plan, verb, given)
+
+
+def _warnings_of(plan: CampaignPlan) -> list[str]:
+    """All that is suspicious about a campaign, or not simulated. Takes a moment, and no event loop.
+
+    Raises:
+        JobError: it can't run.
+    """
+    found: list[str] = []
+    check_job(plan, warn=lambda problem: found.append(str(problem)))
+    return list(dict.fromkeys([*found, *not_simulated(plan, found.append)]))
 
 
 class Running:
@@ -97,7 +108,11 @@ class Running:
             RunError, LaboratoryError, ConfigError, OSError: it can't go on.
         """
         work = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
+        begun = self.item.run is not None
         directory = await asyncio.to_thread(self._directory, work.plan)
+        if not begun:
+            for text in await asyncio.to_thread(_warnings_of, work.plan):
+                self._log_warning(text)
         await self._common.warm.open()
         self.watching = Watching(work.plan)
         monitor = self._recording(work.plan, directory)
@@ -155,12 +170,11 @@ class Running:
     def _recording(self, plan: CampaignPlan, directory: Path) -> RerunMonitor | None:
         if self.item.run != directory.name:
             self.note_run(directory)
-        if not plan.outputs.rrd or not installed("rerun"):
-            return None
         live = self._common.live
-        if live is not None and live.alive:
-            return live.watcher_for(plan, directory)
-        return RerunMonitor(directory / RECORDING, plan)
+        return recorder_of(plan, directory, self._log_warning, live if live is not None and live.alive else None)
+
+    def _log_warning(self, text: str) -> None:
+        self._common.feed.tell("LogLine", {"level": "warning", "text": text, "stage": ""}, self.item.id)
 
     def _note_state(self, event: Any) -> None:
         if isinstance(event, CampaignStateChanged):

@@ -23,7 +23,7 @@ from orchestrator.daemon.settings import Settings
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.errors import RunError
 from orchestrator.monitor.live import LiveView
-from orchestrator.state_directory import use_state_directory
+from orchestrator.state_directory import make_state_directory, use_state_directory
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -59,7 +59,7 @@ def serve(settings: Settings, ready: Callable[[str], None] = lambda url: None) -
 
 
 async def _serve(settings: Settings, ready: Callable[[str], None], renewal: Renewal) -> None:
-    settings.state.mkdir(parents=True, exist_ok=True, mode=0o700)
+    make_state_directory(settings.state)
     tokens = Tokens(settings.tokens)
     with contextlib.ExitStack() as opened:
         listening = opened.enter_context(renewal.listening or _listen(settings))

@@ -58,10 +58,19 @@ class ArmIn(_In):
     """Its name, typed by somebody who has read what will move."""
 
 
-class ReasonIn(_In):
-    """Why."""
+class EmergencyIn(_In):
+    """An emergency stop: of one rig, or of all of them."""
 
     reason: str = Field(default="", max_length=500)
+    rig: str = Field(default="", max_length=60)
+    """Stop only this rig; '' for all."""
+
+
+class ClearIn(_In):
+    """Which emergency stop is cleared."""
+
+    rig: str = Field(default="", max_length=60)
+    """The one of this rig; '' for the one of all rigs. Each is cleared by itself."""
 
 
 class ProblemOut(_Out):
@@ -150,10 +159,15 @@ class PourOut(_Out):
     measured: str
     """'' while nobody knows."""
 
+    loss: str
+    """What `predicted` and `measured` are, such as 'spilled / poured': each loss has its own denominator."""
+
     spillage: float | None
-    """Share of the load that fell outside."""
+    """Share of the load that fell outside: spilled / loaded."""
 
     state: Literal["asked", "under way", "weighed", "failed", "unknown"]
+    """'unknown': it had begun when its run ended, and has no outcome; resuming the run asks about it."""
+
     time: float | None
 
 
@@ -198,6 +212,14 @@ class QuestionOut(_Out):
     open: bool
 
 
+class EmergencyOut(_Out):
+    """Who pressed an emergency stop, and when."""
+
+    by: str
+    time: float
+    reason: str
+
+
 class RigOut(_Out):
     """A laboratory that campaigns lease, one at a time."""
 
@@ -209,6 +231,9 @@ class RigOut(_Out):
     checkpoint: str
     """Where the pour that is under way stands."""
 
+    emergency: EmergencyOut | None
+    """The emergency stop of this rig alone; that of all rigs is in the status."""
+
 
 class WhatMovesOut(_Out):
     """What hardware would do in a campaign."""
@@ -218,14 +243,6 @@ class WhatMovesOut(_Out):
 
     arm: str
     lines: list[str]
-
-
-class EmergencyOut(_Out):
-    """Who has stopped everything, and when."""
-
-    by: str
-    time: float
-    reason: str
 
 
 class StatusOut(_Out):
@@ -241,6 +258,8 @@ class StatusOut(_Out):
     problems: list[str]
     queue_paused: bool
     emergency: EmergencyOut | None
+    """The emergency stop of all rigs."""
+
     simulators: int
     rigs: list[RigOut]
     campaigns: dict[str, int]

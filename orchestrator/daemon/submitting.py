@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from actors.laboratory import check_laboratory
 from actors.protocols import LaboratoryError
-from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import resolved
 from orchestrator.daemon.packing import Files, PackingError, load_confined, pack, unpack
@@ -16,7 +16,7 @@ from orchestrator.daemon.running import job_of
 from orchestrator.daemon.settings import ANY_RIG, DESK, Rig, Settings
 from orchestrator.daemon.store import Item, Wish
 from orchestrator.errors import RunError
-from orchestrator.jobs import Job, JobError
+from orchestrator.jobs import Job, JobError, check_job
 
 
 class SubmissionError(RunError):
@@ -58,10 +58,27 @@ def prepare(settings: Settings, submission: Submission, key: str, by: str) -> It
         return _prepared(settings, submission, key, by)
     except (ConfigError, PackingError, JobError, LaboratoryError, RunError, OSError) as error:
         shutil.rmtree(folder, ignore_errors=True)
-        raise SubmissionError(str(error).replace(f"{folder}/", "").replace(str(folder), "the campaign")) from None
+        raise SubmissionError(_without_places(str(error), settings, folder)) from None
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+_PATH = re.compile(r"(?<![\w./~])/(?:[^\s/'\":;,()\[\]]+/)+([^\s/'\":;,()\[\]]+)")
+"""An absolute path of two parts or more; the group is its last part."""
+
+
+def _without_places(text: str, settings: Settings, folder: Path) -> str:
+    """A message without the paths of this machine: who submits from elsewhere may not learn where things are.
+
+    Files of the campaign are named as the campaign names them, others by their last part.
+    """
+    named = {folder, folder.resolve(), *settings.roots}
+    for place in sorted(map(str, named), key=len, reverse=True):
+        text = text.replace(f"{place}/", "").replace(place, "the campaign")
+    for state in {settings.state, settings.state.resolve()}:  # may hold spaces, which _PATH takes for an end
+        text = text.replace(f"{state}/", "/-/")
+    return _PATH.sub(r"\1", text)
 
 
 def _prepared(settings: Settings, submission: Submission, key: str, by: str) -> Item:
@@ -77,8 +94,7 @@ def _prepared(settings: Settings, submission: Submission, key: str, by: str) -> 
     anywhere = job_of(settings, draft, Rig(ANY_RIG))
     rig = _rig(settings, submission.rig, anywhere)
     work = anywhere if rig.source is None else job_of(settings, draft, rig)
-    if problems := check_campaign(work.plan):
-        raise SubmissionError("\n".join(str(problem) for problem in problems))
+    check_job(work.plan)
     check_laboratory(work.plan.laboratory, need_bench=work.pours)
     mode = "none" if rig.name == DESK else work.plan.laboratory.mode
     item = replace(draft, id=f"{plan.name[:40]}-{key}", rig=rig.name, mode=mode)

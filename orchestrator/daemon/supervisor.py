@@ -27,6 +27,7 @@ from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
 from orchestrator.errors import RunError
 from orchestrator.monitor.live import LiveView
+from orchestrator.state_directory import make_state_directory
 
 LEAVING = 10.0
 """Time that campaigns have to come to rest where Ray has died [s]; then those that don't pour are given up."""
@@ -34,6 +35,11 @@ LEAVING = 10.0
 PAUSED, EMERGENCY = "paused", "emergency"
 
 _log = logging.getLogger(__name__)
+
+
+def _emergency_of(rig: str) -> str:
+    """The flag of the emergency stop of one rig."""
+    return f"{EMERGENCY} {rig}"
 
 
 class RefusedError(RunError):
@@ -49,6 +55,7 @@ class Supervisor:
     """
 
     def __init__(self, settings: Settings, live: LiveView | None = None) -> None:
+        make_state_directory(settings.state)
         settings.runs.mkdir(parents=True, exist_ok=True)
         settings.snapshots.mkdir(parents=True, exist_ok=True)
         self.settings = settings
@@ -161,17 +168,21 @@ class Supervisor:
         Raises:
             RefusedError: nothing new is taken.
         """
-        self.refuse_new_work()
+        self.refuse_new_work(item.rig)
         item = replace(item, rank=self.store.last_rank() + 1.0, created=time.time())
         self.store.add(item)
         self.note(item.by, "submit", item.id)
         self.wake()
         return item
 
-    def refuse_new_work(self) -> None:
-        """Raises RefusedError where nothing new is taken."""
+    def refuse_new_work(self, rig: str = "") -> None:
+        """Raises RefusedError where nothing new is taken, by the daemon or by one rig."""
         if self.emergency is not None:
             raise RefusedError("the emergency stop is latched; nothing is taken before somebody has cleared it")
+        if rig in self.emergencies:
+            raise RefusedError(
+                f"the emergency stop of rig {rig} is latched; it takes nothing before somebody has cleared it"
+            )
         if self.stopping:
             again = "ray" in self.problems
             raise RefusedError("the daemon is just beginning anew; try again" if again else "the daemon is ending")
@@ -224,9 +235,19 @@ class Supervisor:
 
     @property
     def emergency(self) -> dict[str, Any] | None:
-        """Who has stopped everything, and when; None: nobody."""
+        """The emergency stop of all rigs that is latched: by, time, reason; None: there is none."""
         found: dict[str, Any] | None = self.store.flag(EMERGENCY)
         return found
+
+    @property
+    def emergencies(self) -> dict[str, dict[str, Any]]:
+        """The emergency stops of single rigs that are latched, by the rig's name."""
+        stops = {rig.name: self.store.flag(_emergency_of(rig.name)) for rig in self.settings.rigs}
+        return {name: stop for name, stop in stops.items() if stop is not None}
+
+    def is_stopped(self, rig: str) -> bool:
+        """Whether a rig may not begin anything: its own emergency stop is latched, or that of all rigs."""
+        return self.emergency is not None or rig in self.emergencies
 
     # ---- one campaign
 
@@ -275,7 +296,7 @@ class Supervisor:
             RefusedError: it does not rest, or nothing new may begin.
         """
         item = self.item(key)
-        self.refuse_new_work()
+        self.refuse_new_work(item.rig)
         if item.state in (STOPPED, WITHDRAWN) and item.run is None:
             self.store.change(item.id, state="queued", wish=str(Wish.RUN), reason="")
         elif self._running(item) is not None or item.state in ("queued", "finished"):
@@ -298,27 +319,55 @@ class Supervisor:
 
     # ---- all of them
 
-    async def emergency_stop(self, by: str, reason: str) -> None:
-        """Stop every arm, give up everything, and take nothing new until `clear`. The arms come first."""
-        stops = [asyncio.create_task(lane.running.emergency()) for lane in self.lanes.values() if lane.running]
-        for lane in self.lanes.values():
+    async def emergency_stop(self, by: str, reason: str, rig: str = "") -> None:
+        """Stop every arm, give up everything, and take nothing new until `clear`. The arms come first.
+
+        Args:
+            by: who presses it.
+            reason: why, if they say so.
+            rig: stop only this one; '' for all. A stop of all rigs and that of one are latched and cleared separately.
+
+        Raises:
+            KeyError: there is no such rig.
+        """
+        flag, lanes = self._stops(rig)
+        stops = [asyncio.create_task(lane.running.emergency()) for lane in lanes if lane.running]
+        for lane in lanes:
             lane.latched = True
         await asyncio.sleep(0)
         with contextlib.suppress(RunError):  # a full disk is no reason not to stop
-            self.store.set_flag(EMERGENCY, {"by": by, "time": time.time(), "reason": reason})
-            for lane in self.lanes.values():
+            self.store.set_flag(flag, {"by": by, "time": time.time(), "reason": reason})
+            for lane in lanes:
                 if lane.running is not None:
                     self.store.change(lane.running.item.id, wish=str(Wish.ABORT))
-            self.note(by, "emergency stop", detail=reason)
+            where = f"rig {rig}" if rig else ""
+            self.note(by, "emergency stop", detail=": ".join(filter(None, (where, reason))))
         await asyncio.gather(*stops, return_exceptions=True)
 
-    def clear(self, by: str) -> None:
-        """Take work again. What was given up rests until somebody resumes it."""
-        self.store.set_flag(EMERGENCY, None)
-        for lane in self.lanes.values():
-            lane.latched = False
-        self.note(by, "clear emergency stop")
+    def clear(self, by: str, rig: str = "") -> None:
+        """Take work again. What was given up rests until somebody resumes it.
+
+        Args:
+            by: who clears it.
+            rig: whose own emergency stop is cleared; '' for the one of all rigs.
+
+        Raises:
+            KeyError: there is no such rig.
+        """
+        flag, lanes = self._stops(rig)
+        self.store.set_flag(flag, None)
+        for lane in lanes:
+            lane.latched = self.is_stopped(lane.rig.name)
+        self.note(by, "clear emergency stop", detail=f"rig {rig}" if rig else "")
         self.wake()
+
+    def _stops(self, rig: str) -> tuple[str, list[Lane]]:
+        """The flag of an emergency stop, and the lanes that it stops. Raises KeyError."""
+        if not rig:
+            return EMERGENCY, list(self.lanes.values())
+        if rig not in {one.name for one in self.settings.rigs}:
+            raise KeyError(rig)
+        return _emergency_of(rig), [self.lanes[rig]]
 
     # ---- small things
 

@@ -92,7 +92,7 @@ def campaign_blueprint(
             rrb.Tabs(*maps(), *theta()),
             row_shares=[4, 4, 5],
         ),
-        rrb.Vertical(_status(), _log(), row_shares=[5, 4]),
+        rrb.Vertical(rrb.Tabs(_outcome(), _status()), _log(), row_shares=[5, 4]),
         column_shares=[5, 7, 4],
         name="Replaying",
     )
@@ -117,7 +117,7 @@ def beside_blueprint(names: Sequence[str]) -> rrb.Blueprint:
             _cell(f"/{name}", f"{name}: the cell"),
             _simulation(f"/{name}", f"{name}: simulated pour"),
             _weighed_pour(f"/{name}", f"{name}: spilled [g], weighed and simulated"),
-            _status(f"/{name}"),
+            _outcome(f"/{name}"),
             row_shares=[4, 4, 3, 3],
         )
         for name in names
@@ -258,6 +258,13 @@ def _status(under: str = "") -> Any:
     import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(origin=f"{under}/status", name="What is going on")
+
+
+def _outcome(under: str = "") -> Any:
+    """How the run ended. `_status` follows the time cursor, which begins at the start when a recording is opened."""
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(origin=f"{under}/outcome", name="How it ended")
 
 
 def _log() -> Any:

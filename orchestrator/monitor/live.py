@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
@@ -28,6 +29,7 @@ from orchestrator.errors import RunError
 from orchestrator.monitor.monitor import CAPACITY, RerunMonitor
 from orchestrator.monitor.server import environment
 from orchestrator.plan import CampaignPlan
+from sim_engine.extras import installed
 
 LOOPBACK = "127.0.0.1"
 
@@ -216,3 +218,29 @@ def answers(host: str, port: int) -> bool:
             return True
     except OSError:
         return False
+
+
+def can_record(plan: CampaignPlan) -> bool:
+    """Whether a run of a campaign is recorded: the campaign wants it, and Rerun is installed."""
+    return plan.outputs.rrd and installed("rerun")
+
+
+def recorder_of(
+    plan: CampaignPlan, run: Path, tell: Callable[[str], object], live: LiveView | None = None
+) -> RerunMonitor | None:
+    """The watcher that writes a run's recording; None if the campaign wants none, or Rerun is not installed.
+
+    Args:
+        plan: of the campaign.
+        run: its folder.
+        tell: called with the reason if a recording is wanted, but can't be made.
+        live: view that shows the same, if it is alive.
+
+    Raises:
+        OSError: the recording can't be written.
+    """
+    if not can_record(plan):
+        if plan.outputs.rrd:
+            tell("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
+        return None
+    return RerunMonitor(run / RECORDING, plan) if live is None else live.watcher_for(plan, run)

@@ -15,6 +15,8 @@ LOG = "/log"
 
 STATUS = "/status"
 
+OUTCOME = "/outcome"
+
 _PURPOSES = {
     "calibrate": style.MEASURED,
     "prior": style.FALLING,
@@ -117,6 +119,10 @@ class Machine:
         if markdown != self._page:
             self._page = markdown
             self._outlet.log(STATUS, self._rr.TextDocument(markdown, media_type="text/markdown"))
+
+    def outcome(self, markdown: str) -> None:
+        """How the run ended: the same at all times, wherever a viewer's time cursor is."""
+        self._outlet.log(OUTCOME, self._rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def _load(self) -> None:
         running = len(self._slots)

@@ -75,6 +75,9 @@ class CampaignRecording:
         self._balance = BalanceStage(outlet, self._cell.time_scale)
         self._learning = LearningStage(outlet, plan)
         self._machine = Machine(outlet)
+        self._machine.outcome(
+            f"# {self.status.reality}: no end\n\nThe run is under way, or its process was killed before it ended.\n"
+        )
         self._step = 0
         self._decided = ""
 
@@ -120,6 +123,7 @@ class CampaignRecording:
             case CampaignClosed():
                 self._learning.flush(event.time)
                 self._say(f"ended: {event.state}")
+                self._machine.outcome(self.status.page())
                 self._show("replaying")
             case StageOpened():
                 self._say(f"stage {event.stage} begins", source=event.stage)

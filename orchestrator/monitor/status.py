@@ -63,7 +63,7 @@ class Status:
             case CampaignStateChanged():
                 self._state, self._reason = event.after, event.reason
             case CampaignClosed():
-                self._state, self._pour = event.state, ""
+                self._state, self._pour, self._stage = event.state, "", ""
             case StageOpened():
                 self._stage = f"{event.stage} ({event.index} of {event.count})"
             case StrategyProgressed():

@@ -10,7 +10,7 @@ from typing import Any
 
 from orchestrator.plan import CalibrationPlan, CampaignPlan
 from orchestrator.report import style
-from orchestrator.report.results import deployments_of, theta_of
+from orchestrator.report.results import deployments_of, recommended_theta_of
 from orchestrator.results import Results
 from sim_engine.action import Action
 from sim_engine.fill import spacing
@@ -108,8 +108,7 @@ def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list
     Raises:
         ValueError, OSError: as `regimes_of`.
     """
-    calibration = theta_of(results)
-    particles = (plan.parameters if calibration is None else calibration.theta).particles
+    particles = (recommended_theta_of(results) or plan.parameters).particles
     scenes = {} if plan.deployment is None else {scene.name: scene for scene in plan.deployment.scenes}
     found = {}
     for name, result in deployments_of(results).items():

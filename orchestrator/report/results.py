@@ -17,13 +17,14 @@ from orchestrator.report.units import DISCREPANCY, LossUnit, at_least_nothing, d
 from orchestrator.requests import Prediction
 from orchestrator.results import Results
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.evaluation import Scores
-from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.strategies.calibration.evaluation import CalibrationGain, Scores
+from orchestrator.strategies.calibration.scorecard import UNCALIBRATED, recommended_theta
 from orchestrator.strategies.deployment.confirm import Confirmed
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.display import DisplayedMap
 from orchestrator.strategies.learnt import Learnt
 from orchestrator.strategies.repeats import Foreseen
+from sim_engine.liquid import SimulationParameters
 
 L = TypeVar("L", bound=Learnt)
 
@@ -50,6 +51,18 @@ def theta_of(results: Results) -> CalibratedTheta | None:
 def evaluation_of(results: Results) -> Scores | None:
     """The scores of θ* and its rivals on weighed pours."""
     return next(iter(all_of(results, Scores)), None)
+
+
+def gain_of(results: Results) -> CalibrationGain | None:
+    """Whether the weighed pours justify θ*; None where that was not compared."""
+    evaluation = evaluation_of(results)
+    return None if evaluation is None else evaluation.gain
+
+
+def recommended_theta_of(results: Results) -> SimulationParameters | None:
+    """The θ to simulate with: θ*, or the uncalibrated θ if the pours do not justify θ*; None before θ* was found."""
+    found = theta_of(results)
+    return None if found is None else recommended_theta(found.theta, evaluation_of(results))
 
 
 def deployments_of(results: Results) -> dict[str, Deployed]:

@@ -160,19 +160,19 @@ def _without_advice(plan: CampaignPlan, summary: RunSummary, record: Record) -> 
         return said
     if summary.theta is not None:
         return [
-            "This run calibrated the simulator; it recommends no action. θ* is in theta.json, which "
-            "'decant plan CAMPAIGN --parameters' reads."
+            "This run calibrated the simulator; it recommends no action. The parameters to use are in theta.json, "
+            "which 'decant plan CAMPAIGN --parameters' reads."
         ]
     return ["This run recommends no action."]
 
 
 def _theta_table(plan: CampaignPlan, summary: RunSummary) -> Table | None:
-    if summary.theta is None:
+    if summary.calibrated_theta is None:
         return None
     calibration, posterior = plan.calibration, summary.posterior
     axes = {} if calibration is None else {axis.name: axis for axis in calibration.parameters.axes}
     rows = []
-    for name, value in summary.theta.model_dump().items():
+    for name, value in summary.calibrated_theta.model_dump().items():
         axis = axes.get(name)
         searched = "not searched" if axis is None else f"{style.number(axis.lower)} … {style.number(axis.upper)}"
         region = "—"
@@ -194,6 +194,9 @@ def _theta_lines(plan: CampaignPlan, summary: RunSummary) -> list[str]:
     if summary.posterior is not None and plan.calibration is not None:
         found = posterior_lines(summary.posterior, plan.calibration.parameters)
         lines += [f"{line[:1].upper()}{line[1:]}." for line in found]
+    if summary.calibration_gain is not None:
+        text = summary.calibration_gain.text
+        lines.append(f"{text[:1].upper()}{text[1:]}.")
     return lines
 
 

@@ -12,6 +12,7 @@ from pydantic import Field, SerializeAsAny, create_model
 from pydantic.json_schema import GenerateJsonSchema
 
 from orchestrator.results import kinds
+from orchestrator.strategies.calibration.evaluation import CalibrationGain
 from orchestrator.strategies.calibration.posterior import PosteriorSummary
 from orchestrator.strategies.deployment.adaptive import Believed
 from orchestrator.strategies.deployment.confirm import Confirmed
@@ -165,7 +166,13 @@ class RunSummary(Totals):
     campaign: str
     seed: int
     theta: SimulationParameters | None
+    """θ to simulate with from now on: θ*, or the uncalibrated θ if the weighed pours do not justify θ*."""
+
+    calibrated_theta: SimulationParameters | None
     """θ*."""
+
+    calibration_gain: CalibrationGain | None
+    """Whether the weighed pours justify θ*; null where θ* was not compared with the uncalibrated θ."""
 
     predicted_discrepancy: float | None
     """Expected mean |r − c_s| of θ*."""

@@ -55,16 +55,19 @@ def summary_table(plan: CampaignPlan, summary: RunSummary) -> RenderableType:
 def _theta_lines(plan: CampaignPlan, summary: RunSummary) -> list[RenderableType]:
     from rich.text import Text
 
-    if summary.theta is None:
+    if summary.calibrated_theta is None:
         return []
-    text = Text(f"θ*  {style.display_values(summary.theta.model_dump())}")
+    text = Text(f"θ*  {style.display_values(summary.calibrated_theta.model_dump())}")
     if summary.predicted_discrepancy is not None:
         expected = DISCREPANCY.text(summary.predicted_discrepancy, summary.predicted_deviation or 0.0)
         text.append(f"   expected |Δ| {expected}", style="dim")
-    if summary.posterior is None or plan.calibration is None:
-        return [text]
-    lines = posterior_lines(summary.posterior, plan.calibration.parameters)
-    return [text, *(Text(f"  {line}", style="dim") for line in lines)]
+    lines: list[RenderableType] = [text]
+    if summary.posterior is not None and plan.calibration is not None:
+        found = posterior_lines(summary.posterior, plan.calibration.parameters)
+        lines += [Text(f"  {line}", style="dim") for line in found]
+    if (gain := summary.calibration_gain) is not None:
+        lines.append(Text(f"  {gain.text}", style="" if gain.recommended == "calibrated" else "yellow"))
+    return lines
 
 
 def _has_losses(row: ReceiverSummary) -> bool:

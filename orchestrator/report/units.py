@@ -53,6 +53,11 @@ class LossUnit:
         return f", a pour ± {self.factor * deviation:.{self.decimals}f} {self.unit}"
 
     @property
+    def meaning(self) -> str:
+        """The label without the unit: 'spilled / poured'."""
+        return self.label.removesuffix(f" [{self.unit}]")
+
+    @property
     def decimals(self) -> int:
         """Places after the point that mean something: 0.01 % or g (20 mg of 200 g), whole particles."""
         return 0 if self.unit == "particles" else 2

@@ -162,7 +162,9 @@ def unknown_of_all(plan: CampaignPlan, summary: RunSummary, record: Record) -> l
 
 
 def _about_theta(summary: RunSummary) -> list[str]:
-    said = []
+    said, used = [], "calibrated"
+    if summary.calibration_gain is not None and summary.calibration_gain.recommended != used:
+        said, used = [_sentence(summary.calibration_gain.text)], summary.calibration_gain.recommended
     if summary.posterior is None:
         said.append("Which other θ fit the weighed pours as well was not asked: θ* may be one of many.")
     elif summary.posterior.open:
@@ -171,7 +173,7 @@ def _about_theta(summary: RunSummary) -> list[str]:
     unseen = [
         f"{DISCREPANCY.text(own)} on {SPLITS[split]}"
         for split, row in summary.discrepancy.items()
-        if split != "train" and (own := row.get("calibrated")) is not None
+        if split != "train" and (own := row.get(used)) is not None
     ]
     if unseen:
         said.append(
@@ -179,7 +181,7 @@ def _about_theta(summary: RunSummary) -> list[str]:
             "mean."
         )
     elif summary.discrepancy:
-        said.append("The calibrated simulator was not scored on pours that calibration did not see.")
+        said.append("The simulator was not scored on pours that calibration did not see.")
     return said
 
 

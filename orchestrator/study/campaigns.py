@@ -18,8 +18,8 @@ from orchestrator.stages import (
     EVALUATION,
     POURS,
     StageDefinition,
-    calibrated_theta,
     calibration_stages,
+    deployed_theta,
     deployment_stages,
     known_simulations,
     measured_pours,
@@ -184,7 +184,7 @@ def _deployment(
     for calibration in calibrations:
         found = load(calibration)
         deployment = with_posterior(deployment, found)
-        plan = replace(plan, parameters=calibrated_theta(found).theta)
+        plan = replace(plan, parameters=deployed_theta(found))
     plan = replace(plan, calibration=None, deployment=deployment)
     return plan, deployment_stages(plan, deployment)
 

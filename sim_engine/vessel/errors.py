@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from sim_engine.errors import DecantError
 
-class VesselError(ValueError):
+
+class VesselError(DecantError, ValueError):
     """A vessel that can't be built or used; the message says why and what would be right."""

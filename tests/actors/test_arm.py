@@ -171,5 +171,5 @@ class TestArmOfNumbers(ArmContract):
     @pytest.fixture
     def bench(self, path):
         arm = NumbersArm(NumbersSpec(2.0))
-        yield ArmBench(arm, path, 2.0, jog=("z", 0.005, 0.02))
+        yield ArmBench(arm, path, 2.0, jog=("z", 0.005, 0.02), disturb=lambda: arm.grip(Grip(speed_factor=0.7)))
         arm.close()

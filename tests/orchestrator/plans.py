@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Literal
 
+import numpy as np
+
 from orchestrator.config.pose import PoseNoiseSection
 from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
@@ -13,7 +15,11 @@ from orchestrator.strategies.calibration.posterior import PosteriorFound, Remain
 from orchestrator.strategies.deployment.risk import RiskSettings
 from orchestrator.strategies.deployment.window import WindowSettings
 from orchestrator.strategies.doors import STRATEGIES
+from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE
+from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
+from sim_engine.losses import Loss
+from sim_engine.space import Space
 from sim_engine.task import PoseError
 
 CALM: dict[str, dict[str, Any]] = {"D3": {"model": "residual", "trust": "always", "per_pour": 0}}
@@ -30,6 +36,34 @@ def deployment(strategy: str = "D3", **values: Any) -> DeploymentPlan:
     """A deployment by one strategy."""
     settings, rest = _settings(strategy, values)
     return DeploymentPlan(settings, **rest)
+
+
+def calibration_plan(**changes: Any) -> CalibrationPlan:
+    """A calibration of the harness's example."""
+    values: dict[str, Any] = {
+        "scene": SCENE,
+        "actions": CALIBRATION_ACTIONS,
+        "parameters": PARAMETERS,
+        "fixed_parameters": {"friction": 0.1},
+        "pour_count": 32,
+        "holdout": 4,
+    }
+    if changes.get("strategy", "C4") == "C4":
+        values["simulations"] = 60
+    return calibration(**values | changes)
+
+
+def deployment_plan(**changes: Any) -> DeploymentPlan:
+    """A deployment of the harness's example."""
+    values: dict[str, Any] = {"scenes": (SCENE,), "actions": ACTIONS, "loss": Loss(), "pours": 8}
+    if changes.get("strategy", "D3") == "D3":
+        values["prior_simulations"] = 20
+    return deployment(**values | changes)
+
+
+def unit(action: Action, space: Space = ACTIONS) -> np.ndarray:
+    """An action as a point of the unit cube."""
+    return space.encode({name: getattr(action, name) for name in space.names})
 
 
 def risk(

@@ -57,9 +57,9 @@ def changed(part: Any, **updates: Any) -> Any:
     return type(part).model_validate({**dict(part), **updates})
 
 
-def shown(renderable: Any) -> str:
-    """What the terminal would show, 160 columns wide."""
-    console = Console(file=io.StringIO(), width=160)
+def shown(renderable: Any, width: int = 160) -> str:
+    """What the terminal would show, 160 columns wide unless told otherwise."""
+    console = Console(file=io.StringIO(), width=width)
     console.print(renderable)
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 

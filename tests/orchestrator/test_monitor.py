@@ -145,6 +145,15 @@ def test_page_says_at_a_glance_whether_it_is_real_and_what_is_going_on(recorded:
     assert "Best into narrow: 6.00 %" in pages[-1]
 
 
+def test_how_a_run_ended_is_shown_wherever_the_time_cursor_is(recorded: Contents) -> None:
+    """A finished recording opens at its beginning, when the page on the time line said that the run goes on."""
+    pages = [str(row[0]) for row in recorded.values("/outcome", "TextDocument:text")]  # type: ignore[index]
+    assert not {"wall", "sim_time", "step"} & set(recorded.columns["/outcome"])
+    assert pages[-1].startswith("# VIRTUAL: finished\n")
+    assert " of " not in pages[-1].splitlines()[2], "the stage that was reached does not stand there as if it went on"
+    assert "Best into narrow: 6.00 %" in pages[-1]
+
+
 def test_lanes_of_the_machine_show_who_works_at_what(recorded: Contents) -> None:
     simulators = [row[0] for row in recorded.values("/machine/lanes/simulator_1", "StateChange:state")]  # type: ignore[index]
     assert simulators == ["idle", *["calibrate", "idle"] * 2]

@@ -28,12 +28,13 @@ from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.progress import Progress
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from orchestrator.tally import Tally
 from sim_engine.bands import resolution_shift
 from sim_engine.losses import Loss
 from sim_engine.vessel.spec import VesselSpec
 from tests.orchestrator import watched
-from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.reported import changed, shown
 from tests.orchestrator.toy import ToyLaboratory, run_toy, toy_plan
 from tests.orchestrator.toys import narrow_cup
@@ -60,7 +61,7 @@ def repeated(count: int = 5, seed: int = 3, loss: Loss | None = None) -> Repeate
 def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> None:
     strategy = repeated(loss=Loss("grams"))
     assert isinstance(strategy, Strategy)
-    played = Play(narrow_cup)(strategy)
+    played = StrategyHarness(narrow_cup).run(strategy)
     assert {(r.action, r.purpose) for r in played.simulations} == {(ACTION, "predict")}
     assert len({r.seed for r in played.simulations}) == 5
     spilled = [o.outcome.fractions.spilled for _, o in played.told]  # type: ignore[union-attr]
@@ -70,8 +71,11 @@ def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> Non
     assert found["spilled"].count == 5
     assert found["loss"].mean == pytest.approx(200.0 * statistics.mean(spilled))
     assert strategy.progress() == Progress(5, 5)
-    assert Play(narrow_cup)(repeated()).simulations == Play(narrow_cup)(repeated()).simulations
-    assert Play(narrow_cup)(repeated(seed=4)).simulations != played.simulations
+    assert (
+        StrategyHarness(narrow_cup).run(repeated()).simulations
+        == StrategyHarness(narrow_cup).run(repeated()).simulations
+    )
+    assert StrategyHarness(narrow_cup).run(repeated(seed=4)).simulations != played.simulations
 
 
 def measured_cup() -> VesselSpec:
@@ -83,7 +87,7 @@ def measured_cup() -> VesselSpec:
 def test_a_prediction_simulates_a_measured_vessel_with_another_shape_each_time() -> None:
     scene = replace(SCENE, receiver=measured_cup())
     strategy = RepeatedSimulation(Costing(Loss(), scene, THETA), ACTION, 4, 3)
-    requests = Play(narrow_cup)(strategy).simulations
+    requests = StrategyHarness(narrow_cup).run(strategy).simulations
     laboratory = ToyLaboratory()
 
     async def run() -> None:
@@ -103,7 +107,7 @@ def test_a_shape_in_which_the_cups_would_touch_is_the_worst_and_not_lost() -> No
     scene = replace(SCENE, receiver=measured_cup())
     answers = iter([Failed("invalid_action", "cups touch")])
     strategy = RepeatedSimulation(Costing(Loss(), scene, THETA), ACTION, 4, 3)
-    Play(narrow_cup, answer=lambda request: next(answers, None))(strategy)
+    StrategyHarness(narrow_cup, answer=lambda request: next(answers, None)).run(strategy)
     result: Any = strategy.result()
     assert (result.touching, result.simulations_lost, result.over_seeds["loss"].count) == (1, 0, 4)
 
@@ -115,7 +119,7 @@ def test_simulations_that_failed_are_counted_and_left_out_of_the_prediction() ->
         return next(answers, None)
 
     strategy = repeated()
-    Play(narrow_cup, answer=answer)(strategy)
+    StrategyHarness(narrow_cup, answer=answer).run(strategy)
     result: Any = strategy.result()
     assert (result.simulations, result.simulations_lost) == (5, 2)
     assert result.over_seeds["loss"].count == 3
@@ -156,7 +160,7 @@ def test_what_calibration_left_over_widens_the_band_of_a_planned_pour() -> None:
     bands = []
     for discrepancy in (None, 0.6):
         strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), ACTION, 5, 3, discrepancy=discrepancy)
-        Play(narrow_cup)(strategy)
+        StrategyHarness(narrow_cup).run(strategy)
         found = strategy.result().band
         assert found is not None
         bands.append(found)
@@ -190,7 +194,7 @@ def test_a_planned_action_at_the_edge_of_the_box_is_said_to_be(tmp_path: Path) -
 def test_pours_are_predicted_with_how_well_the_mean_is_known_and_how_much_a_pour_scatters(
     name: str, strategy: Any
 ) -> None:
-    played = Play(narrow_cup)(strategy(deployment_plan(strategy=name, pours=3), SCENE, THETA, 1))
+    played = StrategyHarness(narrow_cup).run(strategy(deployment_plan(strategy=name, pours=3), SCENE, THETA, 1))
     predictions = [r.predicted for r in played.asked if isinstance(r, Pour)]
     assert predictions
     assert all(p is not None and p.scatter is not None and p.scatter > 0.0 for p in predictions)
@@ -201,7 +205,7 @@ def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | 
     """Means of four seeds scatter half as much as a single one; what the simulator lacks is a shift of the stream."""
     plan = deployment_plan(strategy="D1", simulations_per_iteration=4, iterations=8)
     strategy = OneShotPlanning(replace(plan, left_over=left_over), SCENE, THETA, 1)
-    Play(narrow_cup)(strategy)
+    StrategyHarness(narrow_cup).run(strategy)
     result: Any = strategy.result()
     seeds, z = (
         2.0 * result.recommended.hyperparameters["noise"],

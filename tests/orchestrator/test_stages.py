@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import html
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,24 +13,29 @@ import pytest
 
 from actors.optimizer.core.problem import Suggestion, SuggestProblem
 from actors.optimizer.core.propose import propose
+from decant.runs import open_run
 from orchestrator.codec import canonical
 from orchestrator.commands.arming import pour_count
+from orchestrator.config.load import predicts_with_posterior
 from orchestrator.errors import RunError
 from orchestrator.events import Event, RequestFinished
+from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour, RecordSet
+from orchestrator.publish import publish
 from orchestrator.report.summarise import summarise
 from orchestrator.report.table import summary_table
 from orchestrator.requests import Pour, Simulate
-from orchestrator.stages import scenes_of, stages_of
+from orchestrator.stages import deployed_theta, scenes_of, stages_of
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3_settings import D3Settings
 from orchestrator.strategies.settings import DeploymentSettings
 from orchestrator.work import work_of
+from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
 from sim_engine.vessel.spec import cylinder
 from tests.orchestrator import plans
-from tests.orchestrator.reported import shown
+from tests.orchestrator.reported import changed, shown
 from tests.orchestrator.toy import SCENE, SPACE, ToyLaboratory, logical_record, run_toy, toy_plan
 
 NARROW = replace(SCENE, name="narrow", receiver=cylinder("narrow", inner_radius=0.02, inner_height=0.1))
@@ -88,7 +95,8 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
     done = [e for e in events if isinstance(e, RequestFinished)]
     deployed = [e.request for e in done if e.stage.startswith("deployment") and isinstance(e.request, Simulate)]
     assert deployed
-    assert {canonical(request.parameters.model_dump()) for request in deployed} == {canonical(theta.model_dump())}
+    used = deployed_theta(result.results)
+    assert {canonical(request.parameters.model_dump()) for request in deployed} == {canonical(used.model_dump())}
     assert {r.request.scene for r in done if r.stage == "deployment:narrow" and isinstance(r.request, Pour)} == {
         "narrow"
     }
@@ -102,6 +110,55 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
     assert evaluation.random_median.keys() == {"test"}  # random θ are not simulated on training pours
     assert evaluation.mean_predictor["test"] is not None
     assert evaluation.regression["test"] is not None
+
+
+def test_a_theta_that_the_pours_do_not_justify_is_not_deployed_and_everything_published_says_so(tmp_path: Path) -> None:
+    # the toy's simulations do not depend on θ, so that no θ fits the pours better than another one
+    plan = campaign(tmp_path, calibration=calibration(random_baseline=0))
+    events: list[Event] = []
+    result = run(tmp_path / "run", plan, watchers=[events.append])
+    evaluation = result.results["evaluation"]
+    gain = evaluation.gain
+    assert (gain.recommended, gain.pours) == ("uncalibrated", 5)
+    scored = [e for e in events if isinstance(e, RequestFinished) and e.stage == "evaluation"]
+    assert len(scored) == work_of(plan, ["evaluation"])["evaluation"].simulations == 2 * 5
+    plain = SimulationParameters(particles=700, viscosity=4.0)
+    assert evaluation.thetas["uncalibrated"] == plain
+    assert {
+        event.request.parameters
+        for event in events
+        if isinstance(event, RequestFinished)
+        and event.stage.startswith("deployment")
+        and isinstance(event.request, Simulate)
+    } == {plain}
+    found = result.results["calibration"].found
+    published = publish(plan, result)
+    assert (published.summary.theta, published.summary.calibrated_theta) == (plain, found.theta)
+    assert gain.text in " ".join(shown(summary_table(plan, published.summary), width=400).split())
+    assert published.theta is not None
+    assert published.report is not None
+    written = json.loads(published.theta.read_text())
+    assert (written["theta"], written["why"]) == (plain.model_dump(), gain.text)
+    assert written["calibrated"] == found.theta.model_dump()
+    assert not predicts_with_posterior(published.theta)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["calibration_gain"]["text"] == gain.text
+    page = html.unescape(published.report.read_text())
+    assert gain.text[1:] in page
+    with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
+        decisions = [entry.body["text"] for entry in journal.entries(stage="evaluation", kinds=[Kind.DECISION])]
+    assert decisions[-1] == gain.text
+    opened = open_run(tmp_path / "run", plan)
+    assert (opened.theta, opened.calibration_gain) == (plain, gain)
+
+
+def test_a_theta_that_the_pours_justify_is_deployed(tmp_path: Path) -> None:
+    results = dict(run(tmp_path / "run", campaign(tmp_path, deployment=None)).results)
+    theta, evaluation = results["calibration"].found.theta, results["evaluation"]
+    assert deployed_theta(results) == evaluation.thetas["uncalibrated"] != theta
+    results["evaluation"] = changed(evaluation, gain=changed(evaluation.gain, recommended="calibrated"))
+    assert deployed_theta(results) == theta
+    results["evaluation"] = changed(evaluation, gain=None)  # of a run by a version that did not compare
+    assert deployed_theta(results) == theta
 
 
 def test_what_is_recommended_is_poured_again_after_each_deployment(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from actors.balance.reading import LineError, Reading, Status
 from actors.balance.virtual_balance import Load
-from actors.contracts.balance import BalanceBench, BalanceContract
+from decant.testing import BalanceBench, BalanceContract
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.spec import VesselSpec
 from tests.plugins.decant_example.balance import SpringBalance, SpringSpec
@@ -21,10 +21,15 @@ from tests.plugins.decant_example.vessel import Cone
 class TestSpring(BalanceContract):
     @pytest.fixture
     def bench(self) -> Iterator[BalanceBench]:
-        spec = SpringSpec(swing=0.1)
+        spec = SpringSpec(swing=1.0, time_scale=10.0)
         driver = SpringBalance(spec)
+        filling, empty = Load((0.0, 3600.0), (0.0, 1.0)), Load((0.0,), (0.0,))
         yield BalanceBench(
-            driver, lambda mass: driver.put(Load((0.0,), (mass,))), tolerance=0.1e-3, make=(SpringBalance, spec)
+            driver,
+            lambda mass: driver.put(Load((0.0,), (mass,))),
+            tolerance=0.1e-3,
+            restless=lambda active: driver.put(filling if active else empty),
+            make=(SpringBalance, spec),
         )
         driver.close()
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from decant.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
 from orchestrator.plan import DeploymentPlan
 from orchestrator.strategies.deployment.objectives import Objectives, Spillage
 from sim_engine.losses import Loss
-from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, replay
 from tests.orchestrator.toys import narrow_cup
 from tests.plugins.decant_example.objective import Gentle
 from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings
@@ -33,7 +33,7 @@ def plan(pours: int = 9, **changes: Any) -> DeploymentPlan:
 @pytest.mark.parametrize("centred", [False, True])
 def test_every_slice_is_poured_from_once(centred: bool) -> None:
     strategy = Hypercube(plan(centred=centred), SCENE, THETA, 3)
-    played = Play(narrow_cup)(strategy)
+    played = StrategyHarness(narrow_cup).run(strategy)
     points = np.array([ACTIONS.encode(pour.action.values()) for pour in played.pours])
     for column in points.T:
         assert sorted(np.floor(9 * column - 1e-9 * column)) == list(range(9))
@@ -43,9 +43,8 @@ def test_every_slice_is_poured_from_once(centred: bool) -> None:
     assert not played.simulations
 
 
-def test_it_is_replayed_exactly() -> None:
-    played = Play(narrow_cup)(Hypercube(plan(), SCENE, THETA, 3))
-    replay(Hypercube(plan(), SCENE, THETA, 3), played)
+def test_it_does_what_every_strategy_has_to_do() -> None:
+    check_strategy(lambda: Hypercube(plan(), SCENE, THETA, 3), narrow_cup)
 
 
 def test_an_objective_of_ones_own_takes_part_in_the_weighted_sum() -> None:

@@ -3,15 +3,32 @@
 A command sent before the last one is answered may be confused with it, so the driver never has two under way. Sources:
 Mettler-Toledo AL/AB operating instructions (commands, `S` replies); AT operating instructions (upper case, CR LF).
 9600 baud 8N1 is the factory setting of many; some come with Xon/Xoff (setting `handshake`).
+
+A virtual balance answers all commands of levels 0 and 1 as the reference manual for weigh modules lists them
+(11781363), and `M21` of level 2, by which clients choose the unit. Assumed, as no balance was at hand: `M21` without
+parameters lists host and display unit in two lines, and `ZC` answers as `ZI` does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from decimal import Decimal
 
 from actors.balance.dialects import status_lines
-from actors.balance.virtual_serial.voice import Voice
+from actors.balance.reading import Reading, Status
+from actors.balance.units import KILOGRAMS
+from actors.balance.virtual_serial.voice import (
+    Cancel,
+    Display,
+    Lines,
+    Repeat,
+    Said,
+    Voice,
+    Waiting,
+    line_of,
+    weight_line,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +45,101 @@ class MtSics(status_lines.StatusLines):
 
     def voices(self) -> Mapping[str, Callable[[], Voice]]:
         """See `Dialect.voices`."""
-        return {self.name: lambda: status_lines.StatusLineVoice(self, '"01" "2.30" "2.22"', "VIRTUAL 6200.00 g")}
+        return {self.name: lambda: MtSicsVoice(self, '"01" "2.30" "2.22"', "VIRTUAL")}
+
+
+HOST, DISPLAY = 0, 1
+"""Kinds of unit that M21 sets: of weights on the line, and of those that SIRU and SRU send."""
+
+UNITS = {"0": "g", "1": "kg", "3": "mg", "5": "ct"}
+"""Numbers of the units; pounds and ounces, which are no whole number of digits, are refused."""
+
+LONGEST_WAIT = 65_535
+"""What SC, TC and ZC may be told to wait [ms]."""
+
+
+class MtSicsVoice(status_lines.StatusLineVoice):
+    """What MT-SICS has and KCP has not: units, commands with a time limit, repeated output of the display's unit."""
+
+    LEVELS: Mapping[str, int] = {
+        **status_lines.StatusLineVoice.LEVELS,
+        **dict.fromkeys(("C", "SC", "SIRU", "SNR", "SRU", "TC", "ZC"), 1),
+        "M21": 2,
+    }
+
+    def __init__(self, dialect: Lines, levels: str, model: str) -> None:
+        super().__init__(dialect, levels, model)
+        self._model = model
+        self._units: dict[int, str] = {}
+
+    def answer_bare(self, word: str, display: Display) -> Said:
+        """See `StatusLineVoice.answer_bare`."""
+        match word:
+            case "C":
+                return Cancel(line_of("C B") + line_of("C A"))
+            case "I2":
+                return line_of(f'I2 A "{self._model} {display.scale.capacity} {display.scale.settings.unit}"')
+            case "SIRU":
+                return Repeat(lambda reading: weight_line(self.dialect, self._in_unit(reading, DISPLAY)))
+            case "SNR":
+                return self.follow(display, moving=False)
+            case "SRU":
+                shown = self.follow(display)
+                return replace(shown, line=lambda r: weight_line(self.dialect, self._in_unit(r, DISPLAY)))
+            case "M21":
+                host, shown_ = (self._number(kind, display) for kind in (HOST, DISPLAY))
+                return line_of(f"M21 B {HOST} {host}") + line_of(f"M21 A {DISPLAY} {shown_}")
+        return super().answer_bare(word, display)
+
+    def answer_with(self, word: str, parameters: str, display: Display) -> Said:
+        """See `StatusLineVoice.answer_with`."""
+        match word:
+            case "SC" | "TC" | "ZC":
+                return self._limited(word, parameters, display)
+            case "SNR":
+                mass = self.mass_in(parameters)
+                return self.follow(display, mass, moving=False) if mass else line_of("SNR L")
+            case "M21":
+                kind, _, unit = parameters.partition(" ")
+                if kind not in (str(HOST), str(DISPLAY)) or unit not in UNITS:
+                    return line_of("M21 L")
+                self._units[int(kind)] = UNITS[unit]
+                return line_of("M21 A")
+        return super().answer_with(word, parameters, display)
+
+    def line(self, reading: Reading) -> bytes:
+        """See `StatusLineVoice.line`."""
+        return weight_line(self.dialect, self._in_unit(reading, HOST))
+
+    def tared(self, display: Display) -> str:
+        """See `StatusLineVoice.tared`."""
+        tare = self._in_unit(Reading(Status.STABLE, display.scale.tared, display.scale.settings.unit), HOST)
+        return f"{tare.value!s:>10} {tare.unit}"
+
+    def _limited(self, word: str, parameters: str, display: Display) -> Said:
+        """Wait for rest for a time, then do it all the same."""
+        if not parameters.isdecimal() or int(parameters) > LONGEST_WAIT:
+            return line_of(f"{word} L")
+
+        def act() -> bytes:
+            return self.weight(display) if word == "SC" else self.act(word, display)
+
+        return Waiting(act, act, int(parameters) / 1000.0)
+
+    def _number(self, kind: int, display: Display) -> str:
+        unit = self._units.get(kind, display.scale.settings.unit)
+        return next((number for number, name in UNITS.items() if name == unit), "0")
+
+    def _in_unit(self, reading: Reading, kind: int) -> Reading:
+        """A reading in the host's unit or the display's; as it is where it has no mass."""
+        unit = self._units.get(kind, reading.unit)
+        if reading.value is None or unit == reading.unit or reading.unit not in KILOGRAMS:
+            return reading
+        factor = Decimal(repr(KILOGRAMS[reading.unit])) / Decimal(repr(KILOGRAMS[unit]))
+        last = Decimal((0, (1,), reading.value.as_tuple().exponent))  # type: ignore[arg-type]
+        digit = (last * factor).normalize()
+        value = (reading.value * factor).quantize(min(digit, Decimal(1)))
+        return replace(reading, value=value, unit=unit)
 
 
 MT_SICS = MtSics()

@@ -11,10 +11,23 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 
 from actors.balance.dialects.dialect import Dialect, number_in, text_of
 from actors.balance.reading import Acknowledgement, Answer, LineError, Reading, Reply, Status
-from actors.balance.virtual_serial.voice import END, Display, Lines, Repeat, Said, Waiting, line_of, weight_line
+from actors.balance.units import KILOGRAMS, kilograms
+from actors.balance.virtual_serial.voice import (
+    END,
+    Cancel,
+    Display,
+    Follow,
+    Lines,
+    Repeat,
+    Said,
+    Waiting,
+    line_of,
+    weight_line,
+)
 
 WEIGHTS = {"S": Status.STABLE, "D": Status.UNSTABLE}
 STATES = {"I": Status.BUSY, "+": Status.OVER, "-": Status.UNDER, "L": Status.ERROR}
@@ -113,7 +126,7 @@ class StatusLines(Dialect):
 
 
 class StatusLineVoice:
-    """KCP and MT-SICS.
+    """The commands that KCP and MT-SICS share: MT-SICS's levels 0 and 1, as most balances have them.
 
     Args:
         dialect: one of the two.
@@ -121,9 +134,21 @@ class StatusLineVoice:
         model: answer to I2.
     """
 
+    LEVELS: Mapping[str, int] = {
+        **dict.fromkeys(("@", "I0", "I1", "I2", "I3", "I4", "I5", "S", "SI", "SIR", "Z", "ZI"), 0),
+        **dict.fromkeys(("D", "DW", "K", "SR", "T", "TA", "TAC", "TI"), 1),
+    }
+    """Commands as I0 lists them, each with its level."""
+
     def __init__(self, dialect: Lines, levels: str, model: str) -> None:
         self.dialect = dialect
-        self._identity = {"I1": levels, "I2": f'"{model}"', "I3": '"1.00"', "I4": '"0123456789"'}
+        self._identity = {
+            "I1": levels,
+            "I2": f'"{model}"',
+            "I3": '"1.00 1.2.3.4"',
+            "I4": '"0123456789"',
+            "I5": '"12345678A"',
+        }
 
     def commands(self, heard: bytearray) -> list[bytes]:
         """See `Voice.commands`."""
@@ -133,37 +158,100 @@ class StatusLineVoice:
 
     def answer(self, command: bytes, display: Display) -> Said:
         """See `Voice.answer`."""
-        word = command.decode("ascii", "replace")
+        word, _, parameters = command.decode("ascii", "replace").partition(" ")
+        if not word and not parameters:
+            return b""
+        if word not in self.LEVELS:
+            return line_of("ES")
+        if parameters:
+            return self.answer_with(word, parameters.strip(), display)
+        return self.answer_bare(word, display)
+
+    def answer_bare(self, word: str, display: Display) -> Said:
+        """The answer to a known command without parameters."""
         match word:
-            case "":
-                return b""
+            case "I0":
+                return self._list()
             case "SI":
-                return weight_line(self.dialect, display.reading())
+                return self.weight(display)
             case "S":
-                return Waiting(lambda: weight_line(self.dialect, display.reading()), line_of("S I"))
+                return Waiting(lambda: self.weight(display), line_of("S I"))
             case "SIR":
-                return Repeat()
+                return Repeat(self.line)
+            case "SR":
+                return self.follow(display)
             case "T" | "Z":
-                return Waiting(lambda: self._act(word, display), line_of(f"{word} I"))
+                return Waiting(lambda: self.act(word, display), line_of(f"{word} I"))
             case "TI" | "ZI":
-                return self._act(word, display)
+                return self.act(word, display)
             case "TA":
-                return line_of(f"TA A {display.scale.tared!s:>10} {display.scale.settings.unit}")
+                return line_of(f"TA A {self.tared(display)}")
             case "TAC":
                 display.scale.clear_tare()
                 return line_of("TAC A")
+            case "DW":
+                return line_of("DW A")
             case "@":
-                return line_of(f"I4 A {self._identity['I4']}")
-        return line_of(f"{word} A {self._identity[word]}") if word in self._identity else line_of("ES")
+                return Cancel(line_of(f"I4 A {self._identity['I4']}"))
+        return line_of(f"{word} A {self._identity[word]}" if word in self._identity else f"{word} L")
 
-    def _act(self, word: str, display: Display) -> bytes:
+    def answer_with(self, word: str, parameters: str, display: Display) -> Said:
+        """The answer to a known command with parameters; 'L' where these are not as they should be."""
+        match word:
+            case "D" if re.fullmatch(r'"[^"]*"', parameters):
+                return line_of("D A")
+            case "K" if parameters in ("1", "2", "3", "4"):
+                return line_of("K A")
+            case "TA" if (mass := self.mass_in(parameters)) is not None and display.scale.preset_tare(mass):
+                return line_of(f"TA A {self.tared(display)}")
+            case "SR" if (mass := self.mass_in(parameters)) is not None and mass > 0.0:
+                return self.follow(display, mass)
+            case "D" | "K" | "TA" | "SR":
+                return line_of(f"{word} L")
+        return line_of("ES")
+
+    def line(self, reading: Reading) -> bytes:
+        """The line for a reading."""
+        return weight_line(self.dialect, reading)
+
+    def weight(self, display: Display) -> bytes:
+        """The line for what is shown now."""
+        return self.line(display.reading())
+
+    def tared(self, display: Display) -> str:
+        """The tare with its unit, as it stands in a line."""
+        return f"{display.scale.tared!s:>10} {display.scale.settings.unit}"
+
+    def mass_in(self, parameters: str) -> float | None:
+        """The mass in 'value unit' [kg]; None where it is none."""
+        value, _, unit = parameters.partition(" ")
+        number, factor = number_in(value), kilograms(unit.strip())
+        return None if number is None or factor is None else float(number) * factor
+
+    def follow(self, display: Display, mass: float | None = None, *, moving: bool = True) -> Follow:
+        """Report changes: of a mass [kg], or by default of an eighth of the weight and at least 30 digits."""
+        scale = display.scale
+        if mass is None:
+            return Follow(self.line, lambda stood: max(abs(stood) / 8, 30 * scale.step), moving)
+        step = Decimal(repr(mass)) / Decimal(repr(KILOGRAMS[scale.settings.unit]))
+        return Follow(self.line, lambda stood: step, moving)
+
+    def act(self, word: str, display: Display) -> bytes:
+        """Tare (T …) or zero (Z …) now, and the line that reports it."""
         status = display.tare() if word.startswith("T") else display.zero()
         if status in _SIGNS:
             return line_of(f"{word} {_SIGNS[status]}")
         letter = "S" if display.scale.stable else "D"
         if word.startswith("Z"):
-            return line_of("Z A" if word == "Z" else f"ZI {letter}")
-        return line_of(f"{word} {letter} {display.scale.tared!s:>10} {display.scale.settings.unit}")
+            return line_of("Z A" if word == "Z" else f"{word} {letter}")
+        return line_of(f"{word} {letter} {self.tared(display)}")
+
+    def _list(self) -> bytes:
+        listed = sorted(self.LEVELS.items(), key=lambda entry: entry[1])
+        states = ["B"] * (len(listed) - 1) + ["A"]
+        return b"".join(
+            line_of(f'I0 {state} {level} "{name}"') for state, (name, level) in zip(states, listed, strict=True)
+        )
 
 
 def levels_of_sics(said: Mapping[str, str]) -> bool:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from decimal import Decimal
 from typing import Any, Protocol
 
 import numpy as np
 
 from actors.balance.doors import voices
+from actors.balance.reading import Status
 from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.faults import FaultyDisplay, spoil
 from actors.balance.virtual_serial.scale import Scale, ScaleSettings
-from actors.balance.virtual_serial.voice import Repeat, Waiting, weight_line
+from actors.balance.virtual_serial.voice import Cancel, Follow, Repeat, Waiting, weight_line
 
 REPEAT_INTERVAL = 0.2
 """From one repeated reading to the next [s of bench time]."""
@@ -66,7 +68,10 @@ class Emulation:
         self._heard = bytearray()
         self._questions = 0
         self._waiting: tuple[Waiting, float] | None = None
+        self._repeat = Repeat()
         self._repeat_at: float | None = None
+        self._following: Follow | None = None
+        self._stood_at: Decimal | None = None
         self._unasked_at: float | None = None
         self._answers: list[tuple[float, bytes]] = []
         self._now: float | None = None
@@ -79,7 +84,7 @@ class Emulation:
         self._heard += data
         for command in self._voice.commands(self._heard):
             self._questions += 1
-            self._repeat_at = None
+            self._repeat_at = self._following = None
             self._carry_out(command, now)
 
     def speak(self, now: float) -> bytes:
@@ -90,7 +95,10 @@ class Emulation:
             self._wait_on(now)
         if self._repeat_at is not None and now >= self._repeat_at:
             self._repeat_at = now + REPEAT_INTERVAL / (self._time_scale or 1.0)
-            self._answers.append((now, self._weight()))
+            reading = self._display.reading()
+            self._answers.append((now, self._repeat.line(reading) if self._repeat.line is not None else self._weight()))
+        if self._following is not None:
+            self._follow(self._following, now)
         ready = b"".join(line for at, line in self._answers if at <= now)
         self._answers = [(at, line) for at, line in self._answers if at > now]
         if faults.unasked > 0.0 and now >= (self._unasked_at or 0.0):
@@ -106,7 +114,7 @@ class Emulation:
             times.append(self._repeat_at)
         if self._display.faults.unasked > 0.0:
             times.append(self._unasked_at or now)
-        if self._waiting is not None:
+        if self._waiting is not None or self._following is not None:
             times.append(now + 0.01)
         return min(times, default=None)
 
@@ -118,14 +126,14 @@ class Emulation:
                 self._scale.put(Load(tuple(times), tuple(masses)))
             case {"do": "prepare", "seed": seed}:
                 self._scale.prepare(tuple(seed))
-                self._waiting = self._repeat_at = None
+                self._waiting = self._repeat_at = self._following = None
             case {"do": "faults", **changes}:
                 self._display.set(changes)
             case {"do": "advance", "seconds": seconds}:
                 self._scale.advance(float(seconds))
             case {"do": "power cycle"}:
                 self._scale.power_cycle()
-                self._waiting = self._repeat_at = None
+                self._waiting = self._repeat_at = self._following = None
             case {"do": "state"}:
                 return {
                     "truth": self._scale.truth,
@@ -145,10 +153,15 @@ class Emulation:
     def _carry_out(self, command: bytes, now: float) -> None:
         said = self._voice.answer(b"?" if self._display.faults.stranger else command, self._display)
         if isinstance(said, Repeat):
-            self._repeat_at = now
+            self._repeat, self._repeat_at = said, now
+        elif isinstance(said, Follow):
+            self._following, self._stood_at = said, None
+        elif isinstance(said, Cancel):
+            self._waiting = None
+            self._say(said.line, now)
         elif isinstance(said, Waiting):
-            patience = COMMAND_PATIENCE / self._time_scale if self._time_scale > 0.0 else math.inf
-            self._waiting = (said, now + patience)
+            patience = COMMAND_PATIENCE if said.patience is None else said.patience
+            self._waiting = (said, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
             self._wait_on(now)
         else:
             self._say(said, now)
@@ -162,7 +175,19 @@ class Emulation:
             self._say(waiting.done(), now)
         elif now > until and waiting.expired is not None:
             self._waiting = None
-            self._say(waiting.expired, now)
+            self._say(waiting.expired if isinstance(waiting.expired, bytes) else waiting.expired(), now)
+
+    def _follow(self, following: Follow, now: float) -> None:
+        """Report the weight once it stands, and its changes."""
+        reading = self._display.reading()
+        if self._stood_at is None:
+            if reading.status is Status.STABLE and reading.value is not None:
+                self._stood_at = reading.value
+                self._answers.append((now, following.line(reading)))
+        elif reading.value is None or abs(reading.value - self._stood_at) >= following.step(self._stood_at):
+            self._stood_at = None
+            if following.moving and reading.status is not Status.STABLE:
+                self._answers.append((now, following.line(reading)))
 
     def _say(self, line: bytes, now: float) -> None:
         if line:

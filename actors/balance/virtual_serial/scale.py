@@ -123,6 +123,23 @@ class Scale:
         """The tare as it would be shown, in the unit."""
         return self._rounded(self._tare)
 
+    def preset_tare(self, mass: float) -> bool:
+        """Take a known mass for the tare [kg]. Returns whether it is within the range."""
+        if not 0.0 <= mass <= self.settings.capacity:
+            return False
+        self._tare = mass
+        return True
+
+    @property
+    def capacity(self) -> Decimal:
+        """The heaviest load as it would be shown, in the unit."""
+        return self._rounded(self.settings.capacity)
+
+    @property
+    def step(self) -> Decimal:
+        """Step of the display, in the unit."""
+        return self._decimal_step
+
     def zero(self) -> Status:
         """Set the zero; refused where more than a little is on it."""
         if abs(self.gross) > ZERO_SHARE * self.settings.capacity:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Protocol
 
 from actors.balance.reading import Reading, Status
@@ -20,19 +21,54 @@ class Waiting:
 
     Attributes:
         done: carries the command out and gives the line.
-        expired: line if it does not come to rest in time; None: waits for ever.
+        expired: line if it does not come to rest in time, or what carries the command out all the same and gives it;
+            None: waits for ever.
+        patience: how long it waits [s of bench time]; None: as long as the balance waits for every command.
     """
 
     done: Callable[[], bytes]
-    expired: bytes | None = None
+    expired: bytes | Callable[[], bytes] | None = None
+    patience: float | None = None
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """Readings from now on, until the next command."""
+    """Readings from now on, until the next command.
+
+    Attributes:
+        line: gives the line for a reading; None: the dialect's.
+    """
+
+    line: Callable[[Reading], bytes] | None = None
 
 
-Said = bytes | Waiting | Repeat
+@dataclass(frozen=True)
+class Follow:
+    """The weight once it stands, and again whenever it has changed and stands again, until the next command.
+
+    Attributes:
+        line: gives the line for a reading.
+        step: change that counts, as a function of the last stable value, in the display's unit.
+        moving: the change itself is reported, too, while the display moves.
+    """
+
+    line: Callable[[Reading], bytes]
+    step: Callable[[Decimal], Decimal]
+    moving: bool = True
+
+
+@dataclass(frozen=True)
+class Cancel:
+    """Ends what waits and what is repeated.
+
+    Attributes:
+        line: the answer.
+    """
+
+    line: bytes
+
+
+Said = bytes | Waiting | Repeat | Follow | Cancel
 
 
 class Display(Protocol):

@@ -82,6 +82,11 @@ class Mover:
 
     # ---- who moves
 
+    @property
+    def holder(self) -> int | None:
+        """Thread whose command moves the arm; None if none does."""
+        return self._holder
+
     def take(self, thread: int) -> None:
         """A thread's command begins.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.lexer import Word, words
 from actors.virtual_ur.urscript.tree import (
@@ -97,6 +99,8 @@ class _Parser:
             function = self._function()
             if self._word.kind != "end of text":
                 raise self._unexpected("nothing more")
+            if function.parameters:
+                raise ScriptError(f"program '{function.name}' must not have parameters", function.line)
             return function
         body, line = [], self._word.line
         while self._word.kind != "end of text":
@@ -309,10 +313,12 @@ class _Parser:
 
 
 def _number(word: Word) -> int | float:
-    if word.text[:2] in ("0x", "0X"):
-        return int(word.text, 16)
-    if word.text.isdigit():
+    hexadecimal = word.text[:2] in ("0x", "0X")
+    if hexadecimal or word.text.isdigit():
         if len(word.text) > 18:
             raise ScriptError("a number with too many digits", word.line)
-        return int(word.text)
-    return float(word.text)
+        return int(word.text, 16 if hexadecimal else 10)
+    value = float(word.text)
+    if not isfinite(value):
+        raise ScriptError("a number that is too large", word.line)
+    return value

@@ -137,18 +137,31 @@ class Program:
             except _HaltedError:
                 return False
             except ScriptError as error:
-                raise ScriptError(error.text, error.line or self._line_of(error)) from error
+                raise ScriptError(error.text, error.line or self._line_of_error(error)) from error
             except Exception as error:
-                raise ScriptError(_explain(error), self._line_of(error)) from error
+                raise ScriptError(_explain(error), self._line_of_error(error)) from error
         return True
 
-    def _line_of(self, error: BaseException) -> int:
+    def line_of(self, number: int) -> int:
+        """Line of the text that a thread has got to; 0 if there is no such thread."""
+        line, steps = 0, self._threads.get(number)
+        while steps is not None:
+            frame = getattr(steps, "gi_frame", None)
+            if frame is not None and frame.f_code.co_filename == "<program>":
+                line = self._text_line(frame.f_lineno)
+            steps = getattr(steps, "gi_yieldfrom", None)
+        return line
+
+    def _line_of_error(self, error: BaseException) -> int:
         line, trace = 0, error.__traceback__
         while trace is not None:
             if trace.tb_frame.f_code.co_filename == "<program>":
-                line = self._lines[min(trace.tb_lineno, len(self._lines)) - 1]
+                line = self._text_line(trace.tb_lineno)
             trace = trace.tb_next
         return line
+
+    def _text_line(self, code_line: int) -> int:
+        return self._lines[min(code_line, len(self._lines)) - 1]
 
     # ---- bounds of time and memory
 

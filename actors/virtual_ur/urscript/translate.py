@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import marshal
 import sys
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,6 +25,9 @@ _MEMORY = 2_000_000_000
 
 _SECONDS = 20
 """Processor time that a translation apart may take [s]."""
+
+_NICENESS = 10
+"""How far a translation apart gives way to the controller's clock [nice]."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,8 @@ def translate(text: str, commands: frozenset[tuple[str, bool]]) -> Translated:
     try:
         tree = parse(text)
         translation = Translation(tree, dict(commands))
-        code = compile(translation.source, "<program>", "exec")
+        with warnings.catch_warnings(action="ignore"):  # of the code's own making: `1[0]`, say
+            code = compile(translation.source, "<program>", "exec")
     except RecursionError:
         raise ScriptError("nested too deeply") from None
     except (SyntaxError, ValueError, MemoryError) as error:
@@ -90,8 +95,10 @@ def read_answer(data: bytes) -> Translated:
 
 def main() -> None:
     """Translate what stands on standard input: `python -m actors.virtual_ur.urscript`."""
+    import os
     import resource
 
+    os.nice(_NICENESS)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS))
     asked = json.loads(sys.stdin.buffer.read())

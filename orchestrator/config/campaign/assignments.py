@@ -8,11 +8,12 @@ from orchestrator.config.motion import dimension_quantity
 from orchestrator.config.yaml.errors import did_you_mean
 from orchestrator.config.yaml.quantities import QuantityError
 from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.errors import DecantError
 from sim_engine.space import Space
 
 
-class AssignmentError(ValueError):
-    """Values from the command line can't be used; one line per value that is wrong."""
+class AssignmentError(DecantError, ValueError):
+    """Values of an action can't be used; one line per value that is wrong."""
 
 
 def set_action(

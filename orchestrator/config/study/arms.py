@@ -95,7 +95,7 @@ class CalibrationsBase(Section):
     """Bayesian optimisation, each θ on all training pours."""
 
     C4: C4Arm | None = None
-    """Bayesian optimisation, one simulation an iteration; its θ* are what D1 and D3 simulate with."""
+    """Bayesian optimisation, one simulation an iteration; the θ that it recommends is what D1 and D3 simulate with."""
 
     C4_paper: C4Arm | None = None
     """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""

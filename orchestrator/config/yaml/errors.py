@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from sim_engine.errors import DecantError
+
 PROBLEMS_SHOWN = 20
 LINE_SHOWN, TEXT_SHOWN = 200, 1500
 """Characters of a line of a file and of a message that are shown: a person mends one thing after the other."""
@@ -47,7 +49,7 @@ class Problem:
         return f"{head}\n{self.line:5d} | {source}\n      | {' ' * before}^"
 
 
-class ConfigError(Exception):
+class ConfigError(DecantError):
     """A campaign, vessel, laboratory, record or parameter file can't be used; its text is the whole report.
 
     Attributes:

@@ -1,12 +1,17 @@
 // The operator's page: what is going on, what is asked, and how to stop.
 
-import { Refused, call, knownToken, listen, saveReport, useToken } from "./talk.js";
-import { button, clock, draw, el, endedList, formerRuns, modeBadge, poursTable, questionCard, queueList, rigCard } from "./show.js";
+import { Refused, call, knownToken, listen, reach, saveReport, useToken } from "./talk.js";
+import {
+  button, cellLine, clock, draw, el, endedList, formerRuns, modeBadge, poursTable, questionCard, queueList, rigCard, stopCard,
+} from "./show.js";
 
 const $ = (id) => document.getElementById(id);
 const RUNNING = ["preparing", "running", "pausing", "waiting for operator", "stopping"];
-const now = { status: null, campaigns: [], questions: [], pours: [], seen: 0 };
-let wanted = 0, busy = false, joined = false;
+const BEAT = 2000, SILENCE = 6000;
+/* How often the daemon is called [ms], and after which silence the page no longer relies on it. */
+const PHYSICAL = "press the physical emergency stop: the red mushroom button on the teach pendant";
+const now = { status: null, campaigns: [], questions: [], pours: [], seen: 0, heard: 0, up: null, clearing: null };
+let wanted = 0, busy = false, begun = false, joined = false;
 
 // ---- what is known
 
@@ -16,16 +21,17 @@ async function refresh() {
   try {
     const [status, campaigns, questions] = await Promise.all([call("status"), call("campaigns?limit=60"), call("questions")]);
     Object.assign(now, { status, campaigns, questions, seen: Date.now() });
-    const shown = campaigns.find((one) => RUNNING.includes(one.state) && one.run) || campaigns.find((one) => one.run);
-    const detail = shown ? await call(`campaigns/${encodeURIComponent(shown.id)}`) : null;
-    const open = shown && !RUNNING.includes(shown.state) ? "UNKNOWN" : "under way";
-    now.pours = (detail ? detail.pours_made : []).filter((pour) => pour.state !== "asked").slice(-8).reverse()
-      .map((pour) => ({ ...pour, state: pour.state === "under way" ? open : pour.state }));
+    const running = campaigns.filter((one) => RUNNING.includes(one.state) && one.run);
+    const shown = running.length ? running : campaigns.filter((one) => one.run).slice(0, 1);
+    const details = await Promise.all(shown.map((one) => call(`campaigns/${encodeURIComponent(one.id)}`)));
+    now.pours = details.flatMap((one) => one.pours_made.map((pour) => ({ ...pour, campaign: one.name })))
+      .filter((pour) => pour.state !== "asked").sort((one, other) => other.time - one.time).slice(0, 8);
     show();
     link(true);
   } catch (error) {
     if (error.status === 401) leave(error.message);
-    else link(false, error instanceof Refused ? error.message : "");
+    else if (error instanceof Refused) $("told").textContent = `No news: ${error.message}`; // it answers, so a stop may work
+    else beat();
   } finally {
     busy = false;
     if (wanted) { wanted = 0; soon(300); }
@@ -63,14 +69,44 @@ function alarm(text) {
   while ($("alarms").children.length > 5) $("alarms").firstChild.remove();
 }
 
-function link(stands, why = "") {
-  $("link").textContent = stands ? `up to date, ${clock(Date.now() / 1000)}` : "no connection";
-  $("lost").hidden = stands;
-  document.body.classList.toggle("stale", !stands);
-  if (!stands) {
-    const since = now.seen ? `What you see is of ${clock(now.seen / 1000)}. ` : "";
-    $("lost").textContent = `No connection to the daemon${why ? ` (${why})` : ""}. ${since}To stop the arm, use its own emergency stop.`;
+let beating = null;
+
+/** Call the daemon now; what the page shows of the connection follows from the answer. */
+function beat() {
+  beating ??= reach().then(() => link(true), () => link(false)).finally(() => { beating = null; });
+  return beating;
+}
+
+async function beats() {
+  for (;;) {
+    if ($("login").hidden) await beat();
+    await new Promise((go) => setTimeout(go, BEAT));
   }
+}
+
+/** A tab that slept, or a clock that went on without an answer: not connected until the daemon answers again. */
+function doubt() {
+  if (now.up && Date.now() - now.heard > SILENCE) link(false);
+  beat();
+}
+
+function link(up) {
+  if (!$("login").hidden) return;
+  if (up) now.heard = Date.now();
+  const changed = up !== now.up;
+  now.up = up;
+  $("link").textContent = up ? `connected, ${clock(now.heard / 1000)}` : "NO CONNECTION";
+  if (!changed) return;
+  $("lost").hidden = up;
+  $("lost").replaceChildren(...(up ? [] : [
+    el("b", { class: "loud" }, "No connection to the daemon: the stop in this page does NOT work now."),
+    el("span", {}, ` To stop the arm, ${PHYSICAL}.${now.seen ? ` What you see is from ${clock(now.seen / 1000)}.` : ""}`),
+  ]));
+  document.body.classList.toggle("stale", !up);
+  if (!up) now.clearing = null;
+  if (now.status) { showStops(); showEmergencies(); }
+  else $("stop-all").disabled = !up;
+  if (up) soon(0);
 }
 
 // ---- what is shown
@@ -81,13 +117,14 @@ function show() {
   draw($("mode"), real.map((rig) => rig.name), (names) => names.length ?
     [modeBadge("hardware"), ` ${names.join(", ")}: a real arm`] : [modeBadge("virtual"), " nothing real moves"]);
   document.body.classList.toggle("real", real.length > 0);
-  showEmergency(status.emergency);
+  showStops();
+  showEmergencies();
   showQuestions();
   const byId = Object.fromEntries(campaigns.map((one) => [one.id, one]));
   const rigs = status.rigs.filter((rig) => rig.mode !== "none" || rig.campaign).map((rig) => [rig, byId[rig.campaign] || null]);
   draw(body("rigs"), [rigs, status.problems, status.ready], () => [
     status.problems.map((problem) => el("p", { class: "problem" }, problem)),
-    status.ready || status.problems.length || status.emergency ? null : el("p", { class: "quiet" }, "The simulators are starting."),
+    status.ready || status.problems.length || stops().length ? null : el("p", { class: "quiet" }, "The simulators are starting."),
     rigs.map(([rig, campaign]) => rigCard(rig, campaign, acts)),
   ]);
   draw(body("pours"), now.pours, poursTable);
@@ -95,24 +132,32 @@ function show() {
   draw(body("queue"), [queued, status.queue_paused], ([items, paused]) => queueList(items, paused, acts));
   const ended = campaigns.filter((one) => one.state !== "queued" && !RUNNING.includes(one.state)).slice(0, 8);
   draw(body("ended"), ended, (items) => endedList(items, acts));
-  showStops(campaigns.filter((one) => RUNNING.includes(one.state)));
   const open = now.questions.length;
-  document.title = status.emergency ? "STOPPED – Decant" : open ? `(${open}) question – Decant` : "Decant";
+  document.title = stops().length ? "STOPPED – Decant" : open ? `(${open}) question – Decant` : "Decant";
 }
 
 const body = (id) => $(id).querySelector(".body");
 
-function showEmergency(emergency) {
-  if (emergency && $("emergency").hidden) announce("call", "Emergency stop");
-  $("emergency").hidden = !emergency;
-  draw($("emergency"), emergency, (latched) => latched && [
-    el("h2", { id: "emergency-head" }, "Emergency stop"),
-    el("p", {}, `By ${latched.by} at ${clock(latched.time)}${latched.reason ? `: ${latched.reason}` : ""}. All arms were told to stop, `,
-      "and nothing begins before it is cleared. A pour that was under way is UNKNOWN: somebody will be asked about it."),
-    el("details", {}, el("summary", {}, "Clear it"),
-      el("p", {}, "Is nobody in the cell, and does nothing stand or hang where it should not?"),
-      button("clear", "Yes: take work again", () => acts.clear(), "plain danger")),
-  ]);
+/** Emergency stops that are latched: the one of all rigs, and those of single ones. */
+function stops() {
+  const { emergency, rigs } = now.status;
+  return [...(emergency ? [{ rig: "", ...emergency }] : []),
+    ...rigs.filter((rig) => rig.emergency).map((rig) => ({ rig: rig.name, ...rig.emergency }))];
+}
+
+let latched = "";
+
+function showEmergencies() {
+  const found = stops(), was = latched;
+  latched = JSON.stringify(found);
+  if (latched !== was) { // another stop than the one that was asked about
+    now.clearing = null;
+    if (found.length) announce("call", found.map((stop) => stop.rig ? `Emergency stop of ${stop.rig}` : "Emergency stop").join(". "));
+  }
+  const queued = now.campaigns.filter((one) => one.state === "queued");
+  const waiting = (stop) => queued.filter((one) => !stop.rig || one.rig === stop.rig).length;
+  draw($("emergency"), [found, now.clearing, found.map(waiting)], ([all, asking]) =>
+    all.map((stop) => stopCard(stop, asking === stop.rig, waiting(stop), acts)));
 }
 
 function showQuestions() {
@@ -125,25 +170,31 @@ function showQuestions() {
     const card = questionCard(question, campaign, modes[question.rig] || "virtual", acts.answer);
     section.append(card);
     const free = document.activeElement === document.body || document.activeElement === $("main");
-    if (free) card.querySelector("h2").focus({ preventScroll: false });
+    if (free) card.querySelector("h2").focus({ preventScroll: true });
     if (navigator.userActivation?.hasBeenActive) navigator.vibrate?.(200);
   }
   for (const card of known.values()) {
     const stood = card.contains(document.activeElement);
     card.remove();
-    if (stood) (section.querySelector("h2") || $("main")).focus();
+    if (stood) (section.querySelector("h2") || $("main")).focus({ preventScroll: true });
   }
+  draw($("asked"), now.questions.length, (open) => open ?
+    [button("asked", open > 1 ? `${open} questions` : "1 question", async () => section.querySelector("h2")?.focus(), "plain")] : []);
 }
 
-function showStops(running) {
-  $("bar").hidden = false;
-  const of = running.length > 1 ? ` all ${running.length}` : "";
-  draw($("grades"), running.map((one) => one.id), () => running.length ? [
-    button("pause", `Pause${of}`, () => acts.endAll(running, "pause"), "grade"),
-    button("stop", `Finish and end${of}`, () => acts.endAll(running, "stop"), "grade"),
-    button("abort", `Stop the motion${of}`, () => acts.endAll(running, "abort"), "grade danger"),
-  ] : [el("p", { class: "quiet" }, "Nothing runs.")]);
-  $("stop-all").disabled = Boolean(now.status.emergency);
+/** The header's part that must work: the state of each rig, and the stops, which work only while the daemon answers. */
+function showStops() {
+  const { status, campaigns, up } = now;
+  const byId = Object.fromEntries(campaigns.map((one) => [one.id, one]));
+  const rigs = status.rigs.filter((rig) => rig.mode !== "none"), several = rigs.length > 1;
+  const mixed = new Set(rigs.map((rig) => rig.mode)).size > 1;
+  const lines = rigs.map((rig) => [rig, byId[rig.campaign] || null, {
+    stopped: Boolean(status.emergency || rig.emergency), several, mixed, up,
+  }]);
+  draw($("cells"), lines, (all) => all.map(([rig, campaign, how]) => cellLine(rig, campaign, how, acts)));
+  $("bar").classList.toggle("several", several);
+  $("stop-all").textContent = several ? "EMERGENCY STOP ALL" : "EMERGENCY STOP";
+  $("stop-all").disabled = !up;
 }
 
 // ---- what people do
@@ -153,18 +204,27 @@ async function doing(what, work) {
   try {
     await work();
     $("told").textContent = `${what}: done`;
+    return true;
   } catch (error) {
     $("told").textContent = `${what}: ${error instanceof Refused ? error.message : "the daemon can't be reached"}`;
     if (!(error instanceof Refused)) link(false);
+    return false;
+  } finally {
+    soon(0);
   }
-  soon(0);
+}
+
+/** An emergency stop, of one rig or ('') of all. One that is not confirmed is not missed. */
+async function stop(rig) {
+  const what = rig ? `STOP ${rig}` : "EMERGENCY STOP";
+  const done = await doing(what, () => call("emergency-stop", { reason: "from the page", rig }, { timeout: 8000 }));
+  if (!done) alarm(`${what} was not confirmed: ${PHYSICAL}.`);
 }
 
 const of = (item, verb) => call(`campaigns/${encodeURIComponent(item.id)}/${verb}`, undefined, { method: "POST" });
 const acts = {
   answer: async (question, text) => { await call(`questions/${question.id}/answer`, { answer: text }); soon(0); },
   end: (item, verb) => doing(`${verb} ${item.name}`, () => of(item, verb)),
-  endAll: (items, verb) => doing(verb, () => Promise.all(items.map((item) => of(item, verb)))),
   resume: (item) => doing(`go on with ${item.name}`, () => of(item, "resume")),
   earlier: (item, other) => doing("move", () => call(`campaigns/${encodeURIComponent(item.id)}/move`, { before: other.id })),
   hold: (hold) => doing(hold ? "hold the queue" : "let the queue go on",
@@ -177,8 +237,15 @@ const acts = {
     await doing(`note on ${run.run}`, () => call(`runs/${encodeURIComponent(run.run)}/notes`, { text }));
     await find();
   },
-  stopAll: () => doing("EMERGENCY STOP", () => call("emergency-stop", { reason: "from the page" })),
-  clear: () => doing("clear the emergency stop", () => call("emergency-stop/clear", undefined, { method: "POST" })),
+  stopRig: (rig) => stop(rig),
+  askClear: (rig) => { // 'No' has the focus: Enter and Escape keep the stop
+    const was = now.clearing;
+    now.clearing = now.up ? rig : null;
+    showEmergencies();
+    const next = now.clearing === null ? `ask ${was}` : `keep ${rig}`;
+    $("emergency").querySelector(`[data-key="${CSS.escape(next)}"]`)?.focus({ preventScroll: true });
+  },
+  clear: (rig) => doing(rig ? `clear the stop of ${rig}` : "clear the emergency stop", () => call("emergency-stop/clear", { rig })),
 };
 
 /** Former runs that have all the words. */
@@ -199,11 +266,16 @@ async function enter() {
   }
   $("login").hidden = true;
   $("rest").hidden = false;
+  $("bar").hidden = false;
   await refresh();
+  if (!begun) {
+    begun = true;
+    setInterval(() => { if (!$("rest").hidden) refresh(); }, 5000);
+    beats();
+  }
   if (!joined) { // one listener, whoever comes and goes in this tab
     joined = true;
-    setInterval(() => { if (!$("rest").hidden) refresh(); }, 5000);
-    listen(told, (stands, error) => { if (error) { joined = false; leave(error.message); } else if (stands) soon(0); else link(false); });
+    listen(told, (stands, error) => { if (error) { joined = false; leave(error.message); } else if (stands) soon(0); else beat(); });
   }
 }
 
@@ -214,9 +286,12 @@ function leave(why = "") {
   $("rest").hidden = true;
   $("bar").hidden = true;
   $("questions").replaceChildren();
-  $("mode").textContent = "";
+  draw($("mode"), null, () => []);
+  draw($("asked"), 0, () => []);
+  $("lost").hidden = true;
+  now.up = null;
   $("link").textContent = "not signed in";
-  $("token").focus();
+  $("token").focus({ preventScroll: true });
 }
 
 $("login").addEventListener("submit", (event) => {
@@ -226,7 +301,12 @@ $("login").addEventListener("submit", (event) => {
   enter();
 });
 $("search").addEventListener("submit", (event) => { event.preventDefault(); find(); });
-$("stop-all").addEventListener("click", acts.stopAll);
+$("stop-all").addEventListener("click", () => stop(""));
+addEventListener("offline", doubt);
+document.addEventListener("visibilitychange", () => { if (!document.hidden) doubt(); });
+new ResizeObserver(() => { // what gets the focus is not covered by the header
+  document.documentElement.style.scrollPaddingTop = `${$("head").offsetHeight + 8}px`;
+}).observe($("head"));
 
 function come() { if (knownToken()) enter(); else leave(); }
 addEventListener("hashchange", () => { if (location.hash.includes("token=")) come(); });

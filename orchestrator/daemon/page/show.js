@@ -35,7 +35,7 @@ export function draw(section, data, build) {
   section.was = now;
   const key = section.contains(document.activeElement) ? document.activeElement.dataset.key : null;
   section.replaceChildren(...[build(data)].flat(Infinity).filter(Boolean));
-  if (key) section.querySelector(`[data-key="${CSS.escape(key)}"]`)?.focus();
+  if (key) section.querySelector(`[data-key="${CSS.escape(key)}"]`)?.focus({ preventScroll: true });
 }
 
 export const modeBadge = (mode) => el("strong", { class: `badge ${mode}` }, MODES[mode] || mode);
@@ -46,6 +46,37 @@ export const clock = (seconds) => new Date(1000 * seconds).toLocaleTimeString([]
 export function lasting(seconds) {
   if (seconds < 90) return `${Math.round(seconds)} s`;
   return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
+}
+
+const MOVING = ["approach", "tilt", "hold", "return"];
+
+/** One rig in the header: its state and, if there are several, a stop of its own, and its mode if they differ. */
+export function cellLine(rig, campaign, { stopped, several, mixed, up }, acts) {
+  const state = stopped ? el("strong", { class: "badge stopped" }, "STOPPED") : !campaign ? "idle" :
+    MOVING.includes(rig.checkpoint) ? "arm moves" : stateText(campaign.state);
+  return el("li", { class: rig.mode },
+    el("span", {}, el("b", {}, rig.name), mixed ? [" ", modeBadge(rig.mode)] : "", up ? ": " : " (last known): ", state),
+    several ? el("button", { type: "button", class: "emergency one", "data-key": `stop ${rig.name}`, disabled: !up,
+      onclick: () => acts.stopRig(rig.name) }, `STOP ${rig.name}`) : null);
+}
+
+/** A latched emergency stop. Clearing it is one question, whose answer "No" has the focus. */
+export function stopCard(stop, asking, waiting, acts) {
+  const all = !stop.rig, name = all ? "Emergency stop" : `Emergency stop of ${stop.rig}`, head = `stop-head-${stop.rig}`;
+  return el("section", { class: "latched", "aria-labelledby": head,
+    onkeydown: (event) => { if (asking && event.key === "Escape") acts.askClear(null); } },
+  el("h2", { id: head }, name),
+  el("p", {}, `By ${stop.by} at ${clock(stop.time)}${stop.reason ? `: ${stop.reason}` : ""}. `,
+    all ? "All arms were told to stop, and nothing begins before this stop is cleared. " :
+      "Its arm was told to stop, and nothing begins on this rig before this stop is cleared. ",
+    "A pour that was under way is UNKNOWN: the operator is asked about it."),
+  asking ? [
+    el("h3", {}, all ? "Are all cells clear of people and obstacles?" : `Is the cell of ${stop.rig} clear of people and obstacles?`),
+    el("p", {}, waiting ? `Yes ends the emergency stop. Queued campaigns that it may start: ${waiting}.` : "Yes ends the emergency stop."),
+    el("div", { class: "answers" },
+      button(`keep ${stop.rig}`, "No, stay stopped", async () => acts.askClear(null), "big go"),
+      button(`clear ${stop.rig}`, "Yes, clear the stop", () => acts.clear(stop.rig), "plain danger")),
+  ] : button(`ask ${stop.rig}`, all ? "Clear the stop" : `Clear the stop of ${stop.rig}`, async () => acts.askClear(stop.rig), "plain danger"));
 }
 
 export function rigCard(rig, campaign, acts) {
@@ -68,6 +99,10 @@ export function rigCard(rig, campaign, acts) {
         campaign.live ? el("a", { href: campaign.live, target: "_blank", rel: "noreferrer", "data-key": `live ${campaign.id}` },
           "Live view") : null,
         campaign.report ? button(`report ${campaign.id}`, "Save report", () => acts.report(campaign.id), "plain") : null),
+      el("div", { class: "grades" },
+        button(`pause ${campaign.id}`, "Pause", () => acts.end(campaign, "pause"), "grade"),
+        button(`stop ${campaign.id}`, "Finish and end", () => acts.end(campaign, "stop"), "grade"),
+        button(`abort ${campaign.id}`, "Stop the motion", () => acts.end(campaign, "abort"), "grade danger")),
     ]);
 }
 
@@ -134,14 +169,20 @@ function weights(question, names, send) {
 export function poursTable(pours) {
   if (!pours.length) return el("p", { class: "quiet" }, "None yet.");
   return el("table", {},
-    el("thead", {}, el("tr", {}, ["Pour", "Into", "Action", "Expected", "Measured", "Spilled"].map((head) =>
+    el("thead", {}, el("tr", {}, ["Campaign", "Pour", "Into", "Action", "Expected", "Measured", SPILLED].map((head) =>
       el("th", { scope: "col" }, head)))),
     el("tbody", {}, pours.map((pour) => el("tr", { class: pour.state.replace(" ", "-") },
-      cell("Pour", pour.number), cell("Into", pour.receiver), cell("Action", pour.action), cell("Expected", pour.predicted || "—"),
-      cell("Measured", pour.measured || pour.state), cell("Spilled", pour.spillage === null ? "—" : percent(pour.spillage))))));
+      cell("Campaign", pour.campaign), cell("Pour", pour.number), cell("Into", pour.receiver), cell("Action", pour.action),
+      cell("Expected", pour.predicted || "—", pour.predicted ? pour.loss : ""),
+      cell("Measured", pour.measured || stateText(pour.state), pour.state === "weighed" ? pour.loss : ""),
+      cell(SPILLED, pour.spillage === null ? "—" : percent(pour.spillage))))));
 }
 
-const cell = (head, text) => el("td", { "data-head": head }, String(text));
+const SPILLED = "Spilled / loaded";
+
+/** A cell; `meaning` says what its value is. */
+const cell = (head, text, meaning = "") =>
+  el("td", { "data-head": head }, String(text), meaning ? el("span", { class: "meaning" }, ` ${meaning}`) : null);
 
 export function queueList(items, paused, acts) {
   return [

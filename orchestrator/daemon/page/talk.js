@@ -38,6 +38,12 @@ export async function call(path, body, { method, timeout = 15000 } = {}) {
   throw new Refused(response.status, detail);
 }
 
+/** Whether the daemon answers now: throws where it does not within so long [ms]. Needs no token. */
+export async function reach(timeout = 5000) {
+  const response = await fetch("healthz", { cache: "no-store", signal: AbortSignal.timeout(timeout) });
+  if (!response.ok) throw new Refused(response.status, response.statusText);
+}
+
 /** A run's report, saved as a file: it is a page of its own, which this one's rules would not let work. */
 export async function saveReport(campaign, kind = "campaigns") {
   const response = await fetch(`${BASE}${kind}/${encodeURIComponent(campaign)}/report`,

@@ -52,6 +52,38 @@ class ScoredPair(Part):
     """Why it is not."""
 
 
+class CalibrationGain(Part):
+    """How much closer to the weighed pours the calibrated θ is than the uncalibrated one, and which of them to use.
+
+    A pair is a weighed pour that both θ were simulated on, with the same seed. Differences are fractions of the liquid
+    that was poured.
+    """
+
+    pours: int
+    """Weighed pours that were compared."""
+
+    pairs: int
+    """Those of them on which both θ have a simulated spillage."""
+
+    calibrated: float | None
+    """Mean |r − c_s| of θ* over the pairs."""
+
+    uncalibrated: float | None
+    """Mean |r − c_s| of the uncalibrated θ over the pairs."""
+
+    gain: float | None
+    """Mean over the pairs of the uncalibrated θ's |r − c_s| minus that of θ*; positive where θ* is closer."""
+
+    gain_error: float | None
+    """Standard error of that mean; None for fewer than two pairs."""
+
+    recommended: Literal["calibrated", "uncalibrated"]
+    """The θ to use from now on."""
+
+    text: str
+    """The same as one sentence, without a full stop."""
+
+
 class Scores(Learnt):
     """How well one or several θ reproduce weighed pours."""
 
@@ -83,6 +115,9 @@ class Scores(Learnt):
 
     regression: dict[str, float | None] = Field(default_factory=dict)
     """What a GP regression of the training pours comes to, by split."""
+
+    gain: CalibrationGain | None = None
+    """Whether the pours justify θ*; None where it is the uncalibrated θ, or was not compared with it."""
 
 
 @dataclass

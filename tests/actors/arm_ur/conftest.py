@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors import contracts
 from actors.arm.joint_path import PourPath
 from actors.arm.ur.driver import UrArm
-from actors.contracts import arm as contract
 from actors.virtual_ur import VirtualController
 from tests.patience import PATIENCE
 
@@ -29,7 +29,7 @@ def next_address() -> str:
     return f"127.{160 + pid % 64}.{pid // 64 % 256}.{number}"
 
 
-class Call(contract.Call):
+class Call(contracts.Call):
     """A blocking call in a thread, with what it gave."""
 
     def result(self, patience: float = PATIENCE) -> Any:

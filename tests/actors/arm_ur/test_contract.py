@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from actors.arm.errors import ArmLostError
+from actors.arm.joint_path import ExecutedPath, PourPath
 from actors.arm.path.plan import plan_path
+from actors.arm.path.transforms import pourer_motion
 from actors.arm.ur.driver import UrArm
 from actors.contracts.arm import ArmBench, ArmContract
 from actors.virtual_ur import VirtualController
@@ -17,19 +23,73 @@ from .conftest import next_address
 from .test_planned import ACTION, SPEC, motion, vessels
 
 
+def bench_of(cls: type[UrArm]) -> Iterator[ArmBench]:
+    """An arm and its controller, whose true joints are the witness."""
+    path = plan_path(motion(ACTION.with_values(angular_velocity=25 * DEG)), SPEC, *vessels())
+    with VirtualController.start(next_address(), SPEC.model, SPEC.time_scale, 125.0, joints=SPEC.home) as controller:
+
+        def true_poses(since: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            kept = controller.fault("history", since=max(since + 1e-6, 0.0))
+            times, joints = np.array(kept["times"]), np.array(kept["joints"]).reshape(-1, 6)
+            if len(times) < 2:
+                return np.zeros(0), np.zeros((0, 7))
+            return times, pourer_motion(joints, times, SPEC).poses
+
+        arm = cls(replace(SPEC, address=controller.address))
+        yield ArmBench(
+            arm,
+            path,
+            SPEC.time_scale,
+            jog=("z", 0.005, 0.05),
+            trip=lambda: controller.fault("protective_stop"),
+            true_poses=true_poses,
+            tool_speed=SPEC.limits.tool_speed,
+            tilt_speed=SPEC.limits.tilt_speed,
+            disturb=lambda: controller.fault("lag", seconds=0.8),
+            cut=lambda: controller.fault("refuse"),
+            restore=lambda: controller.fault("clear"),
+            lost_within=60.0,
+        )
+        arm.close()
+
+
 class TestUrArm(ArmContract):
     @pytest.fixture
     def bench(self) -> Iterator[ArmBench]:
-        path = plan_path(motion(ACTION.with_values(angular_velocity=25 * DEG)), SPEC, *vessels())
-        with VirtualController.start(
-            next_address(), SPEC.model, SPEC.time_scale, 125.0, joints=SPEC.home
-        ) as controller:
-            arm = UrArm(replace(SPEC, address=controller.address))
-            yield ArmBench(
-                arm,
-                path,
-                SPEC.time_scale,
-                jog=("z", 0.005, 0.05),
-                trip=lambda: controller.fault("protective_stop"),
-            )
-            arm.close()
+        yield from bench_of(UrArm)
+
+
+class ReportsThePlan(UrArm):
+    """Reports the poses that it was commanded."""
+
+    def execute(self, path: PourPath) -> ExecutedPath:
+        done = super().execute(path)
+        planned = pourer_motion(path.pour.at(done.times), done.times, SPEC).poses
+        return replace(done, poses=planned)
+
+
+class WaitsForTheController(UrArm):
+    """Tries again until the controller answers."""
+
+    def execute(self, path: PourPath) -> ExecutedPath:
+        while True:
+            try:
+                return super().execute(path)
+            except ArmLostError:
+                self.release()
+
+
+@pytest.mark.parametrize(
+    ("cls", "found_by", "message"),
+    [
+        (ReportsThePlan, "test_the_poses_it_reports_are_measured", "report measured poses, not commanded"),
+        (
+            WaitsForTheController,
+            "test_a_connection_lost_during_a_pour_is_an_error_and_the_arm_stands",
+            "still waits 3 s after the connection was cut",
+        ),
+    ],
+)
+def test_a_driver_that_does_not_do_what_it_reports_is_found(cls: type[UrArm], found_by: str, message: str) -> None:
+    with contextlib.contextmanager(bench_of)(cls) as bench, pytest.raises(AssertionError, match=message):
+        getattr(ArmContract(), found_by)(replace(bench, lost_within=3.0))

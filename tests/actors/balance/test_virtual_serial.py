@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -15,6 +16,7 @@ import serial
 from actors.balance.reading import Status
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.virtual_balance import Load
+from actors.balance.virtual_serial.character import Emulation
 from actors.balance.virtual_serial.handle import VirtualSerialBalance
 from actors.balance.virtual_serial.scale import Scale, ScaleSettings
 from actors.protocols import LaboratoryError
@@ -207,6 +209,181 @@ def test_commands_beyond_the_driver_s_are_answered_too(virtual, voice, asked, an
     with serial.Serial(far.port, 9600, timeout=1.0) as port:
         port.write(asked)
         assert port.read_until(b"\n") == answered
+
+
+class Terminal:
+    """A virtual balance without a line or a clock: time passes when a test says so."""
+
+    def __init__(self, voice: str = "mt-sics", **sheet: Any) -> None:
+        self.balance = Emulation(voice, ScaleSettings(**sheet), time_scale=1.0, latency=0.0, seed=(1,))
+        self.now = 0.0
+
+    def ask(self, command: str) -> list[str]:
+        """Send a command. Returns the lines that come at once."""
+        self.balance.hear(command.encode() + b"\r\n", self.now)
+        return self.lines()
+
+    def lines(self, seconds: float = 0.0) -> list[str]:
+        """Lines that come within a time."""
+        got, end = b"", self.now + seconds
+        while True:
+            got += self.balance.speak(self.now)
+            if self.now >= end:
+                return got.decode("ascii").split("\r\n")[:-1]
+            self.now = min(self.now + 0.05, end)
+
+    def put(self, mass: float, seconds: float = 10.0) -> None:
+        self.balance.control({"do": "put", "times": [0.0], "masses": [mass]}, self.now)
+        self.now += seconds
+
+
+LEVELS_0_AND_1 = {
+    "@": 'I4 A "0123456789"',
+    "I1": 'I1 A "01" "2.30" "2.22"',
+    "I2": 'I2 A "VIRTUAL 6200.0 g"',
+    "I3": 'I3 A "1.00 1.2.3.4"',
+    "I4": 'I4 A "0123456789"',
+    "I5": 'I5 A "12345678A"',
+    "S": "S S       12.3 g",
+    "SI": "S S       12.3 g",
+    "SIR": "S S       12.3 g",
+    "SIRU": "S S       12.3 g",
+    "SR": "S S       12.3 g",
+    "SR 1 g": "S S       12.3 g",
+    "SR 1 furlong": "SR L",
+    "SRU": "S S       12.3 g",
+    "SNR": "S S       12.3 g",
+    "SNR 1 g": "S S       12.3 g",
+    "SC 500": "S S       12.3 g",
+    "SC soon": "SC L",
+    "Z": "Z A",
+    "ZI": "ZI S",
+    "ZC 500": "ZC S",
+    "T": "T S       12.3 g",
+    "TI": "TI S       12.3 g",
+    "TC 500": "TC S       12.3 g",
+    "TA": "TA A        0.0 g",
+    "TA 5 g": "TA A        5.0 g",
+    "TA 5": "TA L",
+    "TA 9 kg": "TA L",
+    "TAC": "TAC A",
+    'D "hello"': "D A",
+    "D hello": "D L",
+    "DW": "DW A",
+    "K 1": "K A",
+    "K 9": "K L",
+    "M21": "M21 B 0 0|M21 A 1 0",
+    "M21 0 0": "M21 A",
+    "M21 0 7": "M21 L",
+    "M21 5 0": "M21 L",
+    "C": "C B|C A",
+    "SI 5": "ES",
+    "si": "ES",
+    "JAK": "ES",
+}
+"""Commands with what a balance with 12.3 g on it answers."""
+
+
+@pytest.mark.parametrize("command", list(LEVELS_0_AND_1))
+def test_mt_sics_answers_every_command_of_levels_0_and_1(command: str) -> None:
+    terminal = Terminal()
+    terminal.put(0.0123)
+    assert "|".join(terminal.ask(command)) == LEVELS_0_AND_1[command]
+
+
+def test_every_listed_command_is_known_and_every_known_one_is_listed() -> None:
+    terminal = Terminal()
+    listed = [line.split() for line in terminal.ask("I0")]
+    assert [line[:2] for line in listed] == [["I0", "B"]] * (len(listed) - 1) + [["I0", "A"]]
+    commands = {line[3].strip('"'): int(line[2]) for line in listed}
+    assert set(commands) == {"I0", *(command.split()[0] for command in LEVELS_0_AND_1)} - {"si", "JAK"}
+    assert {name for name, level in commands.items() if level == 0} >= {"@", "I4", "S", "SI", "Z", "ZI"}
+    assert commands["M21"] == 2
+
+
+def test_kcp_has_the_common_commands_and_none_of_mt_sics_own() -> None:
+    terminal = Terminal("kcp")
+    assert terminal.ask("DW") == ["DW A"]
+    assert terminal.ask("I2") == ['I2 A "KERN VIRTUAL 6200-2"']
+    assert [terminal.ask(command) for command in ("M21 0 0", "SC 500", "C")] == [["ES"]] * 3
+
+
+@pytest.mark.parametrize(
+    ("number", "weight", "tare"),
+    [
+        ("0", "      12.3 g", "       0.5 g"),
+        ("1", "    0.0123 kg", "    0.0005 kg"),
+        ("3", "     12300 mg", "       500 mg"),
+        ("5", "      61.5 ct", "       2.5 ct"),
+    ],
+)
+def test_the_host_unit_holds_for_weights_and_tares_and_survives_a_reset(number: str, weight: str, tare: str) -> None:
+    terminal = Terminal()
+    terminal.put(0.0128)
+    assert terminal.ask(f"M21 0 {number}") == ["M21 A"]
+    terminal.ask("@")
+    assert terminal.ask("M21") == [f"M21 B 0 {number}", "M21 A 1 0"]
+    assert terminal.ask("TA 500 mg") == [f"TA A {tare}"]
+    for command in ("S", "SI", "SIR", "SR", "SC 10"):
+        assert terminal.ask(command) == [f"S S {weight}"]
+    assert terminal.ask("SIRU") == ["S S       12.3 g"]
+    assert terminal.ask("I2") == ['I2 A "VIRTUAL 6200.0 g"']
+
+
+def test_commands_with_a_time_limit_wait_for_rest_no_longer_than_that() -> None:
+    terminal = Terminal(settling_time=60.0)
+    terminal.put(0.1, seconds=0.5)
+    for command, answer in (("SC 1000", "S D "), ("TC 1000", "TC D "), ("ZC 1000", "ZC D")):
+        assert terminal.ask(command) == []
+        assert terminal.lines(0.9) == []
+        (line,) = terminal.lines(0.2)
+        assert line.startswith(answer)
+    assert terminal.ask("S") == []
+    assert terminal.lines(4.9) == []
+    assert terminal.lines(0.2) == ["S I"]
+
+
+def test_sr_reports_changes_and_snr_only_where_they_end() -> None:
+    for command, moving in (("SR", True), ("SNR", False), ("SR 50 g", True)):
+        terminal = Terminal()
+        assert terminal.ask(command) == ["S S        0.0 g"]
+        terminal.put(0.002, seconds=0.0)
+        assert terminal.lines(10.0) == []  # less than 30 digits
+        terminal.put(0.1, seconds=0.0)
+        states = [line[:3] for line in terminal.lines(10.0)]
+        assert states == (["S D", "S S"] if moving else ["S S"])
+        assert terminal.ask("C") == ["C B", "C A"]
+        terminal.put(0.2, seconds=0.0)
+        assert terminal.lines(10.0) == []
+
+
+@pytest.mark.parametrize("command", ["@", "C"])
+def test_a_cancelled_command_is_not_carried_out_later(command: str) -> None:
+    terminal = Terminal(settling_time=60.0)
+    terminal.put(0.1, seconds=0.5)
+    assert terminal.ask("T") == []
+    assert terminal.ask(command) == LEVELS_0_AND_1[command].split("|")
+    assert terminal.lines(100.0) == []
+    assert terminal.ask("TA") == ["TA A        0.0 g"]
+
+
+def test_what_the_drivers_of_others_send_is_answered() -> None:
+    """The commands of PyLabRobot's backend, in the order in which it sends them: set up, weigh, tare, zero, display."""
+    terminal = Terminal()
+    terminal.put(0.25)
+    for command in ("@", "I0", "I1", "I2", "I3", "M21 0 0", "I4", "I5"):
+        assert terminal.ask(command)[-1].split()[1] == "A", command
+    assert [terminal.ask(command)[0].split()[-2:] for command in ("S", "SI", "SC 1000")] == [["250.0", "g"]] * 3
+    assert [terminal.ask(command)[0].split() for command in ("T", "TA", "S", "TAC", "S")] == [
+        ["T", "S", "250.0", "g"],
+        ["TA", "A", "250.0", "g"],
+        ["S", "S", "0.0", "g"],
+        ["TAC", "A"],
+        ["S", "S", "250.0", "g"],
+    ]
+    terminal.put(0.01)
+    for command in ("Z", "ZI", "ZC 1000", "TI", "TC 1000", 'D "text"', "DW", "C"):
+        assert terminal.ask(command)[-1].split()[1] in "AS", command
 
 
 def test_a_command_that_finds_no_rest_is_given_up_where_the_dialect_has_words_for_it(virtual):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -17,7 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.virtual_ur import VirtualController, VirtualControllerError
+from actors.virtual_ur import VirtualController, VirtualControllerError, host
 from tests.depth import examples
 from tests.patience import PATIENCE
 
@@ -149,12 +150,20 @@ def test_an_interpreter_that_hangs_ends_all_the_same() -> None:
         try:
             assert process.stdout is not None
             assert int(process.stdout.readline()) == process.pid
-            assert process.wait(60) == 1
+            assert process.wait(60) == -signal.SIGALRM
         finally:
             process.kill()
             process.communicate()
         complaints.seek(0)
-        assert b"Timeout" in complaints.read()
+        assert b"most recent call first" in complaints.read()
+
+
+@pytest.mark.realtime
+def test_the_clock_never_waits_for_another_thread(fresh: Callable[..., VirtualController]) -> None:
+    """One of usual priority would hold it up for as long as others keep the cores."""
+    controller = fresh(time_scale=1.0)
+    assert controller.fault("state")["timing"]["ticks"] > 0
+    assert psutil.Process(controller.pid).num_threads() == 1
 
 
 def send(controller: VirtualController, text: bytes, most: float = 60.0) -> float:
@@ -191,6 +200,98 @@ def test_no_program_takes_the_clock_its_time(fresh: Callable[..., VirtualControl
         assert time.monotonic() < end, state["messages"]
         time.sleep(0.1)
     assert late < 1.0, f"the clock was {late:.2f} s late"
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("port", [30001, 30002, 30003])
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"def a(x):\n textmsg(1)\nend\n", "program 'a' must not have parameters"),
+        (b"def a(\n textmsg(1)\nend\n", "compile error: expected"),
+        (b"def a():\n def b(x):\n  return 1\n end\n b()\nend\n", "wrong use"),
+        (b"\xff\xfe\x00def a(\x80):\nend\n", "compile error"),
+        (b"def a(x):\n" + b"  y = 1\n" * 10_000 + b"end\n", "program 'a' must not have parameters"),
+        (b"def a():\n" + b"  x = 1234567890\n" * 70_000, "without an end"),
+    ],
+    ids=["parameters", "malformed", "nested", "binary", "long", "endless"],
+)
+def test_a_program_that_can_not_be_run_is_refused_and_the_next_one_runs(
+    shared: VirtualController, port: int, text: bytes, says: str
+) -> None:
+    def run(sent: bytes, wanted: str, mark: str = "") -> None:
+        """Send a program and wait for a message that comes after the mark."""
+        with socket.create_connection((shared.address, port), timeout=PATIENCE) as connection:
+            with contextlib.suppress(ConnectionError):  # too much without an end is cut off
+                connection.sendall(sent)
+            end = time.monotonic() + PATIENCE
+            while True:
+                messages = shared.fault("state", patience=PATIENCE)["messages"]
+                after = messages.index(mark) + 1 if mark else 0
+                if any(wanted in message for message in messages[after:]):
+                    return
+                assert time.monotonic() < end, messages
+                time.sleep(0.02)
+
+    first, last = f"first {os.urandom(8).hex()}", f"last {os.urandom(8).hex()}"
+    run(f'sec first():\n textmsg("{first}")\nend\n'.encode(), first)
+    run(text, says, f"text: {first}")
+    run(f'def last():\n textmsg("{last}")\nend\n'.encode(), last, f"text: {first}")
+    assert shared.alive
+
+
+ASK = """
+import os, subprocess, sys, threading
+from actors.virtual_ur.host import raise_priority
+if sys.argv[1] == "unprivileged" and os.geteuid() == 0:
+    os.setuid(65534)
+def clock():
+    granted = raise_priority()
+    child = subprocess.run(["/bin/sh", "-c", "exec cat /proc/$$/stat"], stdout=subprocess.PIPE, text=True)
+    policy = child.stdout.rsplit(")", 1)[1].split()[38]
+    print(granted, os.sched_getscheduler(0) & 0xFF, policy, os.sched_getscheduler(os.getpid()) & 0xFF, sep=",")
+thread = threading.Thread(target=clock)
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.parametrize("who", ["as it is", "unprivileged"])
+def test_only_the_clock_s_thread_goes_before_other_work_and_where_that_is_not_permitted_it_says_so(who: str) -> None:
+    done = subprocess.run([sys.executable, "-c", ASK, who], stdout=subprocess.PIPE, text=True, check=True)
+    granted, thread, child, main_thread = done.stdout.strip().split(",")
+    assert granted in ("real-time", f"nice {host.NICENESS}", "normal")
+    assert int(thread) == (os.SCHED_FIFO if granted == "real-time" else os.SCHED_OTHER)
+    assert (int(child), int(main_thread)) == (os.SCHED_OTHER, os.SCHED_OTHER)
+    if who == "unprivileged" and resource.getrlimit(resource.RLIMIT_RTPRIO)[0] == 0:
+        assert granted != "real-time"
+
+
+@pytest.mark.realtime
+def test_the_clock_s_priority_is_named_and_is_normal_in_scaled_time_and_where_it_is_asked_for(
+    fresh: Callable[..., VirtualController],
+) -> None:
+    for options in ({"time_scale": 4.0}, {"time_scale": 1.0, "prioritised": False}, {"time_scale": 1.0}):
+        controller = fresh(**options)
+        named = controller.fault("state")["timing"]["priority"]
+        policy = os.sched_getscheduler(controller.pid) & 0xFF
+        assert (named == "real-time") == (policy == os.SCHED_FIFO)
+        assert named == "normal" or options == {"time_scale": 1.0}
+
+
+@pytest.mark.realtime
+def test_a_program_too_heavy_for_the_clock_does_not_keep_a_core_from_others(
+    fresh: Callable[..., VirtualController],
+) -> None:
+    controller = fresh(time_scale=1.0, frequency=500.0)
+    text = b"def heavy():\n while True:\n  i = 0\n  while i < 8000:\n   i = i + 1\n  end\n  sync()\n end\nend\n"
+    with socket.create_connection((controller.address, 30003), timeout=PATIENCE) as port:
+        port.sendall(text)
+        end = time.monotonic() + PATIENCE
+        while controller.fault("state", patience=PATIENCE)["timing"]["priority"] != "normal":
+            assert time.monotonic() < end
+            time.sleep(0.05)
+    assert os.sched_getscheduler(controller.pid) & 0xFF == os.SCHED_OTHER
 
 
 sizes = st.integers(0, 70_000)

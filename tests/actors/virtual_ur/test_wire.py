@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from actors.ur import rtde
@@ -175,6 +175,112 @@ def test_a_speed_slider_beyond_its_ends_stays_where_it_is(server: RtdeServer, fr
     assert server.controller.robot.mover.slider == 1.0
 
 
+RECORD_RECIPE = {
+    "DOUBLE": "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum actual_main_voltage "
+    "actual_robot_voltage actual_robot_current joint_position_deviation_ratio",
+    "VECTOR6D": "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current "
+    "joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed "
+    "joint_temperatures actual_joint_voltage",
+    "UINT64": "actual_digital_input_bits actual_digital_output_bits",
+    "INT32": "robot_mode safety_mode",
+    "VECTOR6INT32": "joint_mode",
+    "VECTOR3D": "actual_tool_accelerometer",
+    "UINT32": "runtime_state",
+}
+"""The recipe that the manufacturer's client records with, by type."""
+
+DOCUMENTED = {
+    "DOUBLE": "standard_analog_input0 standard_analog_input1 standard_analog_output0 standard_analog_output1 "
+    "io_current euromap67_24V_voltage euromap67_24V_current tool_analog_input0 tool_analog_input1 tool_output_current "
+    "tool_temperature tcp_force_scalar payload",
+    "VECTOR6D": "actual_current_window payload_inertia",
+    "VECTOR3D": "elbow_position elbow_velocity payload_cog",
+    "INT32": "safety_status tool_output_voltage",
+    "UINT32": "robot_status_bits safety_status_bits analog_io_types euromap67_input_bits euromap67_output_bits "
+    "tool_mode tool_analog_input_types output_bit_registers0_to_31 output_bit_registers32_to_63 "
+    "input_bit_registers0_to_31 input_bit_registers32_to_63 script_control_line",
+}
+"""What else the manufacturer documents for both generations of controllers, registers left out."""
+
+SINCE_E_SERIES = {
+    "UINT8": "tool_output_mode tool_digital_output0_mode tool_digital_output1_mode",
+    "VECTOR6D": "ft_raw_wrench tcp_offset",
+    "UINT64": "actual_configurable_digital_input_bits actual_configurable_digital_output_bits",
+    "INT32": "encoder0_raw encoder1_raw",
+}
+
+LATER = (
+    "collision_detection_ratio time_scale_source actual_current_as_torque actual_robot_energy_consumed "
+    "actual_robot_braking_energy_dissipated wrench_calc_from_currents target_gravity target_base_acceleration "
+    "actual_TCP_acceleration target_TCP_acceleration target_execution_time actual_qdd"
+)
+"""Documented for later software, or not at all."""
+
+
+def kinds_of(controller: Controller, names: list[str]) -> list[str]:
+    """The types that a controller gives for names; two requests, as one may have no more than 2048 bytes."""
+    answers = []
+    for part in (names[::2], names[1::2]):
+        one = client(RtdeServer(controller, Connections(controller)))
+        answers.append(one.ask("O", struct.pack(">d", 125.0) + ",".join(part).encode())[1:].decode().split(","))
+    return [answers[i % 2][i // 2] for i in range(len(names))]
+
+
+@pytest.mark.parametrize("model", [UR10, UR10E], ids=["CB3", "e-Series"])
+@pytest.mark.parametrize("table", [RECORD_RECIPE, DOCUMENTED, SINCE_E_SERIES], ids=["record", "both", "e-Series"])
+def test_outputs_that_the_manufacturer_documents_have_their_types(model: Any, table: dict[str, str]) -> None:
+    wanted = {name: kind for kind, names in table.items() for name in names.split()}
+    if table is SINCE_E_SERIES and not model.e_series:
+        wanted = dict.fromkeys(wanted, "NOT_FOUND")
+    assert dict(zip(wanted, kinds_of(Controller(model), list(wanted)), strict=True)) == wanted
+
+
+@pytest.mark.parametrize("model", [UR10, UR10E], ids=["CB3", "e-Series"])
+def test_registers_have_their_types_and_later_outputs_are_not_found(model: Any) -> None:
+    registers = {
+        f"{side}_{kind}_register_{i}": type_
+        for side in ("input", "output")
+        for kind, type_, numbers in (
+            ("int", "INT32", range(48)),
+            ("double", "DOUBLE", range(48)),
+            ("bit", "BOOL", range(64, 128)),
+        )
+        for i in numbers
+    }
+    controller = Controller(model)
+    for start in range(0, len(registers), 80):
+        names = list(registers)[start : start + 80]
+        assert kinds_of(controller, names) == [registers[name] for name in names]
+    assert set(kinds_of(controller, LATER.split())) == {"NOT_FOUND"}
+
+
+def test_outputs_follow_what_the_arm_does() -> None:
+    controller = Controller(UR10E)
+    fields = RtdeServer(controller, Connections(controller)).fields
+    still = (fields["script_control_line"].read(), fields["joint_position_deviation_ratio"].read())
+    assert still == (0, 0.0)
+    controller.upload(
+        "def f():\n  q = get_actual_joint_positions()\n  q[1] = q[1] + 0.8\n  movej(q)\n  sleep(9)\nend\n"
+    )
+    for _ in range(200):
+        controller.tick()
+    before = fields["elbow_position"].read()
+    controller.tick()
+    after, speed = fields["elbow_position"].read(), fields["elbow_velocity"].read()
+    assert [(b - a) * 500 for a, b in zip(before, after, strict=True)] == pytest.approx(speed, abs=2e-3)
+    assert max(map(abs, speed)) > 0.1
+    assert fields["script_control_line"].read() == 4
+    assert 0.0 < fields["joint_position_deviation_ratio"].read() < 1.0
+    controller.signals.digital_in = 0x30500
+    assert fields["actual_configurable_digital_input_bits"].read() == 5
+    for _ in range(1500):
+        controller.tick()
+    assert controller.playing
+    assert (fields["script_control_line"].read(), fields["joint_position_deviation_ratio"].read()) == still
+    controller.power_off()
+    assert fields["actual_current_window"].read() == (0.0,) * 6
+
+
 def test_every_field_can_be_sent_in_its_type(server: RtdeServer) -> None:
     names = list(server.fields)
     for start in range(0, len(names), 40):
@@ -284,6 +390,137 @@ def test_no_bytes_whatever_disturb_a_controller(kind: str, pieces: list[bytes]) 
         controller.tick()
     server = RtdeServer(controller, Connections(controller))
     assert client(server).ask("v")
+
+
+_values = st.sampled_from(
+    (
+        *("0", "1", "-1", "3.5", "1e308", "1e999", "0xFFFFFFFF", "0x" + "F" * 40, "9" * 30, "True", "'s'", '"é"', "[]"),
+        *("[0, -1, 1, 0, 0, 0]", "[1e300, 1, 1, 1, 1, 1]", "p[0.5, 0.2, 0.3, 0, 3, 0]", "p[1]", "[[1]]"),
+        *("x", "y", "a", "t"),
+    )
+)
+_commands = st.sampled_from(["f", "a", "t", "run t", *sorted(name for name, _ in Controller(UR10E).known_commands)])
+
+
+def _larger(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    operators = st.sampled_from(["+", "-", "*", "/", "%", "<", "==", "!=", "and", "xor"])
+    return st.one_of(
+        st.builds("({} {} {})".format, inner, operators, inner),
+        st.builds("{}[{}]".format, inner, inner),
+        st.builds("[{}, {}]".format, inner, inner),
+        st.builds("{}({})".format, _commands, st.lists(inner, max_size=4).map(", ".join)),
+        st.builds("{}({}, {}={})".format, _commands, inner, st.sampled_from("avtr"), inner),
+    )
+
+
+_expressions = st.recursive(_values, _larger, max_leaves=5)
+_simple = st.one_of(
+    _expressions,
+    st.builds(
+        "{} {}".format, st.sampled_from(["x =", "global y =", "local x =", "kill", "join", "return"]), _expressions
+    ),
+    st.builds("x[{}] = {}".format, _expressions, _expressions),
+    st.sampled_from(
+        ["sync()", "halt", "break", "continue", "enter_critical", "exit_critical", "x = run t()", "end", ")"]
+    ),
+)
+_parameters = st.sampled_from(["", "", "x", "x, y=1", "x, x", "x=f()", "x=movej([0])", "1", "x"])
+_ends = st.sampled_from(["end", "end", "end", "end", "", "end end", '"'])
+
+
+def _nested(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    block = st.lists(inner, max_size=4).map("\n".join)
+    names = st.sampled_from(["f", "a", "t", "movej", "if"])
+    return st.one_of(
+        st.builds("if {}:\n{}\nelse:\n{}\n{}".format, _expressions, block, block, _ends),
+        st.builds("while {}:\n{}\n{}".format, _expressions, block, _ends),
+        st.builds("def {}({}):\n{}\n{}".format, names, _parameters, block, _ends),
+        st.builds("thread {}({}):\n{}\n{}".format, st.just("t"), _parameters, block, _ends),
+    )
+
+
+_blocks = st.lists(st.recursive(_simple, _nested, max_leaves=8), max_size=5).map("\n".join)
+_programs = st.one_of(
+    _blocks,
+    st.builds("{} a({}):\n{}\n{}".format, st.sampled_from(["def", "sec"]), _parameters, _blocks, _ends),
+    st.text(max_size=60),
+)
+
+
+def reported(wire: Wire) -> list[str]:
+    """Texts of the errors that a primary client has got."""
+    return [
+        body[18:].decode()
+        for kind, body in primary.split(wire.take())
+        if kind == primary.ROBOT_MESSAGE and body[9] == primary.RUNTIME_EXCEPTION
+    ]
+
+
+@settings(max_examples=examples(600), deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@given(texts=st.lists(_programs, min_size=1, max_size=3))
+def test_no_program_whatever_ends_the_controller_or_keeps_the_next_from_running(texts: list[str]) -> None:
+    controller = Controller(UR10E, frequency=125)
+    connections = Connections(controller)
+    port = PrimaryServer(controller, connections)
+    for text in texts:
+        wire = Wire(PrimaryConnection(port, messages=True, writable=True))
+        wire.say(text.encode() + b"\n")
+        for _ in range(5):
+            controller.tick()
+            wire.say(b"")
+        wire.abort()
+    listener = Wire(PrimaryConnection(port, messages=True, writable=True))
+    listener.take()
+    controller.stop()
+    if controller.power.running and controller.safety.may_move:
+        listener.say(b"def after():\n  write_output_integer_register(3, 77)\n  x = 1 / 0\nend\n")
+        controller.tick()
+        assert controller.registers.output_int[3] == 77
+        assert "division by zero" in reported(listener)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("def a(x):\n textmsg(1)\nend\n", "compile error: program 'a' must not have parameters"),
+        ("def a(x=1):\n textmsg(1)\nend\n", "compile error: program 'a' must not have parameters"),
+        ("sec a(x, y):\n textmsg(1)\nend\n", "compile error: program 'a' must not have parameters"),
+        ("def a(x=norm(5)):\n textmsg(1)\nend\n", "compile error: program 'a' must not have parameters"),
+        ("def a(:\nend\n", "compile error: expected a name, found ':'"),
+        ("def a()\n textmsg(1)\nend\n", "compile error: expected ':', found 'textmsg'"),
+        ("def a():\n def b(x):\n  return c\n end\n b()\nend\n", "wrong use of a value or function"),
+        ("def a():\n if True:\nend\nend end\n", "compile error: expected nothing more, found 'end'"),
+        ("def a():\n x = 1e999\nend\n", "compile error: a number that is too large"),
+        ("def a():\n x = 0x" + "F" * 5000 + "\nend\n", "compile error: a number with too many digits"),
+        ("\0\1\2\n", "compile error: '\\x00' means nothing here"),
+    ],
+)
+def test_a_program_that_can_not_be_run_is_reported_on_the_port_it_came_by(text: str, says: str) -> None:
+    controller = Controller(UR10E)
+    wire = Wire(_primary(controller))
+    wire.take()
+    wire.say(text.encode())
+    controller.tick()
+    errors = reported(wire)
+    assert any(error.startswith(says) for error in errors), errors
+    assert not controller.playing
+
+
+def test_a_defect_of_the_translator_is_reported_and_the_controller_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object) -> None:
+        raise KeyError("a defect")
+
+    server = Wire(_primary(controller := Controller(UR10E)))
+    server.take()
+    with monkeypatch.context() as patch:
+        patch.setattr("actors.virtual_ur.controller.translate", broken)
+        server.say(b"sleep(1)\n")
+    assert reported(server) == ["compile error: internal error of the controller: 'a defect'"]
+    assert "KeyError" in capsys.readouterr().err
+    server.say(b"sleep(1)\n")
+    assert controller.playing
 
 
 def test_a_line_without_an_end_is_not_kept_for_ever() -> None:

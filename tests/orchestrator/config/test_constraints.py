@@ -24,11 +24,12 @@ from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.d3_free import FreeHybrid
 from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from tests.orchestrator.good_files import DEPLOYED, report, write
-from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, calibration_plan, deployment_plan
+from tests.orchestrator.plans import calibration_plan, deployment_plan
 
 SPACE = Space(
     (
@@ -150,7 +151,7 @@ def test_every_deployment_keeps_to_them_although_the_best_lies_beyond(name: str)
     kind, changes = DEPLOYMENTS[name]
     base = {"strategy": name[:2], "pours": 4, "prior_simulations": 8, "constraints": (SLOPE,), **changes}
     strategy = kind(deployment_plan(**base), SCENE, THETA, 5)
-    play = Play(spill)(strategy)
+    play = StrategyHarness(spill).run(strategy)
     asked = [r.action for r in (*play.simulations, *play.pours) if isinstance(r, Simulate | Pour)]
     assert len(asked) >= 8
     assert all(allowed(action) for action in asked)
@@ -164,7 +165,7 @@ def test_calibration_weighs_and_simulates_no_others() -> None:
     asked: list[Action] = []
     for stage in calibration_stages(replace(plan, scene=replace(SCENE, fixed={"height": 0.05, "max_angle": 1.9}))):
         strategy = stage.build(results, 3)
-        play = Play(spill)(strategy)
+        play = StrategyHarness(spill).run(strategy)
         results[stage.name] = strategy.result()
         asked += [r.action for r in (*play.simulations, *play.pours) if isinstance(r, Simulate | Pour)]
     assert len(asked) >= 30

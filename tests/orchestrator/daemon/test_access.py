@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import base64
+import http.client
+import itertools
+import json
+import os
+import socket
 import stat
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from orchestrator.catalogue.index import Catalogue
+from orchestrator.catalogue.registry import enter
 from orchestrator.daemon.auth import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
+from orchestrator.daemon.guard import DRAIN
 from orchestrator.daemon.packing import PackingError, unpack
+from tests.orchestrator.daemon.browsing import on_port
 from tests.orchestrator.daemon.served import Served, held, run, serving
 
 LOOKING = (
@@ -61,18 +72,18 @@ def test_every_route_asks_for_a_token(tmp_path: Path) -> None:
     assert open_to_all == {"/healthz", "/readyz"}
 
 
-def test_an_address_that_guesses_is_not_heard_for_a_while_but_may_still_stop_everything(tmp_path: Path) -> None:
+def test_wrong_tokens_from_an_address_bar_wrong_ones_and_never_the_right_one(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path, held) as served:
             await served.submit()
             await served.pouring()
-            for _ in range(FAILURES):
-                answer = await served.http.get("/api/v1/status", headers={"Authorization": "Bearer guess"})
-                assert answer.status_code == 401
-            answer = await served.http.get("/api/v1/status", headers=served.headers())
-            assert answer.status_code == 429
+            for number in range(FAILURES + 2):
+                answer = await served.http.get("/api/v1/status", headers={"Authorization": f"Bearer guess {number}"})
+                assert answer.status_code == (401 if number < FAILURES else 429)
             assert int(answer.headers["Retry-After"]) <= WINDOW + 1
-            answer = await served.http.post("/api/v1/emergency-stop", headers=served.headers(Role.VIEWER))
+            for role in Role:
+                await served.get("/status", role=role)
+            await served.post("/emergency-stop", role=Role.VIEWER)
             assert served.laboratories[0].arm_stops == 1
 
     run(work())
@@ -107,6 +118,35 @@ def test_tokens_are_made_once_for_their_owner_alone_and_refused_where_others_can
         Tokens(path)
 
 
+def first_run(state: Path) -> None:
+    enter([state.parent / "run"], state)
+
+
+def first_look_at_runs(state: Path) -> None:
+    Catalogue(state).close()
+
+
+def first_daemon(state: Path) -> None:
+    Tokens(state / "tokens")
+
+
+@pytest.mark.parametrize("existing", [False, True])
+@pytest.mark.parametrize("begin", [first_run, first_look_at_runs, first_daemon])
+def test_only_its_owner_reads_the_state_directory_whatever_makes_it(
+    tmp_path: Path, begin: Callable[[Path], None], existing: bool
+) -> None:
+    state = tmp_path / "state"
+    before = os.umask(0o022)
+    try:
+        if existing:
+            state.mkdir()
+            assert stat.S_IMODE(state.stat().st_mode) == 0o755
+        begin(state)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(state.stat().st_mode) == 0o700
+
+
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{chr(98 + i)}: &{chr(98 + i)} [{', '.join([f'*{chr(97 + i)}'] * 10)}]\n" for i in range(8)
 )
@@ -130,7 +170,7 @@ def test_what_is_submitted_neither_looks_elsewhere_nor_blows_up(tmp_path: Path, 
             told = await served.post("/campaigns", {"text": text}, status=422)
             assert said in told["detail"]
             assert "daemon:" not in told["detail"], "a file's content was shown"
-            assert str(tmp_path) not in told["detail"].replace(str(tmp_path / "state/tokens"), "")
+            assert_no_place_of_the_server(told["detail"], tmp_path)
             assert list((tmp_path / "state/campaigns").iterdir()) == []
 
     run(work())
@@ -160,9 +200,27 @@ def test_a_link_in_a_root_does_not_lead_out_of_it(tmp_path: Path) -> None:
                 assert "no such campaign in the folders that may be read" in told["detail"], path
             told = await served.post("/campaigns", {"path": "refers.yaml"}, status=422)
             assert told["detail"].count("lies outside") == 2
+            assert_no_place_of_the_server(told["detail"], tmp_path)
             assert "secret" not in told["detail"]
 
     run(work())
+
+
+def test_a_disk_error_is_refused_without_paths_of_the_server(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            snapshots = tmp_path / "state/campaigns"
+            snapshots.rmdir()
+            snapshots.symlink_to(tmp_path / "nothing" / "there")
+            told = await served.post("/campaigns", {"text": "name: x\nseed: 1\n"}, status=422)
+            assert_no_place_of_the_server(told["detail"], tmp_path)
+
+    run(work())
+
+
+def assert_no_place_of_the_server(text: str, folder: Path) -> None:
+    for place in (folder, folder.resolve(), Path.cwd(), Path.home(), Path(sys.prefix)):
+        assert str(place) not in text, text
 
 
 def test_a_campaign_in_a_root_is_submitted_by_its_path(tmp_path: Path) -> None:
@@ -189,6 +247,35 @@ def test_ten_megabytes_are_not_read(tmp_path: Path) -> None:
             assert answer.status_code == 413
 
     run(work())
+
+
+@pytest.mark.parametrize("known_length", [True, False])
+@pytest.mark.parametrize("megabytes", [5, 60])
+def test_a_body_that_is_too_large_is_answered_before_the_connection_closes(
+    tmp_path: Path, megabytes: int, known_length: bool
+) -> None:
+    """Over a real socket, with a client that sends everything before it reads: a reset would lose the answer."""
+    body = itertools.repeat(b"x" * 1_000_000, megabytes)
+    with on_port(tmp_path) as lab:
+        connection = http.client.HTTPConnection(lab.url.removeprefix("http://"), timeout=60)
+        headers = lab.served.headers() | ({"Content-Length": str(megabytes * 1_000_000)} if known_length else {})
+        connection.request("POST", "/api/v1/campaigns", body, headers, encode_chunked=not known_length)
+        answer = connection.getresponse()
+        assert answer.status == 413
+        assert "more than 4 MB are not read" in json.loads(answer.read())["detail"]
+        connection.close()
+
+
+def test_a_client_that_waits_for_100_continue_is_refused_at_once(tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        host, _, port = lab.url.removeprefix("http://").partition(":")
+        with socket.create_connection((host, int(port)), timeout=DRAIN / 2) as connection:
+            connection.sendall(
+                f"POST /api/v1/campaigns HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Length: 900000000\r\n"
+                "Expect: 100-continue\r\n\r\n".encode()
+            )
+            with connection.makefile("rb") as answer:
+                assert answer.read().startswith(b"HTTP/1.1 413 ")  # to the end: the connection is closed, too
 
 
 def test_another_name_for_this_machine_is_not_answered(tmp_path: Path) -> None:

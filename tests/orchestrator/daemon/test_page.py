@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from actors.operator import Question
 from actors.spec import LaboratorySpec
-from orchestrator.daemon.auth import Role
+from orchestrator.config.load import load_laboratory
+from orchestrator.daemon.auth import Role, token_of
 from orchestrator.daemon.settings import Rig
 from orchestrator.state_directory import VARIABLE
 from tests.orchestrator.daemon.browsing import OnPort, browser, on_port
 from tests.orchestrator.daemon.served import HeldBench, HeldLaboratory
 from tests.orchestrator.toy import ToyOptimizer, ToySimulators
+from tests.patience import PATIENCE
 
 pytest.importorskip("playwright")
 
 WAIT = 20_000
 """Of the browser for what a test waits for [ms]."""
+
+MAIN = "from orchestrator.cli import main; main()"
 
 SIZES = {"small phone": (320, 640), "phone": (390, 844), "tablet": (1024, 768), "desk": (1440, 900)}
 
@@ -165,11 +176,66 @@ def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page
         page.get_by_role("heading", name="Emergency stop").wait_for()
         assert laboratory.arm_stops == 1
         assert lab.do(lab.served.until(key, "unknown"))["state"] == "unknown"
-        assert page.get_by_role("button", name="EMERGENCY STOP").is_disabled()
-        page.get_by_text("Clear it").click()
-        page.get_by_role("button", name="Yes: take work again").click()
+        page.locator("header").get_by_text("STOPPED").wait_for()
+        page.get_by_role("button", name="Clear the stop").click()
+        page.get_by_role("button", name="Yes, clear the stop").click()
         page.get_by_role("heading", name="Emergency stop").wait_for(state="hidden")
         assert lab.do(lab.served.get("/status"))["emergency"] is None
+
+
+@pytest.mark.parametrize("act", ["Enter", "Escape", "second press"])
+def test_the_default_answer_to_clearing_a_stop_keeps_it(page: Any, tmp_path: Path, act: str) -> None:
+    with on_port(tmp_path) as lab:
+        page.goto(lab.address())
+        page.get_by_role("button", name="EMERGENCY STOP").click()
+        clear = page.get_by_role("button", name="Clear the stop")
+        clear.wait_for()
+        if act == "second press":
+            box = clear.bounding_box()
+            page.mouse.dblclick(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+            page.get_by_role("button", name="No, stay stopped").wait_for()
+        else:
+            clear.click()
+            page.get_by_role("heading", name="Are all cells clear of people and obstacles?").wait_for()
+            assert page.evaluate("document.activeElement.textContent") == "No, stay stopped"
+            page.keyboard.press(act)
+            page.get_by_role("button", name="No, stay stopped").wait_for(state="detached")
+        assert lab.do(lab.served.get("/status"))["emergency"]["by"] == "admin"
+
+
+def test_with_two_rigs_each_is_stopped_and_cleared_alone_and_all_together(page: Any, tmp_path: Path) -> None:
+    laboratory = tmp_path / "numbers.yaml"
+    laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
+    rigs = tuple(Rig(name, laboratory, load_laboratory(laboratory)) for name in ("left", "right"))
+    with on_port(tmp_path, rigs=rigs) as lab:
+        keys = [lab.do(lab.served.submit(rig=rig.name)) for rig in rigs]
+        for key in keys:
+            lab.do(lab.served.until(key, "running"))
+        wait_until(page, lambda: len(lab.served.laboratories) == 2)
+        for one in lab.served.laboratories:
+            lab.do(one.bench.begun.wait())
+        page.goto(lab.address())
+        lines = page.locator("#cells li")
+        lines.filter(has_text="left: arm moves").wait_for()
+        lines.filter(has_text="right: arm moves").wait_for()
+        page.get_by_role("button", name="STOP left").click()
+        page.get_by_role("heading", name="Emergency stop of left").wait_for()
+        lines.filter(has_text="left: STOPPED").wait_for()
+        assert sorted(one.arm_stops for one in lab.served.laboratories) == [0, 1]
+        assert lines.filter(has_text="right: arm moves").count() == 1
+        lab.do(lab.served.until(keys[0], "unknown"))
+        told = lab.do(lab.served.post(f"/campaigns/{keys[0]}/resume", status=409))
+        assert "emergency stop of rig left is latched" in told["detail"]
+        page.get_by_role("button", name="EMERGENCY STOP ALL").click()
+        lines.filter(has_text="right: STOPPED").wait_for()
+        assert [one.arm_stops for one in lab.served.laboratories] == [1, 1]
+        page.get_by_role("button", name="Clear the stop", exact=True).click()
+        page.get_by_role("button", name="Yes, clear the stop").click()
+        lines.filter(has_text="right: idle").wait_for()
+        assert lines.filter(has_text="left: STOPPED").count() == 1  # its own stop is cleared by itself
+        page.get_by_role("button", name="Clear the stop of left").click()
+        page.get_by_role("button", name="Yes, clear the stop").click()
+        lines.filter(has_text="left: idle").wait_for()
 
 
 def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path: Path) -> None:
@@ -239,6 +305,29 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
         assert len(rows) == len(found["pours_made"]) == 3
         assert f"{100 * found['pours_made'][-1]['spillage']:.2f} %" in rows[0]
         assert found["pours_made"][-1]["predicted"] in rows[0]
+        heads = page.locator("#pours thead th").all_inner_texts()
+        assert (heads[0], heads[-1]) == ("Campaign", "Spilled / loaded")
+        cells = page.locator("#pours tbody tr").first.locator("td").all_inner_texts()
+        assert cells[0] == "cup"
+        assert cells[5].split("\n")[-1].strip() == "(spilled + retained) / loaded"
+
+
+def test_a_pour_without_outcome_reads_unknown_while_its_question_is_open(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        key = lab.do(lab.served.submit())
+        lab.do(lab.served.pouring())
+        page.goto(lab.address())
+        pour = page.locator("#pours tbody tr").first
+        pour.get_by_text("under way").wait_for()
+        page.get_by_role("button", name="Stop the motion").click()
+        page.get_by_role("button", name="Stop the motion").click()
+        pour.get_by_text("UNKNOWN").wait_for()
+        lab.do(lab.served.until(key, "unknown"))
+        lab.do(lab.served.post(f"/campaigns/{key}/resume"))
+        lab.do(lab.served.question())
+        page.get_by_role("button", name="Lost: nobody knows").wait_for()
+        assert page.locator("#pours").get_by_text("UNKNOWN").count() == 1
+        assert page.locator("#pours").get_by_text("under way").count() == 0
 
 
 def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
@@ -267,9 +356,67 @@ def test_a_lost_connection_is_told_with_what_to_do(page: Any, tmp_path: Path) ->
         page.goto(lab.address())
         page.get_by_text("Nothing runs here.").wait_for()
         page.context.set_offline(True)
-        page.get_by_text("To stop the arm, use its own emergency stop.").wait_for()
+        page.get_by_text("the red mushroom button on the teach pendant").wait_for()
         page.context.set_offline(False)
         page.get_by_text("No connection to the daemon").wait_for(state="hidden")
+        assert page.get_by_role("button", name="EMERGENCY STOP").is_enabled()
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("size", ["small phone", "desk"])
+def test_without_a_daemon_the_stop_is_disabled_and_the_physical_one_is_named(
+    page: Any, tmp_path: Path, size: str, end: signal.Signals
+) -> None:
+    """A daemon that is killed, and one that hangs."""
+    width, height = SIZES[size]
+    page.set_viewport_size({"width": width, "height": height})
+    with a_process(tmp_path) as (process, address):
+        page.goto(address)
+        stop = page.get_by_role("button", name="EMERGENCY STOP")
+        wait_until(page, stop.is_enabled)
+        page.evaluate("document.body.style.minHeight = '3000px'; scrollTo(0, 3000)")
+        assert in_view(stop)
+        os.kill(process.pid, end)
+        alert = page.get_by_role("alert").filter(has_text="the stop in this page does NOT work now")
+        alert.wait_for()
+        assert "press the physical emergency stop: the red mushroom button on the teach pendant" in alert.inner_text()
+        assert in_view(alert)
+        assert alert.bounding_box()["width"] == page.evaluate("document.documentElement.clientWidth")
+        assert stop.is_disabled()
+        assert in_view(page.locator("#mode"))
+        assert in_view(page.locator("#link").filter(has_text="NO CONNECTION"))
+
+
+def test_a_stop_that_is_pressed_in_vain_is_not_missed(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        page.goto(lab.address())
+        page.get_by_text("Nothing runs here.").wait_for()
+        page.route("**/emergency-stop", lambda route: route.abort())
+        page.get_by_role("button", name="EMERGENCY STOP").click()
+        alert = page.get_by_role("alert").filter(has_text="EMERGENCY STOP was not confirmed: press the physical")
+        alert.wait_for()
+        assert in_view(alert)
+
+
+def test_nothing_but_the_operator_scrolls_the_page(page: Any, tmp_path: Path) -> None:
+    """A question comes and goes while the operator looks at something else: that stays where it is."""
+    page.set_viewport_size({"width": 390, "height": 600})
+    with on_port(tmp_path, asking(**REFILL)) as lab:
+        page.goto(lab.address())
+        page.get_by_text("Nothing runs here.").wait_for()
+        page.get_by_role("heading", name="Former runs").scroll_into_view_if_needed()
+        page.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
+        assert page.evaluate("scrollY") > 0
+        where = "document.querySelector('#former-head').getBoundingClientRect().top"
+        before = page.evaluate(where)
+        asked(lab)
+        page.get_by_role("button", name="1 question").wait_for()
+        assert abs(page.evaluate(where) - before) < 2
+        lab.served.laboratories[0].bench.question = None  # the pours after this one ask nothing
+        number = lab.do(lab.served.get("/questions"))[0]["id"]
+        lab.do(lab.served.post(f"/questions/{number}/answer", {"answer": "done"}))
+        page.get_by_role("button", name="1 question").wait_for(state="detached")
+        assert page.evaluate("scrollY") > 0
 
 
 def test_it_asks_nobody_else_and_shows_texts_as_texts(page: Any, tmp_path: Path) -> None:
@@ -328,7 +475,10 @@ def test_everything_is_legible_and_large_enough(page: Any, tmp_path: Path, schem
         assert page.evaluate(LEGIBLE) == []
         page.get_by_role("button", name="EMERGENCY STOP").click()
         page.get_by_role("heading", name="Emergency stop").wait_for()
-        page.get_by_text("Clear it").click()
+        page.get_by_role("button", name="Clear the stop").click()
+        assert page.evaluate(LEGIBLE) == []
+        page.context.set_offline(True)
+        page.get_by_text("does NOT work now").wait_for()
         assert page.evaluate(LEGIBLE) == []
 
 
@@ -396,6 +546,46 @@ def test_former_runs_are_found_and_what_is_noted_of_them_is_found_again(
 def former(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The daemon's runs are in the catalogue of its own state directory, as `decant serve` has it."""
     monkeypatch.setenv(VARIABLE, str(tmp_path / "state"))
+
+
+@contextlib.contextmanager
+def a_process(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """`decant serve` as a process of its own, and the address of its page with a token."""
+    settings, state = folder / "decant.yaml", folder / "state"
+    settings.write_text("{listen: {port: 0}, in_process: true, keep_free: 40 MB}\n")
+    command = [sys.executable, "-c", MAIN, "serve", str(settings), "--state", str(state)]
+    with (folder / "log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=dict(os.environ), start_new_session=True)
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not answers(state / "url"):
+            assert process.poll() is None, (folder / "log").read_text()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        yield process, f"{(state / 'url').read_text().strip()}/#token={token_of(state / 'tokens', Role.ADMIN)}"
+    finally:
+        process.kill()
+        process.wait()
+
+
+def answers(address: Path) -> bool:
+    """Whether a daemon that writes its address into a file answers there."""
+    try:
+        return httpx.get(f"{address.read_text().strip()}/healthz", trust_env=False).is_success
+    except (OSError, httpx.HTTPError):
+        return False
+
+
+IN_VIEW = """(one) => {
+  const box = one.getBoundingClientRect(), root = document.documentElement;
+  const inside = box.top >= 0 && box.left >= 0 && box.bottom <= root.clientHeight && box.right <= root.clientWidth;
+  return inside && one.contains(document.elementFromPoint((box.left + box.right) / 2, (box.top + box.bottom) / 2));
+}"""
+
+
+def in_view(found: Any) -> bool:
+    """Whether all of an element is within the window, and nothing lies over its middle."""
+    return bool(found.evaluate(IN_VIEW))
 
 
 def queued(lab: OnPort) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,18 @@ import pytest
 from typer.testing import CliRunner
 
 from orchestrator.cli import app
-from orchestrator.config.load import load_laboratory
+from orchestrator.commands.daemon import submit
+from orchestrator.config.load import load_campaign, load_laboratory
+from orchestrator.daemon.packing import pack
 from orchestrator.daemon.reading import Pours
 from orchestrator.daemon.running import job_of
 from orchestrator.daemon.settings import DESK, Rig, Settings
 from orchestrator.daemon.store import Item
+from orchestrator.daemon.submitting import Submission, SubmissionError, prepare
 from orchestrator.jobs import Job
-from tests.end_to_end.small import NARROW
-from tests.orchestrator.daemon.served import HeldLaboratory, campaign_in, held, run, serving
+from orchestrator.plan import CampaignPlan
+from tests.end_to_end.small import NARROW, write_campaign
+from tests.orchestrator.daemon.served import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
 
 
 def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path) -> None:
@@ -192,5 +197,87 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
             assert found["name"] == plan.name == "cup-plan"
             assert [scene.receiver.name for scene in plan.deployment.scenes] == ["bowl"]  # type: ignore[union-attr]
             assert len(found["summary"]["receivers"]) == 1
+
+    run(work())
+
+
+RISKY = """  strategy: D1
+  risk: {measure: cvar, level: 0.9, theta: posterior, pose_error: {x: 3 mm}}
+"""
+
+
+def with_risk(folder: Path, **changes: str) -> CampaignPlan:
+    text = CAMPAIGN.replace("  strategy: D2\n", RISKY).replace("  pours: 3\n", "")
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    path = folder / "risky.yaml"
+    write_campaign(folder, text)
+    (folder / "small.yaml").rename(path)
+    return load_campaign(path)
+
+
+def test_a_campaign_without_the_draws_of_theta_that_it_bears_is_refused_when_it_is_submitted(tmp_path: Path) -> None:
+    settings = Settings(tmp_path / "state", in_process=True)
+    text, files = pack(with_risk(tmp_path))
+    for verb, said in (("run", "this campaign has no calibration"), ("plan", "needs --parameters")):
+        with pytest.raises(SubmissionError, match=said):
+            prepare(settings, Submission(text=text, files=files, verb=verb), "00000a", "somebody")
+    assert not any(settings.snapshots.iterdir())
+
+
+def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp_path: Path) -> None:
+    theta = tmp_path / "theta.json"
+    rows = [{"theta": {"friction": friction}, "weight": 1.0} for friction in (0.1, 0.3)]
+    content = {"theta": {"friction": 0.2}, "posterior": rows, "remaining_discrepancy": {"shift": 0.25}}
+    theta.write_text(json.dumps(content), encoding="utf-8")
+    sent: list[dict[str, Any]] = []
+
+    class Client:
+        def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
+            sent.append(body)
+            return {"id": "risky-1", "rig": "none", "needs_arming": False}
+
+    @contextlib.contextmanager
+    def talking(at: Any) -> Any:
+        yield Client()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orchestrator.commands.daemon.talking", talking)
+        source = with_risk(tmp_path).source
+        at: Any = None
+        submit(
+            source, wanted="plan", rig="", priority=0, laboratory=None, seed=None, parameters=theta, at=at, as_json=True
+        )
+    (body,) = sent
+    settings = Settings(tmp_path / "state", in_process=True)
+    submission = Submission(text=body["text"], files=body["files"], verb="plan")
+    item = prepare(settings, submission, "00000a", "somebody")
+    planned = job_of(settings, item, settings.rig(item.rig)).plan
+    assert planned.parameters.friction == 0.2
+    assert planned.deployment is not None
+    assert {one.friction for one in planned.deployment.thetas} == {0.1, 0.3}
+    assert planned.deployment.left_over == 0.25
+
+
+def test_warnings_of_the_check_and_a_missing_recording_are_reported_as_the_run_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orchestrator.monitor.live.installed", lambda module: False)
+    far = CAMPAIGN.replace("[60 mm, 100 mm]", "[60 mm, 500 mm]").replace("rrd: false", "rrd: true")
+
+    async def work() -> None:
+        write_campaign(tmp_path, far)
+        async with serving(tmp_path) as served:
+            key = await served.submit()
+            await served.until(key, "finished")
+            told: list[str] = []
+            async for one in served.daemon.feed.read(0, key, beat=0.05):
+                if one is None:
+                    break
+                body = json.loads(one.data)
+                if body["type"] == "LogLine" and body["level"] == "warning":
+                    told.append(body["text"])
+            assert sum("x_offset" in text and "can a stream hit" in text for text in told) == 1
+            assert sum(text.startswith("no recording: it needs Rerun") for text in told) == 1
 
     run(work())

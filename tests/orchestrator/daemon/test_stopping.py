@@ -68,12 +68,13 @@ def test_aborting_stops_the_arm_and_leaves_the_pour_to_the_person_who_brings_it_
             await served.post(f"/campaigns/{key}/abort")
             found = await served.until(key, "unknown")
             assert len(laboratory.bench.aborted) == 1
-            assert found["pours_made"][0]["state"] == "under way"
+            assert found["pours_made"][0]["state"] == "unknown"
             assert await served.get("/questions") == []
 
             await served.post(f"/campaigns/{key}/resume")
             question = await served.question()
             assert question["kind"] == "unknown"
+            assert (await served.get(f"/campaigns/{key}"))["pours_made"][0]["state"] == "unknown"
             await served.post(f"/questions/{question['id']}/answer", {"answer": "lost"})
             served.laboratories[-1].bench.go.set()
             while len(served.laboratories) < 2:

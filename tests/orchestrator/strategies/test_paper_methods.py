@@ -22,6 +22,7 @@ from orchestrator.stages import calibration_stages
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.d3_settings import D3Settings
+from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, StrategyHarness
 from orchestrator.study.cell_process import run_cell
 from orchestrator.study.cells import cells_of
 from orchestrator.study.folder import finished_results, read_result
@@ -32,7 +33,6 @@ from orchestrator.study.report.drawing import colour
 from orchestrator.study.report.gather import gather
 from orchestrator.study.report.tables import tables
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
-from tests.orchestrator.play import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, Play
 from tests.orchestrator.study_files import read, written
 from tests.orchestrator.toy_study import ToyLaboratory
 from tests.orchestrator.toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
@@ -45,7 +45,7 @@ def campaign(folder: Path, keys: str) -> CampaignPlan:
 
 def questions(strategy: RealOnly | Hybrid, purpose: str) -> list[SuggestProblem]:
     """What the optimiser is asked for a purpose in a whole campaign."""
-    asked = Play(narrow_cup_biased, narrow_cup)(strategy).asked
+    asked = StrategyHarness(narrow_cup_biased, narrow_cup).run(strategy).asked
     return [request.problem for request in asked if isinstance(request, Suggest) and request.purpose == purpose]
 
 
@@ -82,7 +82,7 @@ def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, 
     plan = replace(plan, scene=SCENE, actions=CALIBRATION_ACTIONS, parameters=PARAMETERS)
     results: dict[str, Any] = {}
     for stage in calibration_stages(plan)[:2]:
-        played = Play(calibration_spill, weighed)(strategy := stage.build(results, 3))
+        played = StrategyHarness(calibration_spill, weighed).run(strategy := stage.build(results, 3))
         results[stage.name] = strategy.result()
     asked = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose in ("calibrate", "conclude")]
     assert len(asked) > 3

@@ -7,12 +7,10 @@ import json
 import math
 import random
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -22,7 +20,7 @@ from actors.optimizer.core.propose import propose
 from orchestrator.errors import LearningError
 from orchestrator.events import Event, RequestFinished
 from orchestrator.plan import CampaignPlan
-from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulated, Suggest
+from orchestrator.requests import Outcome, Pour, Poured, Request, Suggest
 from orchestrator.results import encode_result
 from orchestrator.strategies.calibration.c1 import UniformGrid
 from orchestrator.strategies.calibration.c2 import StratifiedSampling
@@ -36,22 +34,14 @@ from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.d3_free import FreeHybrid
 from orchestrator.strategies.deployment.objectives import Objectives, Retained, Spillage
 from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, THETA, StrategyHarness, failures, replay
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
 from tests.depth import examples
 from tests.orchestrator import plans
-from tests.orchestrator.play import (
-    CALIBRATION_ACTIONS,
-    SCENE,
-    THETA,
-    Play,
-    calibration_plan,
-    deployment_plan,
-    outcome_of,
-    replay,
-)
+from tests.orchestrator.plans import calibration_plan, deployment_plan
 from tests.orchestrator.toy import SCENE as TOY
 from tests.orchestrator.toy import SPACE, ToyLaboratory, logical_record, run_toy, slow_laboratory, toy_plan
 from tests.orchestrator.toys import calibration_spill, narrow_cup, weighed
@@ -85,7 +75,7 @@ AS_TIME_ALLOWS: dict[str, tuple[Any, dict[str, Any]]] = {
 @cache
 def measured() -> tuple[Any, ...]:
     design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 6, 1, 0)
-    Play(weighed)(design)
+    StrategyHarness(weighed).run(design)
     return design.measured
 
 
@@ -97,7 +87,7 @@ def make(name: str, seed: int) -> Any:
     return kind(deployment_plan(strategy=name[:2], **changes), SCENE, THETA, seed)
 
 
-class Shuffled(Play):
+class Shuffled(StrategyHarness):
     """Simulations come back in any order."""
 
     def __init__(self, *arguments: Any, shuffle: int, **options: Any) -> None:
@@ -119,8 +109,8 @@ def spill(name: str) -> Callable[..., float]:
 def test_the_order_in_which_simulations_return_changes_no_request(
     name: str, seed: int, slots: int, shuffle: int
 ) -> None:
-    first = Play(spill(name), slots=slots)(make(name, seed))
-    other = Shuffled(spill(name), slots=slots, shuffle=shuffle)(make(name, seed))
+    first = StrategyHarness(spill(name), slots=slots).run(make(name, seed))
+    other = Shuffled(spill(name), slots=slots, shuffle=shuffle).run(make(name, seed))
     assert (other.simulations, other.pours) == (first.simulations, first.pours)
     assert [r.problem for r in other.asked if isinstance(r, Suggest)] == [
         r.problem for r in first.asked if isinstance(r, Suggest)
@@ -131,30 +121,6 @@ def test_the_order_in_which_simulations_return_changes_no_request(
 NAN = math.nan
 
 
-def misfortune(share: float, seed: int) -> Callable[[Request], Outcome | None]:
-    """Every kind of bad luck, in a share of the requests."""
-    rng = np.random.default_rng(seed)
-
-    def strike(request: Request) -> Outcome | None:
-        if isinstance(request, Suggest) or rng.random() >= share:
-            return None
-        if isinstance(request, Pour):
-            lost = PourMeasurement(0.2, NAN, 0.0)
-            return [Failed("pour_failed", "spilled by hand"), Failed("invalid_action", "touch"), Poured(lost)][
-                int(rng.integers(3))
-            ]
-        return [
-            Failed("simulation", "diverged"),
-            Failed("invalid_action", "cups touch"),
-            Simulated(outcome_of(NAN)),
-            Simulated(replace(outcome_of(0.9), invalid="escaped 1.2 %")),
-            Simulated(outcome_of(0.0, retained=1.0)),
-            Simulated(outcome_of(0.3, retained=NAN)),
-        ][int(rng.integers(6))]
-
-    return strike
-
-
 @pytest.mark.parametrize("name", [*ALL, "D3, free", pytest.param("D3, free, varying noise", marks=pytest.mark.slow)])
 @settings(max_examples=examples(5), deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**31), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]))
@@ -162,9 +128,9 @@ def test_whatever_fails_every_question_has_numbers_and_the_end_is_an_answer_or_a
     name: str, seed: int, share: float
 ) -> None:
     strategy = make(name, seed)
-    played, reason = Play(spill(name), slots=3, answer=misfortune(share, seed), beside=20), ""
+    played, reason = StrategyHarness(spill(name), slots=3, answer=failures(share, seed), beside=20), ""
     try:
-        played(strategy)
+        played.run(strategy)
     except LearningError as error:
         reason = str(error)
     assert strategy.finished or (name in CALIBRATIONS and "gave no discrepancy" in reason)
@@ -181,7 +147,7 @@ def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
         return Poured(PourMeasurement(0.2, NAN, 0.0)) if isinstance(request, Pour) and request.number == 2 else None
 
     design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 4, 1, 0)
-    Play(weighed, answer=lost)(design)
+    StrategyHarness(weighed, answer=lost).run(design)
     assert len(design.measured) == 3
     assert "no numbers" in str(design.result().pours[1].given_up)
 

@@ -1,6 +1,7 @@
-"""An arm that is none: a stand whose motor turns the pourer about its lip. Everything that an arm needs, in one file.
+"""A stand as an arm: a slide lifts the pourer, a motor turns it about its lip. All that an arm needs, in one file.
 
-`Stand` is the driver, `StandSpec` its settings as values, `StandSection` what stands in a laboratory's file:
+`Stand` is the driver, `Drive` what it moves, `StandSpec` its settings as values, `StandSection` what stands in a
+laboratory's file:
 
     arm: {kind: stand, fastest: 60 deg/s}
 """
@@ -15,8 +16,9 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from actors.arm.errors import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+from actors.arm.errors import ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.geometry import Pose
 from actors.arm.motion_path import ExecutedMotion, MotionPath
 from actors.arm.protocol import ArmFacts, ArmState, Whereabouts
@@ -28,8 +30,8 @@ from orchestrator.config.yaml.quantities import Quantity
 from sim_engine.action import Action
 from sim_engine.task import Scene
 
-READINGS = 50.0
-"""Readings of the motor's encoder per bench second [Hz]."""
+HOME_HEIGHT = 0.05
+"""Where the slide waits, above where it pours [m]."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class StandSpec(ArmSpec):
     """A stand with a motor.
 
     Attributes:
-        fastest: that the motor turns [rad/s].
+        fastest: largest speed of the motor [rad/s].
     """
 
     fastest: float = math.radians(90.0)
@@ -52,7 +54,7 @@ class StandSpec(ArmSpec):
 
     def plan(self, scene: Scene, action: Action) -> MotionPath:
         """See `ArmSpec.plan`: the motor makes any motion that isn't too fast for it."""
-        path = MotionPath(plan_pour(scene, action), approach_time=1.0)
+        path = MotionPath(plan_pour(scene, action), approach_time=1.0, retreat_time=1.0)
         if path.report.tilt_speed > self.fastest * 1.001:
             asked, most = math.degrees(path.report.tilt_speed), math.degrees(self.fastest)
             raise InvalidActionError(
@@ -80,26 +82,80 @@ class StandSection(ArmSettings):
         return StandSpec(fastest=self.fastest)
 
 
-class Stand:
-    """The driver: see `actors.arm.protocol.Arm`. Its motor is a clock here."""
+class Drive:
+    """The stand itself: a motor that turns the pourer, a slide that lifts it, and their encoders.
 
-    def __init__(self, spec: StandSpec) -> None:
+    In this example it is an object; a real one is at the end of a cable. It is the witness of the driver's tests, for
+    it keeps what it truly did.
+
+    Attributes:
+        slip: share of every commanded turn that the belt loses.
+        plugged: its cable is connected.
+    """
+
+    def __init__(self, time_scale: float = 1.0) -> None:
+        self._scale = time_scale
+        self._commanded = 0.0
+        self.slip = 0.0
+        self.plugged = True
+        self.now, self.tilt, self.height = 0.0, 0.0, HOME_HEIGHT
+        self.readings: list[tuple[float, float, float]] = []
+        """Time [s of bench time], tilt [rad] and height [m]."""
+        self.tick()
+
+    def tick(self) -> float:
+        """Read the encoders; the time of that reading [s of bench time]."""
+        self.now = time.monotonic() * self._scale
+        self.readings.append((self.now, self.tilt, self.height))
+        return self.now
+
+    def read(self) -> tuple[float, float, float]:
+        """A reading over the cable.
+
+        Raises:
+            ConnectionError: the cable is not connected.
+        """
+        if not self.plugged:
+            raise ConnectionError("the stand does not answer")
+        self.tick()
+        return self.readings[-1]
+
+    def go(self, tilt: float, height: float) -> None:
+        """Be there at the time of the last reading [rad], [m]. Raises as `read`."""
+        if not self.plugged:
+            raise ConnectionError("the stand does not answer")
+        self.tilt += (1.0 - self.slip) * (tilt - self._commanded)
+        self._commanded, self.height = tilt, height
+        self.readings[-1] = (self.now, self.tilt, self.height)
+
+
+class Stand:
+    """The driver: see `actors.arm.protocol.Arm`.
+
+    Args:
+        spec: its settings.
+        drive: what it moves; its own by default.
+    """
+
+    def __init__(self, spec: StandSpec, drive: Drive | None = None) -> None:
         self._spec = spec
+        self._drive = drive or Drive(spec.time_scale)
         self._one = threading.Lock()
         self._halt = threading.Event()
         self._free = False
         self._state = ArmState()
-        self._height = 0.0
 
     def connect(self) -> ArmFacts:
         self._free = False
         return self.facts()
 
     def facts(self) -> ArmFacts:
+        self._read()
         return ArmFacts(model="stand", serial="1")
 
     def hands_in(self) -> None:
         self._free = False
+        self._read()
 
     def release(self) -> None:
         self._halt.clear()
@@ -110,18 +166,22 @@ class Stand:
         return self._state
 
     def where(self) -> Whereabouts:
-        return Whereabouts(Pose(z=self._height))
+        return Whereabouts(Pose(z=self._read()[2]))
 
     def move_to_start(self, path: MotionPath) -> None:
-        self._way("approach", path.approach_time, lambda t: 0.0)
+        self._consent()
+        _, tilt, height = self._read()
+        self._way("approach", path.approach_time, lambda t: tilt, _ramp(height, 0.0, path.approach_time))
 
     def execute(self, path: MotionPath) -> ExecutedMotion:
         def phase(t: float) -> str:
             return next((name for name, _, end in path.phases if t < end), "return")
 
-        reached = self._turn(path.pour_time, phase, lambda t: float(path.tilt(np.array([t]))[0]))
-        times = np.linspace(0.0, reached, max(2, round(reached * READINGS)))
-        executed = ExecutedMotion(times, path.poses(times), completed=reached >= path.pour_time)
+        readings = self._turn(path.pour_time, phase, lambda t: float(path.tilt(np.array([t]))[0]), lambda t: 0.0)
+        reached, measured = readings[-1][0], np.array(readings)
+        measured = measured[np.append(True, np.diff(measured[:, 0]) > 0.0)]
+        poses = poses_of(path, measured[:, 1], measured[:, 2])
+        executed = ExecutedMotion(measured[:, 0], poses, completed=reached >= path.pour_time)
         if not executed.completed:
             raise ArmStoppedError(
                 f"stopped {reached:.1f} s into the pour",
@@ -134,12 +194,15 @@ class Stand:
         return executed
 
     def retreat(self, path: MotionPath) -> None:
-        self._way("retreat", path.retreat_time, lambda t: 0.0)
+        self._consent()
+        if self._read()[1] > 0.0:
+            self._upright("retreat")
+        _, tilt, height = self._read()
+        self._way("retreat", path.retreat_time, lambda t: tilt, _ramp(height, HOME_HEIGHT, path.retreat_time))
         self._free = False
 
     def untilt(self, path: MotionPath | None = None) -> None:
-        tilt, speed = self._state.tilt, self._spec.untilt_speed
-        self._way("untilt", tilt / speed, lambda t: max(tilt - speed * t, 0.0))
+        self._upright("untilt")
         self._free = False
 
     def recover(self) -> str:
@@ -158,33 +221,79 @@ class Stand:
     def jog(self, axis: str, amount: float, speed: float) -> None:
         if axis != "z" or abs(amount) > 0.05:
             raise ArmRefusedError("a stand goes up and down, by 50 mm at most: axis 'z'")
-        self._way("jog", abs(amount) / speed, lambda t: self._state.tilt)
-        self._height += amount
+        self._consent()
+        _, tilt, height = self._read()
+        duration = abs(amount) / speed
+        self._way("jog", duration, lambda t: tilt, _ramp(height, height + amount, duration))
         self._free = False
 
     def close(self) -> None:
         self.stop()
 
+    def _read(self) -> tuple[float, float, float]:
+        """Time, tilt and height that the encoders report."""
+        try:
+            return self._drive.read()
+        except ConnectionError as error:
+            raise self._lost(error) from error
+
+    def _lost(self, error: ConnectionError) -> ArmLostError:
+        """Consent ends with the connection."""
+        self._free = False
+        self._state = replace(self._state, moving=False, stopped=True)
+        return ArmLostError(f"{error}; look at its cable")
+
     def _consent(self) -> None:
         if not self._free:
-            raise ArmNotReleasedError("the stand is locked: somebody has to release it before it moves")
+            raise ArmNotReleasedError("the stand is locked: the operator has to release it before it moves")
 
-    def _way(self, name: str, duration: float, tilt: Callable[[float], float]) -> None:
-        reached = self._turn(duration, lambda t: name, tilt)
+    def _upright(self, name: str) -> None:
+        self._consent()
+        _, tilt, height = self._read()
+        duration = abs(tilt) / self._spec.untilt_speed
+        self._way(name, duration, _ramp(tilt, 0.0, duration), lambda t: height)
+
+    def _way(
+        self, name: str, duration: float, tilt: Callable[[float], float], height: Callable[[float], float]
+    ) -> None:
+        reached = self._turn(duration, lambda t: name, tilt, height)[-1][0]
         if reached < duration:
             raise ArmStoppedError(f"stopped during {name}", "operator", name, reached, self._state.tilt)
 
-    def _turn(self, duration: float, phase: Callable[[float], str], tilt: Callable[[float], float]) -> float:
-        """Let the motor turn; how far it came [s of bench time]."""
+    def _turn(
+        self,
+        duration: float,
+        phase: Callable[[float], str],
+        tilt: Callable[[float], float],
+        height: Callable[[float], float],
+    ) -> list[tuple[float, float, float]]:
+        """Move tilt and height over time; what the encoders read: time since the begin [s], tilt and height."""
         if not self._one.acquire(blocking=False):
             raise ArmRefusedError("the stand turns already")
         try:
             self._consent()
-            begun, now = time.monotonic(), 0.0
-            while now < duration and not self._halt.wait(0.01):
-                now = min((time.monotonic() - begun) * self._spec.time_scale, duration)
-                self._state = ArmState(True, False, now, now / duration, phase(now), tilt(now))
-            self._state = ArmState(False, self._halt.is_set(), now, 1.0, "idle", tilt(now))
-            return now
+            begun, at, lift = self._drive.read()
+            readings = [(0.0, at, lift)]
+            while (now := readings[-1][0]) < duration and not self._halt.wait(0.01):
+                now = min(self._drive.read()[0] - begun, duration)
+                self._drive.go(tilt(now), height(now))
+                readings.append((now, self._drive.tilt, self._drive.height))
+                self._state = ArmState(True, False, now, now / duration, phase(now), self._drive.tilt)
+            self._state = ArmState(False, self._halt.is_set(), now, 1.0, "idle", self._drive.tilt)
+            return readings
+        except ConnectionError as error:
+            raise self._lost(error) from error
         finally:
             self._one.release()
+
+
+def poses_of(path: MotionPath, tilts: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses of the pourer in the world, shape (T, 7), from what the encoders read, both of shape (T,)."""
+    pivot = replace(path.motion, segments=())
+    poses = np.array([replace(pivot, tilt_error=float(tilt)).sample(np.zeros(1))[0] for tilt in tilts])
+    poses[:, 2] += heights
+    return poses
+
+
+def _ramp(begin: float, end: float, duration: float) -> Callable[[float], float]:
+    return lambda t: begin + (end - begin) * min(t / duration, 1.0) if duration > 0.0 else end

@@ -12,12 +12,17 @@ import time
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
+
 from actors.balance.protocol import Weight
 from actors.balance.spec import BalanceDevice
 from actors.balance.virtual_balance import Load
 from actors.protocols import LaboratoryError
 from orchestrator.config.laboratory.balance import BalanceDeviceSection
 from orchestrator.config.yaml.quantities import Quantity
+
+PATIENCE = 20.0
+"""How long it may take to come to rest [s of bench time]."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +69,8 @@ class SpringBalance:
 
     def __init__(self, spec: SpringSpec, name: str = "spring") -> None:
         self._spec, self._name = spec, name
-        self._mass = self._tare = 0.0
-        self._changed = -math.inf
+        self._tare = 0.0
+        self._load, self._changed = Load((0.0,), (0.0,)), -math.inf
         self._interrupted = threading.Event()
 
     def connect(self) -> str:
@@ -75,7 +80,7 @@ class SpringBalance:
     def tare(self) -> None:
         """See `BalanceDriver.tare`."""
         self._rest()
-        self._tare = self._mass
+        self._tare = self._mass(time.monotonic())
 
     def weigh(self) -> Weight:
         """See `BalanceDriver.weigh`."""
@@ -84,8 +89,8 @@ class SpringBalance:
 
     def read(self) -> Weight:
         """See `BalanceDriver.read`."""
-        steps = round((self._mass - self._tare) / self._spec.step)
         now = time.monotonic()
+        steps = round((self._mass(now) - self._tare) / self._spec.step)
         return Weight(steps * self._spec.step, now >= self._still_at, now, step=self._spec.step)
 
     def keep_reference(self) -> None:
@@ -104,16 +109,24 @@ class SpringBalance:
 
     def prepare(self, seed: tuple[int, ...]) -> None:
         """A new pour: it is empty."""
-        self._mass, self._tare = 0.0, 0.0
+        self._load, self._tare = Load((0.0,), (0.0,)), 0.0
 
     def put(self, load: Load) -> None:
-        """What stands on it from now on."""
-        self._mass, self._changed = load.masses[-1], time.monotonic()
+        """Masses that stand on it from now on."""
+        self._load, self._changed = load, time.monotonic()
+
+    def _mass(self, now: float) -> float:
+        """What stands on it [kg]."""
+        since = (now - self._changed) * self._spec.time_scale
+        return float(np.interp(since, self._load.times, self._load.masses))
 
     @property
     def _still_at(self) -> float:
-        return self._changed + self._spec.swing / self._spec.time_scale
+        return self._changed + (self._load.times[-1] + self._spec.swing) / self._spec.time_scale
 
     def _rest(self) -> None:
-        if self._interrupted.wait(max(self._still_at - time.monotonic(), 0.0)):
+        wait = self._still_at - time.monotonic()
+        if self._interrupted.wait(min(max(wait, 0.0), PATIENCE / self._spec.time_scale)):
             raise LaboratoryError(f"balance {self._name}: interrupted")
+        if time.monotonic() < self._still_at:
+            raise LaboratoryError(f"balance {self._name}: not at rest within {PATIENCE:g} s; is it shaken?")

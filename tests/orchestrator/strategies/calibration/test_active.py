@@ -17,10 +17,11 @@ from orchestrator.requests import Failed, Pour, Simulate, Slots
 from orchestrator.stages import POURS, known_simulations, measured_pours, stages_of
 from orchestrator.strategies.calibration.active import ActivePours, joint_contexts
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.strategy_harness import ACTIONS, SCENE, StrategyHarness, replay
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
-from tests.orchestrator.play import ACTIONS, SCENE, Play, calibration_plan, deployment_plan, replay
+from tests.orchestrator.plans import calibration_plan, deployment_plan
 from tests.orchestrator.strategies.calibration.test_nuisances import SEARCHED, TRUTH, spilled, written
 
 NARROW = replace(SCENE, name="deployment-narrow", fixed={"height": 0.07})
@@ -58,12 +59,14 @@ def truth(action: Action, _: SimulationParameters, rng: np.random.Generator) -> 
 
 
 @pytest.fixture(scope="module")
-def played() -> tuple[ActivePours, Play]:
+def played() -> tuple[ActivePours, StrategyHarness]:
     strategy = ActivePours(*plans(), 3)
-    return strategy, Play(spilled, truth)(strategy)
+    return strategy, StrategyHarness(spilled, truth).run(strategy)
 
 
-def test_it_simulates_what_is_to_be_deployed_and_then_pours_what_it_chose(played: tuple[ActivePours, Play]) -> None:
+def test_it_simulates_what_is_to_be_deployed_and_then_pours_what_it_chose(
+    played: tuple[ActivePours, StrategyHarness],
+) -> None:
     strategy, play = played
     kinds = [type(request) for request in play.asked]
     assert kinds[:40] == [Simulate] * 40
@@ -76,7 +79,7 @@ def test_it_simulates_what_is_to_be_deployed_and_then_pours_what_it_chose(played
     assert known[-1] < 0.5 * known[0]
 
 
-def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, Play]) -> None:
+def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, StrategyHarness]) -> None:
     strategy, _ = played
     plan, _ = plans()
     results = {POURS: strategy.result()}
@@ -84,7 +87,7 @@ def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, Play]) 
     assert len(plan.known) == 20
     measured = [scored.pour for scored in measured_pours(plan, results)]
     calibration = ContinuousBayesianCalibration(plan, measured, 1)
-    play = Play(spilled)(calibration)
+    play = StrategyHarness(spilled).run(calibration)
     assert len(play.simulations) == 30
     first = next(r for r in play.asked if getattr(r, "purpose", "") == "calibrate" and not isinstance(r, Simulate))
     assert len(first.problem.data) >= 20
@@ -92,7 +95,7 @@ def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, Play]) 
     assert low <= TRUTH.receiver_x <= high
 
 
-def test_it_asks_for_the_same_when_it_is_replayed(played: tuple[ActivePours, Play]) -> None:
+def test_it_asks_for_the_same_when_it_is_replayed(played: tuple[ActivePours, StrategyHarness]) -> None:
     assert replay(ActivePours(*plans(), 3), played[1]) == played[1].asked
 
 
@@ -106,7 +109,7 @@ def test_an_action_that_cannot_be_made_is_replaced_by_the_next_best() -> None:
         return None
 
     strategy = ActivePours(*plans(holdout=0, pour_count=3), 3)
-    Play(spilled, truth, answer=answer)(strategy)
+    StrategyHarness(spilled, truth, answer=answer).run(strategy)
     assert len(strategy.measured) == 3
     assert refused[0] != refused[1]
     assert not {pour.action for pour in strategy.measured} & set(refused)
@@ -114,7 +117,7 @@ def test_an_action_that_cannot_be_made_is_replaced_by_the_next_best() -> None:
 
 def test_it_pours_even_where_no_simulation_comes_to_anything() -> None:
     strategy = ActivePours(*plans(holdout=0, pour_count=3), 3)
-    Play(lambda *_: float("nan"), truth)(strategy)
+    StrategyHarness(lambda *_: float("nan"), truth).run(strategy)
     assert len(strategy.measured) == 3
     assert "too few simulations" in " ".join(decision.text for decision in strategy.decisions)
 

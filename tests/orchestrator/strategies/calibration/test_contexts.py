@@ -16,11 +16,12 @@ from orchestrator.stages import POURS, measured_pours, scenes_of
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours
+from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from sim_engine.vessel.spec import cylinder
-from tests.orchestrator.play import CALIBRATION_ACTIONS, SCENE, Play, calibration_plan
+from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.strategies.calibration.test_nuisances import written
 
 WIDE = replace(SCENE, name="calibration-wide", receiver=cylinder("wide", inner_radius=0.05, inner_height=0.1))
@@ -47,7 +48,7 @@ def played(strategy: Any) -> Any:
         truth = theta if isinstance(scene[0], Simulate) else TRUTH
         return spilled(scene[0], truth)
 
-    Play(amount, amount, answer=answer)(strategy)
+    StrategyHarness(amount, amount, answer=answer).run(strategy)
     return strategy
 
 

@@ -15,10 +15,11 @@ from orchestrator.publish import theta_file
 from orchestrator.strategies.calibration.base import described
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.draws import drawn_benches
+from orchestrator.strategy_harness import SCENE, StrategyHarness
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
-from tests.orchestrator.play import SCENE, Play, calibration_plan
+from tests.orchestrator.plans import calibration_plan
 
 ACTIONS = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
 SEARCHED = Space((Axis("receiver_x", -0.015, 0.015), Axis("speed_factor", 0.9, 1.1)))
@@ -40,7 +41,7 @@ def calibrated(seed: int = 1, **changes: Any) -> Any:
         pours.append(MeasuredPour(action, spilled(action, TRUTH, rng), 0.98, "train"))
     plan = calibration_plan(actions=ACTIONS, parameters=SEARCHED, fixed_parameters={}, simulations=40, **changes)
     strategy = ContinuousBayesianCalibration(plan, pours, seed)
-    Play(spilled)(strategy)
+    StrategyHarness(spilled).run(strategy)
     return strategy.result()
 
 

@@ -27,11 +27,12 @@ from orchestrator.strategies.calibration.posterior import (
 )
 from orchestrator.strategies.deployment.costs import Costing
 from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
-from tests.orchestrator.play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play, calibration_plan
+from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.reported import is_picture
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
 
@@ -52,7 +53,7 @@ def calibrated(spill: Any, truth: Any, seed: int = 0, **changes: Any) -> Any:
         action = SCENE.action(CALIBRATION_ACTIONS.draw(rng))
         pours.append(MeasuredPour(action, min(max(truth(action, None, rng), 0.0), 1.0), 0.98, "train"))
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=40, **changes), pours, seed)
-    Play(spill)(strategy)
+    StrategyHarness(spill).run(strategy)
     return strategy.result()
 
 
@@ -212,9 +213,9 @@ def test_a_prediction_takes_turns_with_thetas_of_the_posterior(tmp_path: Path) -
     action = SCENE.action({"angular_velocity": 80 * DEG, "max_angle": 100 * DEG})
     costing = Costing(Loss(), SCENE, TRUE_THETA)
     one, several = (RepeatedSimulation(costing, action, 8, 3, drawn) for drawn in ((), thetas))
-    played = Play(calibration_spill)(several)
+    played = StrategyHarness(calibration_spill).run(several)
     assert [request.parameters for request in played.simulations] == [*thetas, *thetas]
-    Play(calibration_spill)(one)
+    StrategyHarness(calibration_spill).run(one)
     spreads: Any = [strategy.result().over_seeds for strategy in (one, several)]
     assert spreads[1]["spilled"].deviation > spreads[0]["spilled"].deviation
 

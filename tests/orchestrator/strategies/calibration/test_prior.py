@@ -16,10 +16,11 @@ from orchestrator.fingerprint import fingerprint
 from orchestrator.plan import CalibrationPlan, NormalPrior
 from orchestrator.stages import calibration_stages
 from orchestrator.strategies.calibration.prior import actions_of_prior
+from orchestrator.strategy_harness import CALIBRATION_ACTIONS, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.space import Axis, Space
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
-from tests.orchestrator.play import CALIBRATION_ACTIONS, Play, calibration_plan
+from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.toys import calibration_spill, weighed
 
 SLOW = NormalPrior("angular_velocity", 30 * DEG, 10 * DEG)
@@ -79,7 +80,7 @@ def speeds(**changes: Any) -> tuple[list[float], list[float]]:
     """Speeds of all weighed and all simulated pours of a calibration [deg/s]."""
     results: dict[str, Any] = {}
     for stage in calibration_stages(calibration(**changes))[:2]:
-        played = Play(calibration_spill, weighed)(strategy := stage.build(results, 3))
+        played = StrategyHarness(calibration_spill, weighed).run(strategy := stage.build(results, 3))
         results[stage.name] = strategy.result()
         if stage.pours:
             poured = [request.action.angular_velocity / DEG for request in played.pours]

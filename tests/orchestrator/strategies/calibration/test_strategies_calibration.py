@@ -12,20 +12,12 @@ from orchestrator.strategies.calibration.baselines import mean_predictor_discrep
 from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.contexts import Contexts
 from orchestrator.strategies.calibration.design import DesignedPours, choose_holdout, stratified
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
-from orchestrator.strategies.calibration.scorecard import Scorecard
+from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPair, ScoredPour, random_parameters
+from orchestrator.strategies.calibration.scorecard import JUSTIFIED, NOT_JUSTIFIED, Scorecard, calibration_gain
+from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of, replay
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
-from tests.orchestrator.play import (
-    CALIBRATION_ACTIONS,
-    PARAMETERS,
-    SCENE,
-    Play,
-    calibration_plan,
-    outcome_of,
-    replay,
-    unit,
-)
+from tests.orchestrator.plans import calibration_plan, unit
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
 
 
@@ -38,7 +30,7 @@ class Quiet:
 
 def measured(seed=0, count=32, holdout=4):
     design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
-    Play(weighed)(design)
+    StrategyHarness(weighed).run(design)
     return design.measured
 
 
@@ -84,7 +76,7 @@ def test_an_impossible_action_is_replaced_by_another_of_its_stratum():
         return 0.1
 
     design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 32, 4, 1)
-    played = Play(sometimes_touching)(design)
+    played = StrategyHarness(sometimes_touching).run(design)
     assert refused
     assert len(played.pours) == 32 + len(refused)
     assert len(design.measured) == 32
@@ -97,14 +89,14 @@ def test_a_stratum_without_a_possible_action_is_given_up_with_its_reason():
         raise ValueError("cups touch: at tilt 37° …")
 
     design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 2, 0, 1)
-    Play(never)(design)
+    StrategyHarness(never).run(design)
     assert design.measured == ()
     assert "cups touch" in str(design.result().pours[0].given_up)
 
 
 def test_weighed_pours_survive_the_journal():
     design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 6, 1, 1)
-    Play(weighed)(design)
+    StrategyHarness(weighed).run(design)
     read_back = measured_pours(calibration_plan(), {POURS: design.result()})
     assert tuple(scored.pour for scored in read_back) == design.measured
 
@@ -125,7 +117,7 @@ def test_c4_finds_a_theta_better_than_random_ones():
     scores = []
     for seed in range(2):
         strategy = ContinuousBayesianCalibration(calibration_plan(simulations=30), pours, seed)
-        played = Play(calibration_spill)(strategy)
+        played = StrategyHarness(calibration_spill).run(strategy)
         assert len(played.simulations) == 30
         scores.append(true_discrepancy(strategy.theta))
     assert max(scores) < 0.5 * baseline
@@ -134,7 +126,7 @@ def test_c4_finds_a_theta_better_than_random_ones():
 def test_c4_asks_for_the_same_whatever_finishes_first_and_when_replayed():
     def campaign(order="first", seed=5):
         strategy = ContinuousBayesianCalibration(calibration_plan(simulations=16), measured(), seed)
-        return Play(calibration_spill, slots=3, order=order)(strategy)
+        return StrategyHarness(calibration_spill, slots=3, order=order).run(strategy)
 
     first, reversed_order = campaign(), campaign("last")
     assert first.simulations == reversed_order.simulations
@@ -145,7 +137,7 @@ def test_c4_asks_for_the_same_whatever_finishes_first_and_when_replayed():
 
 def test_every_simulated_theta_and_action_lies_in_its_box_and_keeps_what_is_fixed():
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=30), measured(), 2)
-    for request in Play(calibration_spill)(strategy).simulations:
+    for request in StrategyHarness(calibration_spill).run(strategy).simulations:
         theta = request.parameters
         assert PARAMETERS.contains({"particles": theta.particles, "cohesion": theta.cohesion})
         assert theta.friction == 0.1
@@ -167,7 +159,7 @@ def test_failed_and_leaking_simulations_never_reach_the_fit():
         return None
 
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=40), measured(), 1)
-    played = Play(calibration_spill, answer=unlucky)(strategy)
+    played = StrategyHarness(calibration_spill, answer=unlucky).run(strategy)
     final = [r for r in played.asked if isinstance(r, Suggest)][-1].problem
     assert lost
     assert len(final.data) == 40 - len(lost)
@@ -186,7 +178,7 @@ def test_pours_too_small_for_a_spillage_are_left_out_and_their_actions_not_simul
         for p in measured(count=32, holdout=0)
     ]
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=30), pours, 1)
-    simulations = Play(calibration_spill)(strategy).simulations
+    simulations = StrategyHarness(calibration_spill).run(strategy).simulations
     assert np.mean([is_poured(r.action) for r in simulations]) > 0.9
     with pytest.raises(LearningError, match="at least 2 training pours"):
         ContinuousBayesianCalibration(calibration_plan(), [MeasuredPour(pours[0].action, None, 0.0)] * 5, 1)
@@ -195,7 +187,7 @@ def test_pours_too_small_for_a_spillage_are_left_out_and_their_actions_not_simul
 def test_test_pours_are_not_used_for_fitting():
     pours = measured()
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=4), pours, 1)
-    regression = Play(calibration_spill)(strategy).asked[0]
+    regression = StrategyHarness(calibration_spill).run(strategy).asked[0]
     assert isinstance(regression, Suggest)
     assert len(regression.problem.data) == 28
 
@@ -209,7 +201,7 @@ def test_signed_differences_calibrate_better_than_noise_at_the_same_price():
         for seed in range(4):
             plan = calibration_plan(simulations=24, averaging=averaging)
             strategy = ContinuousBayesianCalibration(plan, pours, seed)
-            Play(calibration_spill)(strategy)
+            StrategyHarness(calibration_spill).run(strategy)
             scores[averaging].append(true_discrepancy(strategy.theta))
     assert np.mean(scores["context"]) < 0.7 * np.mean(scores["noise"])
 
@@ -227,7 +219,7 @@ def calibrated_in_four():
     truth = SimulationParameters(cohesion=0.04, friction=0.2)
     pours = [replace(p, spillage=spill_by_two(p.action, truth, None)) for p in measured()]
     strategy = ContinuousBayesianCalibration(calibration_plan(parameters=BOX, simulations=40), pours, 4)
-    return strategy, Play(spill_by_two)(strategy)
+    return strategy, StrategyHarness(spill_by_two).run(strategy)
 
 
 def test_of_four_parameters_the_result_maps_the_two_that_matter_with_the_others_at_theta_star():
@@ -266,7 +258,9 @@ def test_without_an_answer_of_the_optimiser_calibration_stops_with_its_reason():
         return Failed("optimizer", "out of memory") if isinstance(request, Suggest) else None
 
     with pytest.raises(LearningError, match="out of memory"):
-        Play(calibration_spill, answer=broken)(ContinuousBayesianCalibration(calibration_plan(), measured(), 1))
+        StrategyHarness(calibration_spill, answer=broken).run(
+            ContinuousBayesianCalibration(calibration_plan(), measured(), 1)
+        )
 
 
 def test_simulations_that_all_fail_end_the_calibration_with_a_reason_and_not_a_traceback():
@@ -275,7 +269,7 @@ def test_simulations_that_all_fail_end_the_calibration_with_a_reason_and_not_a_t
 
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=6), measured(), 1)
     with pytest.raises(LearningError, match="6 simulations 6 gave no discrepancy"):
-        Play(calibration_spill, answer=hopeless)(strategy)
+        StrategyHarness(calibration_spill, answer=hopeless).run(strategy)
 
 
 # -- scores --------------------------------------------------------------------------------------------------------
@@ -286,7 +280,7 @@ def test_the_true_theta_scores_best_and_undefined_pours_are_left_out():
     pours.append(ScoredPour("cup", MeasuredPour(pours[0].pour.action, None, 0.01)))
     thetas = {"best": TRUE_THETA, **random_parameters(PARAMETERS, {}, 5, 2)}
     evaluation = Evaluation(thetas, pours, 1)
-    played = Play(calibration_spill)(evaluation)
+    played = StrategyHarness(calibration_spill).run(evaluation)
     assert len(played.simulations) == 6 * 32
     for split in ("train", "test"):
         assert evaluation.discrepancy("best", split) < 0.025  # noise of 1 % in both
@@ -297,7 +291,7 @@ def test_a_score_is_the_mean_absolute_difference():
     action = SCENE.action({"angular_velocity": 1.0, "max_angle": 2.0})
     pours = [ScoredPour("cup", MeasuredPour(action, r, 1.0, "test")) for r in (0.1, 0.5)]
     evaluation = Evaluation({"one": TRUE_THETA}, pours, 1)
-    Play(lambda a, t, rng: 0.2)(evaluation)
+    StrategyHarness(lambda a, t, rng: 0.2).run(evaluation)
     assert evaluation.discrepancy("one", "test") == pytest.approx((0.1 + 0.3) / 2)
 
 
@@ -309,7 +303,7 @@ def test_draws_of_the_posterior_are_scored_by_the_mean_of_their_simulations():
     card = Scorecard(
         TRUE_THETA, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, drawn=(TRUE_THETA, wide, TRUE_THETA)
     )
-    played = Play(lambda a, theta, rng: spilled[theta.wall_distance])(card)
+    played = StrategyHarness(lambda a, theta, rng: spilled[theta.wall_distance]).run(card)
     assert len(played.simulations) == 2 + 3, "draws are simulated on pours that calibration did not see"
     result = card.result()
     assert result.posterior_mean == {"test": pytest.approx(0.5 - (0.3 + 0.6 + 0.3) / 3)}
@@ -331,7 +325,7 @@ def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the
     rivals = random_parameters(PARAMETERS, {}, 2, 1)
     card = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=plain)
     without = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3)
-    played, before = Play(calibration_spill)(card), Play(calibration_spill)(without)
+    played, before = StrategyHarness(calibration_spill).run(card), StrategyHarness(calibration_spill).run(without)
     asked = {theta: [r for r in played.simulations if r.parameters == theta] for theta in (TRUE_THETA, plain)}
     assert [(r.action, r.seed) for r in asked[TRUE_THETA]] == [(r.action, r.seed) for r in asked[plain]]
     assert played.simulations[: len(before.simulations)] == before.simulations, (
@@ -342,5 +336,53 @@ def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the
     assert sum(pair.theta == "uncalibrated" for pair in result.pairs) == 8
     assert "uncalibrated" not in without.result().discrepancy
     same = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=TRUE_THETA)
-    Play(calibration_spill)(same)
+    StrategyHarness(calibration_spill).run(same)
     assert "uncalibrated" not in same.result().discrepancy
+
+
+def pairs(*simulated: float | None) -> list[ScoredPair]:
+    """Pours that all spilled 0.5, with what was simulated of them."""
+    return [
+        ScoredPair(theta="one", split="train", scene="cup", measured=0.5, simulated=value, reason="")
+        for value in simulated
+    ]
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "uncalibrated", "recommended", "why"),
+    [
+        # gains 0.1, 0.1, 0.1, 0.2: 0.125 ± 0.025
+        ((0.4, 0.4, 0.4, 0.4), (0.3, 0.3, 0.3, 0.2), "calibrated", "gain 12.50 ± 2.50 points"),
+        ((0.3, 0.3, 0.3, 0.2), (0.4, 0.4, 0.4, 0.4), "uncalibrated", "gain -12.50 ± 2.50 points"),
+        # gains 0.3, −0.2, 0.1, −0.1: better in the mean, by less than its standard error
+        ((0.5, 0.3, 0.5, 0.4), (0.2, 0.5, 0.4, 0.5), "uncalibrated", "gain 2.50 ± 11.09 points"),
+        ((0.4, 0.4), (0.4, 0.4), "uncalibrated", "gain 0.00 ± 0.00 points"),
+        ((0.5, None, None), (0.1, None, None), "uncalibrated", "fewer than two pours could be compared"),
+        ((0.4, 0.4, 0.4), (None, 0.2, None), "calibrated", "with the uncalibrated parameters only 1 of 3 pours"),
+        ((None, 0.5, None), (0.4, 0.4, 0.4), "uncalibrated", "with θ* only 1 of 3 pours"),
+    ],
+)
+def test_theta_is_recommended_only_if_it_is_closer_to_the_pours_by_more_than_a_standard_error(
+    calibrated, uncalibrated, recommended, why
+):
+    gain = calibration_gain(pairs(*calibrated), pairs(*uncalibrated))
+    assert gain.recommended == recommended
+    assert gain.text.startswith(f"{JUSTIFIED if recommended == 'calibrated' else NOT_JUSTIFIED}: ")
+    assert why in gain.text
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_scorecard_says_at_its_end_whether_the_training_and_test_pours_justify_theta(swapped):
+    pours = [ScoredPour("cup", pour) for pour in measured(count=8, holdout=2)]
+    # a pour of another receiver, from which both are far, does not take part
+    pours.append(ScoredPour("cup", replace(pours[0].pour, spillage=1.0, split="transfer")))
+    plain = SimulationParameters(particles=4000, cohesion=0.0)
+    theta, other = (plain, TRUE_THETA) if swapped else (TRUE_THETA, plain)
+    card = Scorecard(theta, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=other)
+    assert card.result().gain is None
+    StrategyHarness(calibration_spill).run(card)
+    gain = card.result().gain
+    assert (gain.pours, gain.pairs) == (8, 8)
+    assert gain.recommended == ("uncalibrated" if swapped else "calibrated")
+    assert gain.gain == pytest.approx(gain.uncalibrated - gain.calibrated)
+    assert card.decisions[-1].text == gain.text

@@ -11,7 +11,8 @@ from orchestrator.strategies.calibration.c3 import BayesianCalibration
 from orchestrator.strategies.calibration.design import DesignedPours
 from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
 from orchestrator.strategies.progress import Progress
-from tests.orchestrator.play import CALIBRATION_ACTIONS, PARAMETERS, SCENE, Play, calibration_plan, outcome_of
+from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of
+from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
 
 STRATEGIES = {"C1": UniformGrid, "C2": StratifiedSampling, "C3": BayesianCalibration}
@@ -20,7 +21,7 @@ BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"samples": 18
 
 def measured(seed=0, count=12, holdout=2):
     design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
-    Play(weighed)(design)
+    StrategyHarness(weighed).run(design)
     return design.measured
 
 
@@ -41,7 +42,7 @@ def random_score():
     pours = [ScoredPour("cup", p) for p in measured()]
     thetas = {f"random {i}": replaced(PARAMETERS.draw(rng)) for i in range(20)}
     evaluation = Evaluation(thetas, pours, 1)
-    Play(calibration_spill)(evaluation)
+    StrategyHarness(calibration_spill).run(evaluation)
     return evaluation.random_median("test")
 
 
@@ -52,7 +53,7 @@ def replaced(values):
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_every_theta_is_simulated_once_on_each_training_pour_with_the_pours_own_seed(name):
     strategy = make(name)
-    played = Play(calibration_spill, slots=3)(strategy)
+    played = StrategyHarness(calibration_spill, slots=3).run(strategy)
     thetas = {"C1": 16, "C2": 18, "C3": 16}[name]
     train = {p.action for p in measured() if p.split == "train"}
     assert len(train) == 10
@@ -66,10 +67,10 @@ def test_every_theta_is_simulated_once_on_each_training_pour_with_the_pours_own_
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_the_theta_found_is_far_better_than_a_random_one_and_reported_as_c4_does(name):
     strategy = make(name)
-    Play(calibration_spill)(strategy)
+    StrategyHarness(calibration_spill).run(strategy)
     pours = [ScoredPour("cup", p) for p in measured()]
     evaluation = Evaluation({"theta": strategy.theta}, pours, 1)
-    Play(calibration_spill)(evaluation)
+    StrategyHarness(calibration_spill).run(evaluation)
     assert evaluation.discrepancy("theta", "test") < 0.5 * random_score()
     result = strategy.result()
     assert result.strategy == name
@@ -80,14 +81,14 @@ def test_the_theta_found_is_far_better_than_a_random_one_and_reported_as_c4_does
 
 
 def test_c1_tries_the_middles_of_equal_cells():
-    tried = units(Play(calibration_spill)(make("C1", grid={"particles": 2, "cohesion": 5})))
+    tried = units(StrategyHarness(calibration_spill).run(make("C1", grid={"particles": 2, "cohesion": 5})))
     assert sorted({round(u, 3) for u in tried[:, 0]}) == pytest.approx([0.25, 0.75], abs=1e-3)  # whole particles
     assert sorted({round(v, 6) for v in tried[:, 1]}) == pytest.approx([0.1, 0.3, 0.5, 0.7, 0.9])
     assert len(tried) == 10
 
 
 def test_c2_draws_two_theta_in_each_of_three_by_three_strata():
-    tried = units(Play(calibration_spill)(make("C2", seed=4)))
+    tried = units(StrategyHarness(calibration_spill).run(make("C2", seed=4)))
     cells = [tuple(np.clip(np.floor(3 * u + 1e-3 * (0.5 - u)), 0, 2).astype(int)) for u in tried]
     assert {cells.count(cell) for cell in cells} == {2}
     assert len(set(cells)) == 9
@@ -95,7 +96,7 @@ def test_c2_draws_two_theta_in_each_of_three_by_three_strata():
 
 def test_theta_star_of_c1_is_the_grid_point_with_the_least_mean_discrepancy():
     strategy = make("C1")
-    played = Play(calibration_spill)(strategy)
+    played = StrategyHarness(calibration_spill).run(strategy)
     spillage = {p.action: p.spillage for p in measured()}
     errors = {}
     for request, outcome in played.told:
@@ -110,16 +111,16 @@ def test_theta_star_of_c1_is_the_grid_point_with_the_least_mean_discrepancy():
 
 
 def test_c3_learns_from_every_theta_before_the_next_one():
-    played = Play(calibration_spill, slots=2)(make("C3", iterations=12))
+    played = StrategyHarness(calibration_spill, slots=2).run(make("C3", iterations=12))
     questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "calibrate"]
     assert [len(q.data) for q in questions] == [8, 9, 10, 11]
 
 
 def test_c3_comes_closer_than_as_many_stratified_theta():
     def score(strategy):
-        Play(calibration_spill)(strategy)
+        StrategyHarness(calibration_spill).run(strategy)
         evaluation = Evaluation({"theta": strategy.theta}, [ScoredPour("cup", p) for p in measured()], 1)
-        Play(calibration_spill)(evaluation)
+        StrategyHarness(calibration_spill).run(evaluation)
         return evaluation.discrepancy("theta", "train")
 
     of_each = (("C2", "samples"), ("C3", "iterations"))
@@ -140,7 +141,7 @@ def test_a_theta_that_was_lucky_on_the_one_pour_that_it_made_is_not_chosen(name)
         return Simulated(outcome_of(0.0, retained=1.0))
 
     strategy = make(name)
-    Play(calibration_spill, answer=sticky)(strategy)
+    StrategyHarness(calibration_spill, answer=sticky).run(strategy)
     assert strategy.theta.cohesion < 0.06
     assert strategy.result().undefined > 0
 
@@ -151,4 +152,4 @@ def test_simulations_that_all_fail_end_with_a_reason(name):
         return Failed("simulation", "leaked") if isinstance(request, Simulate) else None
 
     with pytest.raises(LearningError, match="gave no discrepancy"):
-        Play(calibration_spill, answer=hopeless)(make(name))
+        StrategyHarness(calibration_spill, answer=hopeless).run(make(name))

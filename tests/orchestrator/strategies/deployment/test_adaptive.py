@@ -20,10 +20,11 @@ from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.learnt import Deployed
 from orchestrator.strategies.deployment.play import displacement, play_of
 from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.liquid import SimulationParameters
 from sim_engine.space import Axis, Space
 from tests.orchestrator import plans
-from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
 
 
@@ -55,7 +56,7 @@ def believed(strategy: Hybrid) -> Believed:
 @pytest.mark.parametrize("per_pour", [1, "free"])
 def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(per_pour: Any) -> None:
     strategy = adaptive(pours=3, per_pour=per_pour)
-    Play(narrow_cup_biased, narrow_cup, beside=2)(strategy)
+    StrategyHarness(narrow_cup_biased, narrow_cup, beside=2).run(strategy)
     after = [text for text in said(strategy) if text.startswith("after pour")]
     assert [text.split(" the simulator ")[0] for text in after] == ["after pour 1", "after pour 2", "after pour 3"]
     assert "that it says nothing of this bench" in after[-1]
@@ -67,7 +68,7 @@ def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(per_pou
 
 def test_every_pour_is_announced_with_the_band_that_its_row_has() -> None:
     strategy = adaptive(pours=2)
-    Play(narrow_cup)(strategy)
+    StrategyHarness(narrow_cup).run(strategy)
     announced = [
         decision for decision in strategy.decisions if "  predicted " in decision.text and "/2 " in decision.text
     ]
@@ -79,14 +80,14 @@ def test_every_pour_is_announced_with_the_band_that_its_row_has() -> None:
 
 def test_a_result_with_what_was_said_survives_its_file() -> None:
     strategy = adaptive(pours=2)
-    Play(narrow_cup)(strategy)
+    StrategyHarness(narrow_cup).run(strategy)
     result = strategy.result()
     assert Learnt.KINDS[result.kind].model_validate_json(result.model_dump_json()) == result
 
 
 def test_a_simulator_that_says_nothing_of_the_bench_is_found_out_and_gone_on_without() -> None:
     strategy = adaptive(2, pours=6, ignorance=IgnoranceSettings(limit=0.7))
-    Play(upside_down, narrow_cup)(strategy)
+    StrategyHarness(upside_down, narrow_cup).run(strategy)
     trust = believed(strategy)
     assert trust.alarm
     assert trust.followed == "go on"
@@ -96,7 +97,7 @@ def test_a_simulator_that_says_nothing_of_the_bench_is_found_out_and_gone_on_wit
 
 def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
     strategy = adaptive(pours=6, ignorance=IgnoranceSettings(limit=0.7, policy="stop"))
-    Play(upside_down, narrow_cup)(strategy)
+    StrategyHarness(upside_down, narrow_cup).run(strategy)
     result = strategy.result()
     assert len(losses(strategy)) < 6
     assert result.ended is not None
@@ -107,7 +108,9 @@ def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
 @pytest.mark.parametrize("answer", ["go on", "stop"])
 def test_by_its_policy_it_asks_a_person(answer: str) -> None:
     strategy = adaptive(pours=6, ignorance=IgnoranceSettings(limit=0.7, policy="ask"))
-    play = Play(upside_down, narrow_cup, answer=lambda r: Answered(answer) if isinstance(r, Ask) else None)(strategy)
+    play = StrategyHarness(
+        upside_down, narrow_cup, answer=lambda r: Answered(answer) if isinstance(r, Ask) else None
+    ).run(strategy)
     asked = [request for request in play.asked if isinstance(request, Ask)]
     assert len(asked) == 1
     assert asked[0].options == ("go on", "stop")
@@ -117,20 +120,20 @@ def test_by_its_policy_it_asks_a_person(answer: str) -> None:
 
 def test_it_ends_when_no_further_pour_is_worth_it_and_says_how_many_were_saved() -> None:
     strategy = adaptive(pours=12, stop=StopSettings(gain_below=0.01))
-    Play(narrow_cup)(strategy)
+    StrategyHarness(narrow_cup).run(strategy)
     made = len(losses(strategy))
     assert made < 12
     assert min(losses(strategy)) < 0.05
     assert any(f"{12 - made} pours saved" in text for text in said(strategy))
     assert strategy.progress().pours == strategy.progress().of_pours == made
     without = adaptive(pours=12)
-    Play(narrow_cup)(without)
+    StrategyHarness(narrow_cup).run(without)
     assert len(losses(without)) == 12
 
 
 def test_good_enough_is_the_end() -> None:
     strategy = adaptive(pours=12, good_enough=0.06)
-    Play(narrow_cup)(strategy)
+    StrategyHarness(narrow_cup).run(strategy)
     ended = strategy.result().ended
     assert ended is not None
     assert ended.startswith("good enough")
@@ -142,7 +145,7 @@ def test_good_enough_is_the_end() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> None:
     strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05, otherwise="stop"))
-    Play(narrow_cup_biased, narrow_cup)(strategy)
+    StrategyHarness(narrow_cup_biased, narrow_cup).run(strategy)
     found = losses(strategy)
     good = next(i for i, loss in enumerate(found) if loss <= 0.15)
     assert max(found[good:]) <= 0.15
@@ -150,7 +153,7 @@ def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> No
 
 @pytest.mark.parametrize("limit", [None, RiskLimitSettings()])
 def test_with_a_limit_pours_are_made_for_what_they_tell_once_one_has_kept_it(limit: Any) -> None:
-    play = Play(narrow_cup)(adaptive(pours=3, risk_limit=limit))
+    play = StrategyHarness(narrow_cup).run(adaptive(pours=3, risk_limit=limit))
     asked = [one.problem.mismatch for one in play.asked if isinstance(one, Suggest) and one.purpose == "pour"]
     problems = [one for one in asked if one is not None]
     assert [one.looks_ahead for one in problems] == [limit is None or one.limit is not None for one in problems]
@@ -161,7 +164,7 @@ def test_with_a_limit_pours_are_made_for_what_they_tell_once_one_has_kept_it(lim
 def test_a_limit_that_can_not_be_kept_is_said_before_the_pour(otherwise: Any) -> None:
     limit = RiskLimitSettings(loss=0.02, probability=0.001, otherwise=otherwise)
     strategy = adaptive(pours=6, risk_limit=limit)
-    Play(narrow_cup, lambda a, t, r: 0.0)(strategy)  # good once, and too noisy to promise it again
+    StrategyHarness(narrow_cup, lambda a, t, r: 0.0).run(strategy)  # good once, and too noisy to promise it again
     told = [text for text in said(strategy) if "no action is known to keep the limit" in text]
     assert told
     assert (len(losses(strategy)) == 6) == (otherwise == "go on")
@@ -210,14 +213,14 @@ def test_a_displacement_is_where_the_simulator_does_what_the_bench_does() -> Non
 def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
     plan = deployment_plan(model="adaptive", trust=None, pours=4, per_pour=1)
     first = adaptive(pours=4)
-    Play(narrow_cup_biased, narrow_cup)(first)
+    StrategyHarness(narrow_cup_biased, narrow_cup).run(first)
     learnt = first.result()
     assert isinstance(learnt, Deployed)
     again = Deployed.model_validate_json(learnt.model_dump_json())
     told = with_bench(plan, {DEPLOYMENT + "first": again}, THETA)
     assert len(told.bench) == 64
     second = Hybrid(told, SCENE, THETA, 2)
-    played = Play(narrow_cup_biased, narrow_cup)(second)
+    played = StrategyHarness(narrow_cup_biased, narrow_cup).run(second)
     pour = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
     assert pour.mismatch is not None
     assert pour.mismatch.drawn == told.bench

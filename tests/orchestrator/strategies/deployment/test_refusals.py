@@ -16,10 +16,11 @@ from orchestrator.strategies.deployment.base import MAX_REFUSED
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.vessel.build import build_vessel
-from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, unit
+from tests.orchestrator.plans import deployment_plan, unit
 from tests.orchestrator.toys import narrow_cup
 
 STRATEGIES: dict[str, Any] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
@@ -39,14 +40,14 @@ def touching(action: Action, theta: SimulationParameters, rng: np.random.Generat
     return narrow_cup(action, theta, rng)
 
 
-def questions(played: Play) -> list[Any]:
+def questions(played: StrategyHarness) -> list[Any]:
     return [request.problem for request in played.asked if isinstance(request, Suggest)]
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_a_refusal_has_no_cost_takes_no_budget_and_its_place_is_told(name: str) -> None:
     strategy = make(name, 1, pours=5, prior_simulations=12, iterations=8)
-    played = Play(touching)(strategy)
+    played = StrategyHarness(touching).run(strategy)
     result = strategy.result()
     refused = [unit(r.action) for r, o in played.told if isinstance(o, Failed) and not isinstance(r, Suggest)]
     assert refused
@@ -76,7 +77,7 @@ def test_what_only_the_arm_refuses_is_learnt_though_simulations_go_well_there() 
     refused = []
     for seed in range(2):
         strategy = make("D3", seed, pours=4, prior_simulations=10, per_pour=1)
-        played = Play(narrow_cup, answer=out_of_reach)(strategy)
+        played = StrategyHarness(narrow_cup, answer=out_of_reach).run(strategy)
         assert len(played.real_spills) == 4
         assert not questions(played)[-1].infeasible
         assert strategy.best_values["x_offset"] >= NEAREST
@@ -93,7 +94,7 @@ def test_a_plan_that_the_arm_refuses_is_replaced_by_the_next_best_one() -> None:
         return Failed("invalid_action", "the arm can't reach")
 
     refused, strategy = 0, make("D1", 2, pours=1, iterations=8)
-    played = Play(narrow_cup, answer=refused_twice)(strategy)
+    played = StrategyHarness(narrow_cup, answer=refused_twice).run(strategy)
     assert [row.status for row in strategy.result().pours] == ["refused", "refused", "weighed"]
     assert len({pour.action for pour in played.pours}) == 3
     assert strategy.best_values == {
@@ -107,7 +108,7 @@ def test_where_nothing_can_be_made_it_ends(name: str) -> None:
         raise ValueError("cups touch")
 
     strategy = make(name, pours=2, prior_simulations=5, iterations=4)
-    played = Play(never)(strategy)
+    played = StrategyHarness(never).run(strategy)
     assert strategy.finished
     assert strategy.best_values is None
     assert len(played.pours) <= MAX_REFUSED
@@ -128,7 +129,7 @@ def test_real_vessels_that_touch_are_learnt_in_a_few_refusals() -> None:
     refusals = []
     for seed in range(2):
         strategy = RealOnly(spaces, scene, THETA, seed)
-        played = Play(spill)(strategy)
+        played = StrategyHarness(spill).run(strategy)
         refusals.append(strategy.result().refused_pours)
         assert len(played.real_spills) == 8
     assert 0 < sum(refusals) <= 16  # type: ignore[operator]

@@ -18,13 +18,14 @@ from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.risk import Disturbances, RiskSettings
 from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed, replay
 from sim_engine.action import DEG
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import Loss
 from sim_engine.space import Axis, Space
 from sim_engine.task import PoseError
 from tests.orchestrator import plans
-from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, executed, replay
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toys import quiet_valleys, two_valleys
 
 ERRORS = PoseError(x=8e-3, speed_factor=0.03)
@@ -49,18 +50,18 @@ def true_losses(values: dict[str, float], count: int = 4000) -> np.ndarray:
 
 def test_under_errors_the_broad_valley_is_chosen_and_without_them_the_narrow_one() -> None:
     plain = OneShotPlanning(deployment_plan(strategy="D1", pours=0, iterations=18, initial=6), SCENE, THETA, 2)
-    Play(two_valleys)(plain)
+    StrategyHarness(two_valleys).run(plain)
     assert abs(place(plain) - 0.25) < 0.06
     for risk in (plans.risk("expected", pose_error=ERRORS), plans.risk("cvar", 0.9, ERRORS)):
         strategy = risky(2, risk=risk)
-        Play(two_valleys)(strategy)
+        StrategyHarness(two_valleys).run(strategy)
         assert abs(place(strategy) - 0.7) < 0.1, risk.measure
 
 
 @pytest.mark.parametrize("level", [0.0, 0.8])
 def test_what_is_promised_under_errors_is_what_comes(level: float) -> None:
     strategy = risky(1, risk=plans.risk("cvar" if level else "expected", level or 0.9, ERRORS))
-    Play(two_valleys)(strategy)
+    StrategyHarness(two_valleys).run(strategy)
     result: Any = strategy.result()
     losses = np.sort(true_losses(result.recommended.action_si))
     assert result.risk.expected == pytest.approx(losses.mean(), abs=0.04)
@@ -71,7 +72,7 @@ def test_what_is_promised_under_errors_is_what_comes(level: float) -> None:
 
 
 def test_each_action_is_simulated_as_planned_and_under_errors_within_the_budget() -> None:
-    played = Play(two_valleys, slots=3)(risky(iterations=6, simulations_per_iteration=4))
+    played = StrategyHarness(two_valleys, slots=3).run(risky(iterations=6, simulations_per_iteration=4))
     assert len(played.simulations) == 24
     by_action: dict[Any, list[Simulate]] = {}
     for request in played.simulations:
@@ -85,14 +86,16 @@ def test_each_action_is_simulated_as_planned_and_under_errors_within_the_budget(
 
 
 def test_all_actions_are_compared_under_the_same_errors() -> None:
-    played = Play(two_valleys)(risky(iterations=6))
+    played = StrategyHarness(two_valleys).run(risky(iterations=6))
     asked = {r.problem.risk for r in played.asked if isinstance(r, Suggest) and r.problem.risk is not None}
     assert len(asked) == 1
 
 
 def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
-    def play(order: str = "first") -> Play:
-        return Play(two_valleys, order=order, slots=3)(risky(3, iterations=6, pours=1, window=plans.window(0.3)))
+    def play(order: str = "first") -> StrategyHarness:
+        return StrategyHarness(two_valleys, order=order, slots=3).run(
+            risky(3, iterations=6, pours=1, window=plans.window(0.3))
+        )
 
     first = play()
     assert first.pours
@@ -106,7 +109,7 @@ def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
 
 
 def test_the_pour_is_predicted_with_the_spread_of_the_errors() -> None:
-    played = Play(two_valleys)(risky(1, pours=1))
+    played = StrategyHarness(two_valleys).run(risky(1, pours=1))
     (pour,) = played.pours
     assert pour.predicted is not None
     assert pour.predicted.scatter is not None
@@ -129,7 +132,7 @@ def touching_below(limit: float) -> Any:
 def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_planned_no_action() -> None:
     """Without errors the best place is right at the contact; with them well away from it."""
     strategy = risky(0, iterations=14)
-    played = Play(touching_below(0.1))(strategy)
+    played = StrategyHarness(touching_below(0.1)).run(strategy)
     assert strategy.best_values is not None
     assert strategy.best_values["x_offset"] > 0.1 + 0.8 * ERRORS.x
     told = [(r, o) for r, o in played.told if isinstance(r, Simulate) and isinstance(o, Failed)]
@@ -137,7 +140,7 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
     costs = [c for r in played.asked if isinstance(r, Suggest) for c in r.problem.data.costs]
     assert max(costs) == 1.0
     plain = OneShotPlanning(deployment_plan(strategy="D1", pours=0, iterations=20), SCENE, THETA, 0)
-    Play(touching_below(0.1))(plain)
+    StrategyHarness(touching_below(0.1)).run(plain)
     assert plain.best_values is not None
     assert plain.best_values["x_offset"] < strategy.best_values["x_offset"]
 
@@ -145,7 +148,7 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
 @pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG, speed_factor=0.0)])
 def test_where_every_action_touches_nothing_is_recommended(errors: PoseError) -> None:
     strategy = risky(iterations=4, pours=1, window=plans.window(0.1), risk=plans.risk("expected", pose_error=errors))
-    played = Play(touching_below(1.0))(strategy)
+    played = StrategyHarness(touching_below(1.0)).run(strategy)
     assert not played.pours
     assert strategy.best_values is None
     assert "touch" in str(strategy.result().gave_up)
@@ -156,7 +159,7 @@ def test_lost_simulations_are_left_out() -> None:
         return float("nan") if rng.random() < 0.3 else two_valleys(action, theta, rng)
 
     strategy = risky(4, window=plans.window(0.5))
-    Play(flaky)(strategy)
+    StrategyHarness(flaky).run(strategy)
     assert strategy.best_values is not None
 
 
@@ -208,7 +211,7 @@ def test_thetas_of_the_calibration_before_are_borne_and_a_campaign_without_says_
     informed = with_posterior(plan, {"calibration": calibrated})
     assert 50 <= len(informed.thetas) <= 100
     strategy = risky(risk=informed.settings.risk, thetas=informed.thetas)  # type: ignore[attr-defined]
-    played = Play(spill)(strategy)
+    played = StrategyHarness(spill).run(strategy)
     assert len({request.parameters.cohesion for request in played.simulations}) > 10
     result: Any = strategy.result()
     assert result.risk.expected > true_losses(result.recommended.action_si).mean() + 0.1  # mean cohesion costs 0.2
@@ -227,7 +230,7 @@ def test_a_prediction_bears_the_errors_and_counts_cups_that_touch_as_the_worst()
             raise ValueError("cups touch")
         return float(100.0 * (executed_action.x_offset - 0.109))
 
-    played = Play(spill)(strategy)
+    played = StrategyHarness(spill).run(strategy)
     assert [request.pose_error for request in played.simulations] == errors
     result: Any = strategy.result()
     assert (result.touching, result.simulations_lost) == (1, 0)

@@ -23,8 +23,8 @@ from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.progress import Progress
+from orchestrator.strategy_harness import THETA, StrategyHarness
 from sim_engine.action import DEG
-from tests.orchestrator.play import THETA, Play
 from tests.orchestrator.toy import ToyLaboratory, run_toy
 from tests.orchestrator.toys import narrow_cup
 
@@ -95,7 +95,7 @@ def strategy(plan: DeploymentPlan) -> Any:
     return {"D2": RealOnly, "D3": Hybrid}[plan.strategy](plan, plan.scenes[0], THETA, 1)
 
 
-def questions(played: Play) -> list[SuggestProblem]:
+def questions(played: StrategyHarness) -> list[SuggestProblem]:
     return [request.problem for request in played.asked if isinstance(request, Suggest)]
 
 
@@ -105,7 +105,7 @@ def test_a_run_goes_on_from_the_pours_of_a_former_one_and_pours_its_own_budget(t
     assert plan.data is not None
     (former,) = plan.data.pours.values()
     assert len(former) == 5
-    played = Play(narrow_cup)(strategy(plan))
+    played = StrategyHarness(narrow_cup).run(strategy(plan))
     assert len(played.pours) == 5
     assert [len(problem.data) for problem in questions(played)] == [5, 6, 7, 8, 9, 10], "no drawn action to begin with"
     made = {pour.action for pour in former}
@@ -117,9 +117,9 @@ def test_a_run_goes_on_from_the_pours_of_a_former_one_and_pours_its_own_budget(t
 def test_former_pours_count_only_where_it_is_said(tmp_path: Path) -> None:
     run(tmp_path, CAMPAIGN)
     some = WITH_RUN.replace("pours: 5", "pours: 7").replace("former}", "former, counts: true}")
-    assert len(Play(narrow_cup)(strategy(deployment(tmp_path, some))).pours) == 2
+    assert len(StrategyHarness(narrow_cup).run(strategy(deployment(tmp_path, some))).pours) == 2
     none = strategy(deployment(tmp_path, some.replace("pours: 7", "pours: 3")))
-    assert Play(narrow_cup)(none).pours == []
+    assert StrategyHarness(narrow_cup).run(none).pours == []
     assert none.best_values is not None, "something was known all the same"
     assert none.progress() == Progress(pours=3, of_pours=3)
 
@@ -128,7 +128,7 @@ def test_a_hybrid_pours_first_where_the_former_pours_and_the_simulations_say(tmp
     (tmp_path / "pours.csv").write_text(CSV)
     text = CAMPAIGN.replace("D2", "D3") + "  prior_simulations: 6\n  data: {from: pours.csv}\n"
     hybrid = strategy(deployment(tmp_path, text))
-    played = Play(narrow_cup)(hybrid)
+    played = StrategyHarness(narrow_cup).run(hybrid)
     first = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
     assert (len(first.data), len(first.simulated), first.acquisition) == (3, 6, "least_loss")
     assert hybrid.result().former_pours == 3
@@ -138,7 +138,7 @@ def test_planning_with_the_same_campaign_learns_from_no_pour(tmp_path: Path) -> 
     (tmp_path / "pours.csv").write_text(CSV)
     plan = deployment(tmp_path, CAMPAIGN + "  data: {from: pours.csv, counts: true}\n")
     planner = OneShotPlanning(dataclasses.replace(plan, settings=D1Settings()), plan.scenes[0], THETA, 1)
-    played = Play(narrow_cup)(planner)
+    played = StrategyHarness(narrow_cup).run(planner)
     assert len(played.pours) == 1
     assert planner.result().former_pours == 0
     assert not any("former" in decision.text for decision in planner.decisions)

@@ -12,9 +12,10 @@ from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, replay
 from sim_engine.losses import Loss
 from sim_engine.outcome import PourMeasurement
-from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, replay
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
 
 STRATEGIES = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
@@ -36,7 +37,7 @@ def quiet_spill(values):
 def test_a_campaign_stays_in_its_box_keeps_its_budget_and_reports_json(name):
     strategy = make(name, pours=5)
     assert isinstance(strategy, Strategy)
-    played = Play(narrow_cup)(strategy)
+    played = StrategyHarness(narrow_cup).run(strategy)
     assert len(played.pours) == (1 if name == "D1" else 5)
     assert len(played.simulations) == {"D1": 30, "D2": 0, "D3": 20}[name]
     for request in (*played.pours, *played.simulations):
@@ -54,7 +55,9 @@ def test_a_campaign_stays_in_its_box_keeps_its_budget_and_reports_json(name):
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_same_seed_same_requests_and_a_replay_repeats_them(name):
     def campaign(order="first", seed=3):
-        return Play(narrow_cup, narrow_cup_biased, order=order, slots=3)(make(name, seed, pours=3, per_pour=2))
+        return StrategyHarness(narrow_cup, narrow_cup_biased, order=order, slots=3).run(
+            make(name, seed, pours=3, per_pour=2)
+        )
 
     first = campaign()
     assert campaign().asked == first.asked
@@ -66,7 +69,7 @@ def test_same_seed_same_requests_and_a_replay_repeats_them(name):
 
 def test_with_a_right_simulator_the_first_pours_of_d3_spill_less_than_those_of_d2():
     first = {
-        name: np.mean([Play(narrow_cup)(make(name, seed, pours=3)).real_spills for seed in range(4)])
+        name: np.mean([StrategyHarness(narrow_cup).run(make(name, seed, pours=3)).real_spills for seed in range(4)])
         for name in ("D2", "D3")
     }
     assert first["D3"] < 0.5 * first["D2"]
@@ -75,7 +78,7 @@ def test_with_a_right_simulator_the_first_pours_of_d3_spill_less_than_those_of_d
 def test_pours_improve_on_a_simulator_that_is_somewhat_wrong():
     firsts, bests = [], []
     for seed in range(3):
-        spills = Play(narrow_cup_biased, narrow_cup)(make("D3", seed, pours=8)).real_spills
+        spills = StrategyHarness(narrow_cup_biased, narrow_cup).run(make("D3", seed, pours=8)).real_spills
         firsts.append(spills[0])
         bests.append(min(spills))
     assert np.mean(bests) < 0.5 * np.mean(firsts)
@@ -85,7 +88,7 @@ def test_d1_recommends_an_action_that_spills_little_and_needs_no_pour():
     values = []
     for seed in range(3):
         strategy = make("D1", seed, pours=0)
-        assert Play(narrow_cup)(strategy).pours == []
+        assert StrategyHarness(narrow_cup).run(strategy).pours == []
         values.append(quiet_spill(strategy.best_values))
         result = strategy.result()
         assert abs(result.recommended.predicted_loss - values[-1]) < 0.1
@@ -94,7 +97,7 @@ def test_d1_recommends_an_action_that_spills_little_and_needs_no_pour():
 
 
 def test_d1_averages_its_simulations_of_an_action():
-    played = Play(narrow_cup)(make("D1", iterations=6, simulations_per_iteration=3))
+    played = StrategyHarness(narrow_cup).run(make("D1", iterations=6, simulations_per_iteration=3))
     actions = [r.action for r in played.simulations]
     assert len(actions) == 18
     assert len(set(actions)) == 6
@@ -103,7 +106,7 @@ def test_d1_averages_its_simulations_of_an_action():
 
 def test_d1_predicts_the_spillage_of_its_action_whatever_it_minimised():
     strategy = make("D1", pours=0, loss=Loss("grams"))
-    told = Play(lambda *pour: 0.1 + 0.5 * narrow_cup(*pour))(strategy).told
+    told = StrategyHarness(lambda *pour: 0.1 + 0.5 * narrow_cup(*pour)).run(strategy).told
     result = strategy.result()
     chosen = SCENE.action(result.recommended.action_si)
     simulated = [o.outcome.fractions for r, o in told if isinstance(r, Simulate) and r.action == chosen]
@@ -116,7 +119,9 @@ def test_d1_predicts_the_spillage_of_its_action_whatever_it_minimised():
 def test_a_zero_mean_pours_worse_than_a_constant_one():
     # to a zero mean everything unexplored is perfect, so that it tries the corners of the plateau one by one
     spills = {
-        mean: np.mean([Play(narrow_cup)(make("D2", s, pours=15, mean=mean)).real_spills[6:] for s in range(8)])
+        mean: np.mean(
+            [StrategyHarness(narrow_cup).run(make("D2", s, pours=15, mean=mean)).real_spills[6:] for s in range(8)]
+        )
         for mean in ("constant", "zero")
     }
     assert spills["constant"] < spills["zero"]
@@ -124,7 +129,7 @@ def test_a_zero_mean_pours_worse_than_a_constant_one():
 
 def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
     strategy = make("D3", pours=4, per_pour=2)
-    played = Play(narrow_cup, slots=2)(strategy)
+    played = StrategyHarness(narrow_cup, slots=2).run(strategy)
     assert [r.purpose for r in played.simulations] == ["prior"] * 20 + ["refine"] * 8
     pour = next(i for i, r in enumerate(played.asked) if isinstance(r, Pour))
     assert [type(r) for r in played.asked[pour : pour + 3]] == [Pour, Simulate, Simulate]
@@ -135,7 +140,7 @@ def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
 
 def test_d3_simulates_freely_while_a_pour_is_under_way():
     strategy = make("D3", pours=3, per_pour="free")
-    played = Play(narrow_cup, slots=2, beside=9)(strategy)
+    played = StrategyHarness(narrow_cup, slots=2, beside=9).run(strategy)
     assert len(played.pours) == 3
     assert sum(r.purpose == "refine" for r in played.simulations) > 8
     questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour"]
@@ -147,7 +152,7 @@ def test_failed_simulations_and_pours_never_poison_a_fit():
         return math.nan if rng.random() < 0.3 else narrow_cup(action, theta, rng)
 
     for name in STRATEGIES:
-        played = Play(flaky)(make(name, 2, pours=6))
+        played = StrategyHarness(flaky).run(make(name, 2, pours=6))
         costs = [c for r in played.asked if isinstance(r, Suggest) for c in r.problem.data.costs]
         assert all(math.isfinite(c) and c <= 1.0 for c in costs)
 
@@ -159,7 +164,7 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
         return Failed("pour_failed", "the operator knocked the cup over") if lost else None
 
     strategy = make("D2", pours=4, on_failed_pour=policy)
-    played = Play(narrow_cup, answer=second_fails)(strategy)
+    played = StrategyHarness(narrow_cup, answer=second_fails).run(strategy)
     assert [r.number for r in played.pours] == [1, 2, 3, 4]
     final = [r for r in played.asked if isinstance(r, Suggest)][-1].problem
     assert len(final.data) == (4 if entered else 3)
@@ -183,7 +188,7 @@ def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_pape
         return {2: Failed("pour_failed", "cups touch after all"), 3: Poured(nothing)}.get(number)
 
     strategy = make(name, pours=5, **changes)
-    played = Play(narrow_cup, answer=second_touches_third_is_not_weighed)(strategy)
+    played = StrategyHarness(narrow_cup, answer=second_touches_third_is_not_weighed).run(strategy)
     assert [pour.status for pour in strategy.result().pours].count("failed") == 2
     second = ACTIONS.encode(played.pours[1].action.values())
     last = [request for request in played.asked if isinstance(request, Suggest)][-1].problem
@@ -197,13 +202,13 @@ def test_touching_vessels_are_avoided_and_cost_no_pour():
         return narrow_cup(action, theta, rng)
 
     strategy = make("D2", 1, pours=8)
-    played = Play(touches_when_near)(strategy)
+    played = StrategyHarness(touches_when_near).run(strategy)
     result = strategy.result()
     assert result.refused_pours > 0
     assert len(played.real_spills) == 8
     assert [r.number for r in result.pours if r.status == "weighed"] == list(range(1, 9))
     hybrid = make("D3", 1, pours=4, model="scaled")
-    Play(touches_when_near)(hybrid)
+    StrategyHarness(touches_when_near).run(hybrid)
     assert hybrid.result().refused_pours <= 1  # simulations have told most of it
     assert hybrid.best_values["x_offset"] >= 0.10
 
@@ -213,7 +218,7 @@ def test_a_space_without_a_possible_action_ends_with_an_explanation():
         raise ValueError("cups touch")
 
     strategy = make("D2", pours=3)
-    played = Play(never)(strategy)
+    played = StrategyHarness(never).run(strategy)
     assert len(played.pours) == MAX_REFUSED
     assert "refused as invalid" in strategy.result().gave_up
 
@@ -223,8 +228,8 @@ def test_a_simulator_that_is_wrong_raises_the_alarm_and_a_right_one_does_not():
         return 1.0 - narrow_cup(action, theta, rng)
 
     wrong, right = make("D3", 1, pours=5), make("D3", 1, pours=5)
-    Play(upside_down, narrow_cup)(wrong)
-    Play(narrow_cup)(right)
+    StrategyHarness(upside_down, narrow_cup).run(wrong)
+    StrategyHarness(narrow_cup).run(right)
     assert wrong.result().trust.alarm
     assert not right.result().trust.alarm
 

@@ -21,12 +21,13 @@ from orchestrator.strategies.calibration.design import DesignedPours
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
 from sim_engine.action import DEG, Action
 from sim_engine.liquid import SimulationParameters
 from sim_engine.losses import normalised_spillage
 from sim_engine.outcome import PourMeasurement
 from sim_engine.space import Axis, Space
-from tests.orchestrator.play import SCENE, THETA, Play, calibration_plan, deployment_plan, outcome_of, replay
+from tests.orchestrator.plans import calibration_plan, deployment_plan
 from tests.orchestrator.strategies.test_strategies_properties import Shuffled
 
 ACTIONS = (
@@ -103,7 +104,7 @@ def _touches(action: Action) -> bool:
 @cache
 def measured(dimension: int) -> tuple[MeasuredPour, ...]:
     design = DesignedPours((SCENE,), Space(ACTIONS[:dimension]), 6, 1, 0)
-    Play(spill)(design)
+    StrategyHarness(spill).run(design)
     return design.measured
 
 
@@ -129,11 +130,13 @@ def make(name: str, dimension: int) -> Any:
     return KINDS[name](calibration, measured(dimension), 5)
 
 
-def played(name: str, dimension: int, play: Callable[..., Play] = Play, **options: Any) -> Play:
-    return play(spill, answer=bad_luck, slots=3, **options)(make(name, dimension))
+def played(
+    name: str, dimension: int, play: Callable[..., StrategyHarness] = StrategyHarness, **options: Any
+) -> StrategyHarness:
+    return play(spill, answer=bad_luck, slots=3, **options).run(make(name, dimension))
 
 
-def questions(play: Play) -> list[Any]:
+def questions(play: StrategyHarness) -> list[Any]:
     return [request.problem for request in play.asked if isinstance(request, Suggest)]
 
 
@@ -165,7 +168,7 @@ def test_proposals_keep_to_the_box_and_fits_see_only_what_was_measured(name: str
         assert refused <= 14
 
 
-def _costs(name: str, play: Play) -> list[float]:
+def _costs(name: str, play: StrategyHarness) -> list[float]:
     """Losses that may enter a fit: of what went well, and the worst for pours that failed."""
     known = [1.0]
     waiting: dict[Any, list[float]] = {}

@@ -21,8 +21,9 @@ from orchestrator.strategies.deployment.d3_free import MOST_SIMULATIONS, FreeHyb
 from orchestrator.strategies.deployment.prices import Prices, PricesSettings
 from orchestrator.strategies.deployment.thinning import thinned
 from orchestrator.strategies.deployment.trust import TrustSettings
+from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from tests.orchestrator.killed import die_at, finished_times
-from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.test_stages import campaign, laboratory
 from tests.orchestrator.toy import SCENE as TOY_SCENE
 from tests.orchestrator.toy import logical_record, run_toy
@@ -55,9 +56,11 @@ class Log:
         return getattr(self.strategy, name)
 
 
-def played(strategy: FreeHybrid, simulated: Any = narrow_cup, real: Any = None, **arguments: Any) -> tuple[Play, Log]:
+def played(
+    strategy: FreeHybrid, simulated: Any = narrow_cup, real: Any = None, **arguments: Any
+) -> tuple[StrategyHarness, Log]:
     log = Log(strategy)
-    return Play(simulated, real, **{"beside": 40, **arguments})(log), log
+    return StrategyHarness(simulated, real, **{"beside": 40, **arguments}).run(log), log
 
 
 # -- what is worth it ------------------------------------------------------------------------------------------------
@@ -132,8 +135,10 @@ def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_p
 
     strategy = free(pours=4, trust=TrustSettings(policy="ask"))
     log = Log(strategy)
-    play = Play(wrong, narrow_cup, beside=10, answer=lambda r: Answered("widen") if isinstance(r, Ask) else None)
-    play(log)
+    play = StrategyHarness(
+        wrong, narrow_cup, beside=10, answer=lambda r: Answered("widen") if isinstance(r, Ask) else None
+    )
+    play.run(log)
     assert [r.number for r in play.pours] == [1, 2, 3, 4]
     assert sum(isinstance(r, Ask) for r in play.asked) == 1
     assert strategy.result().trust.followed == "widen"

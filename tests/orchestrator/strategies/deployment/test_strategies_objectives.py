@@ -31,13 +31,14 @@ from orchestrator.strategies.deployment.objectives import (
     Time,
     duration,
 )
+from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
 from sim_engine.action import DEG, Action
 from sim_engine.losses import Loss
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import Fractions, PourMeasurement
 from sim_engine.space import Axis, Space
 from sim_engine.vessel.build import build_vessel
-from tests.orchestrator.play import SCENE, THETA, Play, deployment_plan, outcome_of, replay
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toy import toy_plan
 
 STRATEGIES = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
@@ -94,8 +95,8 @@ def make(name: str, parts: tuple[Objective, ...], seed: int = 0, *, pareto: bool
     return STRATEGIES[name](plan, SCENE, THETA, seed)
 
 
-def play(strategy: Any, **options: Any) -> Play:
-    return Play(lambda *_: 0.0, answer=answers, **options)(strategy)
+def play(strategy: Any, **options: Any) -> StrategyHarness:
+    return StrategyHarness(lambda *_: 0.0, answer=answers, **options).run(strategy)
 
 
 def delivered(fractions: Fractions) -> float:

@@ -19,11 +19,12 @@ from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.pours import PourTrial
 from orchestrator.strategies.deployment.trust import TrustCheck, TrustSettings
+from orchestrator.strategy_harness import SCENE as PLAYED
+from orchestrator.strategy_harness import THETA, StrategyHarness
 from orchestrator.unknown import OperatorNeededError
 from sim_engine.losses import Loss
 from tests.orchestrator import plans
-from tests.orchestrator.play import SCENE as PLAYED
-from tests.orchestrator.play import THETA, Play, deployment_plan
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.reported import is_picture
 from tests.orchestrator.test_stages import laboratory
 from tests.orchestrator.toy import SCENE, SPACE, ToyLaboratory, answering, run_toy, toy_plan
@@ -93,7 +94,7 @@ def test_an_error_that_nobody_cares_about_raises_no_alarm() -> None:
 
 def test_a_wrong_simulator_is_forgotten_from_the_alarm_on() -> None:
     strategy = hybrid(pours=6, per_pour=2)
-    played = Play(upside_down, narrow_cup)(strategy)
+    played = StrategyHarness(upside_down, narrow_cup).run(strategy)
     questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose in ("pour", "conclude")]
     assert [len(q.simulated) > 0 for q in questions] == [True] * 3 + [False] * 4
     assert [q.mean for q in questions[3:]] == ["constant"] * 4
@@ -114,7 +115,7 @@ def pessimistic(action: Any, theta: Any, rng: Any) -> float:
 
 def test_a_simulator_that_promised_too_little_is_not_forgotten_and_people_are_told() -> None:
     strategy = hybrid(pours=6, per_pour=2, model="scaled")
-    played = Play(pessimistic, narrow_cup)(strategy)
+    played = StrategyHarness(pessimistic, narrow_cup).run(strategy)
     trust = strategy.result().trust
     assert np.mean(np.abs(trust.z_scores)) > 2.5
     assert (trust.alarm, trust.followed) == (False, None)
@@ -133,14 +134,14 @@ def test_one_pour_that_is_better_does_not_excuse_those_that_are_worse() -> None:
 
 
 def test_a_wrong_simulator_is_believed_less_where_the_policy_is_to_widen() -> None:
-    played = Play(upside_down, narrow_cup)(hybrid(policy="widen", pours=4))
+    played = StrategyHarness(upside_down, narrow_cup).run(hybrid(policy="widen", pours=4))
     last = [r.problem for r in played.asked if isinstance(r, Suggest)][-1]
     assert (last.mean, last.widening, len(last.simulated)) == ("pooled", 3.0, 20)
 
 
 def test_a_right_simulator_is_used_to_the_end() -> None:
     strategy = hybrid(pours=5, model="scaled")
-    played = Play(narrow_cup)(strategy)
+    played = StrategyHarness(narrow_cup).run(strategy)
     last = [r.problem for r in played.asked if isinstance(r, Suggest)][-1]
     assert last.mean == "scaled"
     assert not [d for d in strategy.decisions if d.urgent]
@@ -152,7 +153,7 @@ def test_on_a_wrong_simulator_d3_ends_no_worse_than_d2_and_on_a_right_one_it_is_
     seeds = range(10)
 
     def ends(strategy: Any, simulated: Any = narrow_cup) -> float:
-        Play(simulated, narrow_cup)(strategy)
+        StrategyHarness(simulated, narrow_cup).run(strategy)
         return without_noise(strategy.best_values)
 
     plan = deployment_plan(strategy="D2", pours=15)
@@ -161,9 +162,13 @@ def test_on_a_wrong_simulator_d3_ends_no_worse_than_d2_and_on_a_right_one_it_is_
         wrong = np.array([ends(hybrid(seed, pours=15, model=model), upside_down) for seed in seeds])
         # 1 % of the load is what a simulator may be wrong by: less is not a difference
         assert wrong.mean() - real.mean() < 0.01 + 2 * np.hypot(real.std(), wrong.std()) / np.sqrt(len(seeds))
-        first = [np.min(Play(narrow_cup)(hybrid(seed, pours=3, model=model)).real_spills) for seed in seeds]
+        first = [
+            np.min(StrategyHarness(narrow_cup).run(hybrid(seed, pours=3, model=model)).real_spills) for seed in seeds
+        ]
         of_d2 = [
-            np.min(Play(narrow_cup)(RealOnly(plan.with_settings(pours=3), PLAYED, THETA, seed)).real_spills)
+            np.min(
+                StrategyHarness(narrow_cup).run(RealOnly(plan.with_settings(pours=3), PLAYED, THETA, seed)).real_spills
+            )
             for seed in seeds
         ]
         assert np.mean(first) < 0.5 * np.mean(of_d2)

@@ -20,11 +20,12 @@ from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d1_risk import RobustPlanning
 from orchestrator.strategies.deployment.risk import RiskSettings
 from orchestrator.strategies.deployment.window import ROUNDS, SafeWindow
+from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed
 from sim_engine.losses import Loss
 from sim_engine.task import PoseError
 from tests.orchestrator import plans, toy
 from tests.orchestrator.killed import die_at
-from tests.orchestrator.play import ACTIONS, SCENE, THETA, Play, deployment_plan, executed
+from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.reported import changed, is_picture
 from tests.orchestrator.toy import ToyLaboratory, logical_record, toy_plan
 from tests.orchestrator.toys import quiet_valleys, two_valleys
@@ -38,7 +39,7 @@ def planned(seed: int, tolerance: float, risk: RiskSettings | None = None, spill
         strategy="D1", pours=0, iterations=12, simulations_per_iteration=3, risk=risk, window=plans.window(tolerance)
     )
     strategy = (RobustPlanning if risk else OneShotPlanning)(plan, SCENE, THETA, seed)
-    Play(spill)(strategy)
+    StrategyHarness(spill).run(strategy)
     return strategy.result()
 
 
@@ -145,7 +146,7 @@ def test_cups_that_touch_are_outside() -> None:
         far = isinstance(request, Simulate) and request.purpose == "window" and request.action.x_offset > 0.135
         return Failed("invalid_action", "cups touch") if far else None
 
-    Play(two_valleys, answer=touching)(strategy)
+    StrategyHarness(two_valleys, answer=touching).run(strategy)
     window: Any = strategy.result().window
     assert window.axes["x_offset"].high <= 0.135
     touched = [check for check in window.checks if check.action_si["x_offset"] > 0.135]
@@ -156,7 +157,7 @@ def test_cups_that_touch_are_outside() -> None:
 def test_a_plan_without_a_window_asks_for_what_it_always_did() -> None:
     def asked(tolerance: float | None) -> list[Any]:
         plan = deployment_plan(strategy="D1", pours=0, iterations=6, window=plans.window(tolerance))
-        return Play(two_valleys)(OneShotPlanning(plan, SCENE, THETA, 1)).asked
+        return StrategyHarness(two_valleys).run(OneShotPlanning(plan, SCENE, THETA, 1)).asked
 
     plain, checked = asked(None), asked(0.3)
     assert checked[: len(plain)] == plain
