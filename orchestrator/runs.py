@@ -15,8 +15,10 @@ from orchestrator.catalogue.registry import register
 from orchestrator.codec import digest
 from orchestrator.fingerprint import fingerprint
 from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal_check import check_journal, has_begun
 from orchestrator.journal_file import JournalError
 from orchestrator.plan import CampaignPlan
+from orchestrator.pour_ledger import LEDGER_NAME, readable_lines
 from orchestrator.reserve import TO_BEGIN, require_space
 from orchestrator.states import State
 
@@ -91,24 +93,33 @@ def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
 
     Raises:
         RunNotFoundError: no such run, or none that is unfinished.
+        JournalDamagedError: its journal has lost or changed entries, so that resuming it could repeat pours.
     """
     parent = plan.outputs.directory
     if run_id is not None:
         directory = parent / run_id
-        if not (directory / JOURNAL_NAME).is_file():
+        if not has_begun(directory / JOURNAL_NAME):
             known = sorted(p.parent.name for p in parent.glob(f"*/{JOURNAL_NAME}"))
             raise RunNotFoundError(f"{directory}: no such run; known: {', '.join(known) or 'none'}")
-        return directory
+    else:
+        directory = _newest_unfinished(plan, parent)
+    check_journal(directory / JOURNAL_NAME).require()
+    return directory
+
+
+def _newest_unfinished(plan: CampaignPlan, parent: Path) -> Path:
     mine = digest(fingerprint(plan))
     found: list[tuple[bool, float, Path]] = []
-    for path in parent.glob(f"*/{JOURNAL_NAME}") if parent.is_dir() else ():
+    for directory in sorted(parent.iterdir()) if parent.is_dir() else ():
         try:
-            with JournalReader(path) as journal:
+            with JournalReader(directory / JOURNAL_NAME) as journal:
                 if journal.header.name == plan.name and journal.state() is not State.FINISHED:
                     same = digest(journal.header.fingerprint) == mine
-                    found.append((same, journal.header.created, path.parent))
+                    found.append((same, journal.header.created, directory))
         except JournalError:
-            continue  # another program's, or another version's: not to be resumed by us
+            # Another program's, or another version's; or a run of this campaign that is damaged, which is refused later.
+            begun = readable_lines(directory / LEDGER_NAME)[:1]
+            found += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
     if not found:
         raise RunNotFoundError(f"{parent}: no unfinished run of campaign '{plan.name}'; begin one without --resume")
     return max(found)[2]
