@@ -56,6 +56,17 @@ class JournalCheck:
     unchecked: int = 0
     begun: bool = True
 
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence without its end."""
+        if self.problems:
+            return f"damaged or incomplete: {'; '.join(self.problems)}"
+        if self.unchecked == 0:
+            return f"complete and unchanged ({self.entries} entries)"
+        if self.unchecked < self.entries:
+            return f"complete; the first {self.unchecked} of {self.entries} entries are older than the hash chain"
+        return f"not verifiable: the journal ({self.entries} entries) is of a version without a hash chain"
+
     def require(self) -> None:
         """Refuse to go on with a journal that fails the check.
 

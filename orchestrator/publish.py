@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal_check import check_journal
 from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import regimes
@@ -161,6 +162,7 @@ def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory:
         OSError: it can't be written, or a figure can't be read.
         RunError: the journal can't be read.
     """
+    check = check_journal(directory / JOURNAL_NAME)
     with JournalReader(directory / JOURNAL_NAME) as journal:
         record = read_record(journal)
     try:
@@ -168,7 +170,7 @@ def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory:
     except (OSError, ValueError):
         versions = {}
     draft = path.with_suffix(".html.part")
-    draft.write_text(run_page(plan, summary, record, directory, versions=versions), encoding="utf-8")
+    draft.write_text(run_page(plan, summary, record, directory, versions=versions, check=check), encoding="utf-8")
     draft.replace(path)
     return path
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orchestrator.commands.options import Json, Quiet, call, examples
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json, say
 
 if TYPE_CHECKING:
     from orchestrator.plan import CampaignPlan
@@ -70,7 +70,10 @@ def _report(what: Path, *, output: Path | None, pdf: bool, as_json: bool) -> Non
 
 def _nothing_there(folder: Path) -> str:
     from orchestrator.journal import JOURNAL_NAME
+    from orchestrator.journal_check import check_journal, has_begun
 
+    if has_begun(folder / JOURNAL_NAME):
+        return f"{folder}: {check_journal(folder / JOURNAL_NAME).verdict}"
     near = sorted(path.parent.name for path in folder.absolute().parent.glob(f"*/{JOURNAL_NAME}"))
     known = f"; runs there: {', '.join(near)}" if near else ""
     return (
@@ -82,10 +85,13 @@ def _nothing_there(folder: Path) -> str:
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
     from orchestrator.errors import RunError
     from orchestrator.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.journal_check import check_journal
     from orchestrator.publish import report_on
     from orchestrator.run_result import read_result
 
     plan = _plan_of(folder)
+    for problem in check_journal(folder / JOURNAL_NAME).problems:
+        say(f"warning: {problem}")
     mention("drawing the figures …")
     try:
         with JournalReader(folder / JOURNAL_NAME) as journal:

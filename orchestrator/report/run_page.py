@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from orchestrator.journal_check import JournalCheck
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.asked import what_was_asked
@@ -77,7 +78,13 @@ _FIGURES: dict[str, tuple[str, str]] = {
 
 
 def run_page(
-    plan: CampaignPlan, summary: RunSummary, record: Record, directory: Path, *, versions: Mapping[str, Any]
+    plan: CampaignPlan,
+    summary: RunSummary,
+    record: Record,
+    directory: Path,
+    *,
+    versions: Mapping[str, Any],
+    check: JournalCheck,
 ) -> str:
     """The page of a run.
 
@@ -87,6 +94,7 @@ def run_page(
         record: what its journal says was done.
         directory: its folder.
         versions: as `versions.json` has them; empty where that is missing.
+        check: of its journal; a journal that fails is reported at the top of the page.
 
     Returns:
         HTML.
@@ -106,7 +114,7 @@ def run_page(
         state=str(record.state),
         finished=record.state is State.FINISHED,
         lead=f"Begun {_date(record.created)}, last entry {ended}. Seed {plan.seed}.",
-        standing=standing(record, directory.name),
+        standing=[*_damage(check), *standing(record, directory.name)],
         advice=said,
         no_advice=[] if said else _without_advice(plan, summary, record),
         open=unknown_of_all(plan, summary, record),
@@ -123,12 +131,22 @@ def run_page(
         pours=pour_tables(plan, record, names),
         no_pours="No pour was asked for." if not record.pours else "",
         not_simulated=_not_simulated(summary, names),
-        settings=_settings(plan, summary, directory, versions),
+        settings=[*_settings(plan, summary, directory, versions), ("records", check.verdict)],
         decisions=record.decisions[-MOST_DECISIONS:],
         notes=[(_date(when), text) for when, text in record.notes],
         resolved=_resolved(plan),
         footer=f"Made by Decant {dict(versions.get('packages', {})).get('decant', '')} from the run's journal.",
     )
+
+
+def _damage(check: JournalCheck) -> list[str]:
+    if not check.problems:
+        return []
+    made = f" The ledger of pours names: {'; '.join(check.pours)}." if check.pours else ""
+    return [
+        "WARNING: the records of this run are damaged or incomplete. Numbers on this page may be wrong or missing. "
+        f"Problems: {'; '.join(check.problems)}.{made}"
+    ]
 
 
 def _resolved(plan: CampaignPlan) -> str:
