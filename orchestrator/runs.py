@@ -117,7 +117,7 @@ def _newest_unfinished(plan: CampaignPlan, parent: Path) -> Path:
                     same = digest(journal.header.fingerprint) == mine
                     found.append((same, journal.header.created, directory))
         except JournalError:
-            # Another program's, or another version's; or a run of this campaign that is damaged, which is refused later.
+            # Another program's or version's; a damaged run of this campaign is a candidate, and is refused.
             begun = readable_lines(directory / LEDGER_NAME)[:1]
             found += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
     if not found:

@@ -151,7 +151,9 @@ def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json 
     call(verb.show, run, daemon=daemon, as_json=as_json)
 
 
-@runs.command(epilog=examples("decant runs check quickstart-20300301-1", "decant runs check runs/quickstart-20300301-1"))
+@runs.command(
+    epilog=examples("decant runs check quickstart-20300301-1", "decant runs check runs/quickstart-20300301-1")
+)
 def check(run: Which, state: State = None, as_json: Json = False) -> None:
     """Check a run's records: SQLite's own check, the hash chain over all entries, and the ledger of pours.
 

@@ -1,4 +1,4 @@
-"""A run whose process was killed after its second pour, and whose journal is then lost or changed: no pour is repeated."""
+"""A process is killed after its second pour, then the journal is lost or changed: no pour is repeated."""
 
 from __future__ import annotations
 
