@@ -77,7 +77,7 @@ class PourLedger:
 
     @classmethod
     def resume(cls, path: Path) -> Self:
-        """Go on with a ledger; a last line that was never completed is overwritten.
+        """Go on with a ledger; a last line that was never completed is removed.
 
         Raises:
             LedgerError: it is damaged.
@@ -87,6 +87,7 @@ class PourLedger:
         for text in _whole_lines(path):
             _, last = _parsed(path, text, last)
             size += len(text)
+        os.truncate(path, size)
         return cls(path, os.open(path, os.O_WRONLY | os.O_CLOEXEC), size, last)
 
     def append(self, lines: Sequence[LedgerLine]) -> None:
@@ -100,8 +101,7 @@ class PourLedger:
             written = 0
             while written < len(text):
                 written += os.pwrite(self._descriptor, text[written:], self._size + written)
-            os.ftruncate(self._descriptor, self._size + len(text))
-            os.fsync(self._descriptor)
+            os.fdatasync(self._descriptor)
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, self._size)
