@@ -19,9 +19,10 @@ from orchestrator.report.record import read_record
 from orchestrator.report.results import evaluation_of, theta_of
 from orchestrator.report.run_page import REPORT_NAME, run_page
 from orchestrator.report.summarise import summarise
-from orchestrator.report.summary import PoolUse, RunSummary, Totals, write_summary
+from orchestrator.report.summary import SUMMARY_NAME, PoolUse, RunSummary, Totals, write_summary
 from orchestrator.run_result import CampaignResult
 from orchestrator.runs import VERSIONS
+from orchestrator.states import State
 from orchestrator.strategies.calibration.base import CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.scorecard import shift_left_over
@@ -85,16 +86,38 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
     Raises:
         OSError: a file can't be written.
     """
-    directory = result.directory
     if recording is not None:
         recording.close()
+        return _write(plan, result, recording.path, recording.dropped)
+    return _write(plan, result, None, 0)
+
+
+def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
+    """Publish a finished run whose process ended before `summary.json` or `theta.json` was written.
+
+    Returns:
+        Whether anything was missing.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    expected = [SUMMARY_NAME, *([] if theta_of(result.results) is None else [THETA_FILE])]
+    if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
+        return False
+    recording = result.directory / "campaign.rrd"
+    _write(plan, result, recording if recording.is_file() else None, 0)
+    return True
+
+
+def _write(plan: CampaignPlan, result: CampaignResult, recording: Path | None, dropped: int) -> Published:
+    directory = result.directory
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
     summary = summary_of(
         plan,
         result,
         figures,
-        recording=None if recording is None else recording.path,
-        dropped_events=0 if recording is None else recording.dropped,
+        recording=recording,
+        dropped_events=dropped,
     )
     write_summary(directory, summary)
     found = theta_of(result.results)
@@ -108,7 +131,7 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
     except Exception as error:  # days of pouring don't end in a traceback about a page
         _log.warning("the report was not written: %s: %s", type(error).__name__, error)
         report = None
-    return Published(summary, figures, None if recording is None else recording.path, theta, report)
+    return Published(summary, figures, recording, theta, report)
 
 
 def summary_of(

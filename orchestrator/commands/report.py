@@ -86,7 +86,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
     from orchestrator.errors import RunError
     from orchestrator.journal import JOURNAL_NAME, JournalReader
     from orchestrator.journal_check import check_journal
-    from orchestrator.publish import report_on
+    from orchestrator.publish import publish_if_missing, report_on
     from orchestrator.run_result import read_result
 
     plan = _plan_of(folder)
@@ -96,6 +96,8 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
     try:
         with JournalReader(folder / JOURNAL_NAME) as journal:
             result = read_result(journal, folder)
+        if publish_if_missing(plan, result):
+            mention("summary.json and theta.json were missing, and are written now")
         page, figures = report_on(plan, result, output, formats)
     except RunError as error:
         raise RefusalError(str(error)) from None
