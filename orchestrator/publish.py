@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from orchestrator.catalogue.reading import read_run
 from orchestrator.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal_check import check_journal
 from orchestrator.occupancy import occupancies
@@ -17,11 +18,11 @@ from orchestrator.report import regimes
 from orchestrator.report.campaign import draw_figures
 from orchestrator.report.record import read_record
 from orchestrator.report.results import evaluation_of, theta_of
-from orchestrator.report.run_page import REPORT_NAME, run_page
+from orchestrator.report.run_page import REPORT_NAME, reduced_run_page, run_page
 from orchestrator.report.summarise import summarise
 from orchestrator.report.summary import SUMMARY_NAME, PoolUse, RunSummary, Totals, write_summary
 from orchestrator.run_result import CampaignResult
-from orchestrator.runs import VERSIONS
+from orchestrator.runs import read_versions
 from orchestrator.states import State
 from orchestrator.strategies.calibration.base import CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
@@ -188,12 +189,35 @@ def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory:
     check = check_journal(directory / JOURNAL_NAME)
     with JournalReader(directory / JOURNAL_NAME) as journal:
         record = read_record(journal)
-    try:
-        versions = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        versions = {}
+    versions = read_versions(directory)
+    return _write_page(path, run_page(plan, summary, record, directory, versions=versions, check=check))
+
+
+def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
+    """Write the page about a run whose campaign or results can't be read: what its journal has without them.
+
+    Args:
+        path: of the page.
+        directory: of the run.
+        reason: why the whole report can't be made.
+
+    Raises:
+        OSError: it can't be written, or a figure can't be read.
+        RunError: the journal can't be read.
+    """
+    check = check_journal(directory / JOURNAL_NAME)
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        name, record = journal.header.name, read_record(journal)
+    found = read_run(directory).run
+    page = reduced_run_page(
+        name, record, directory, versions=read_versions(directory), check=check, reason=reason, found=found
+    )
+    return _write_page(path, page)
+
+
+def _write_page(path: Path, page: str) -> Path:
     draft = path.with_suffix(".html.part")
-    draft.write_text(run_page(plan, summary, record, directory, versions=versions, check=check), encoding="utf-8")
+    draft.write_text(page, encoding="utf-8")
     draft.replace(path)
     return path
 

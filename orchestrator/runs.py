@@ -8,6 +8,7 @@ import platform
 import re
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from orchestrator.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal_check import check_journal, has_begun
 from orchestrator.journal_file import JournalError
 from orchestrator.plan import CampaignPlan
+from orchestrator.plugins import packages as plugin_packages
 from orchestrator.pour_ledger import LEDGER_NAME, readable_lines
 from orchestrator.reserve import TO_BEGIN, require_space
 from orchestrator.states import State
@@ -65,7 +67,7 @@ def write_provenance(directory: Path, plan: CampaignPlan) -> None:
 
 
 def versions() -> dict[str, Any]:
-    """Versions of Python, platform, Decant and what it is built on."""
+    """Versions of Python, platform, Decant, what it is built on, and packages that add plug-ins."""
     packages: dict[str, str] = {}
     names = ["decant"]
     try:
@@ -77,12 +79,38 @@ def versions() -> dict[str, Any]:
             packages[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             packages[name] = "not installed"
+    plugins = plugin_packages()
+    packages |= {name: version for name, (version, _) in plugins.items()}
     return {
         "python": sys.version.split()[0],
         "platform": platform.platform(),
         "processor": platform.machine(),
         "packages": packages,
+        "plugins": {name: sorted(set(added)) for name, (_, added) in plugins.items()},
     }
+
+
+def missing_plugins(versions: Mapping[str, Any]) -> list[str]:
+    """Packages with plug-ins that a run had and that are not installed here: 'decant-example 1.0 (decant.arms: stand)'.
+
+    Args:
+        versions: as `versions.json` has them.
+    """
+    here, packages = plugin_packages(), versions.get("packages") or {}
+    return [
+        f"{name} {packages.get(name, '')} ({', '.join(added)})"
+        for name, added in (versions.get("plugins") or {}).items()
+        if name not in here
+    ]
+
+
+def read_versions(directory: Path) -> dict[str, Any]:
+    """`versions.json` of a run; empty where it is missing or damaged."""
+    try:
+        found = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
