@@ -122,7 +122,8 @@ def read_ledger(path: Path) -> list[LedgerLine]:
         LedgerError: a line was changed, removed or inserted; the text gives its number.
         OSError: it can't be read.
     """
-    lines, last = [], ""
+    lines: list[LedgerLine] = []
+    last = ""
     for text in _whole_lines(path):
         line, last = _parsed(path, text, last, len(lines) + 1)
         lines.append(line)
