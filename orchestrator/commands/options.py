@@ -37,7 +37,11 @@ Quiet = Annotated[
         help="Only results, questions, warnings of a run, and errors: no progress, no notes.",
     ),
 ]
-Seed = Annotated[int | None, typer.Option(min=0, help="In place of the campaign's.", show_default=False)]
+Seed = Annotated[
+    int | None,
+    # The largest is the schema's, whose module takes longer to import than `--help` may.
+    typer.Option(min=0, max=2**63 - 1, help="In place of the campaign's.", show_default=False),
+]
 Assignments = Annotated[
     list[str] | None,
     typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),

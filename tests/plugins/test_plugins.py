@@ -190,6 +190,20 @@ def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: 
     again = decant("validate", str(run / "resolved.json"), cwd=folder)
     assert again.returncode == 0, again.stderr
 
+    versions = json.loads((run / "versions.json").read_text())
+    assert versions["packages"]["decant-example"] == "1.0"
+    assert {"decant.strategies: hypercube", "decant.arms: stand"} <= set(versions["plugins"]["decant-example"])
+
+    reported = command()("report", str(run), "-o", "elsewhere.html", cwd=folder)  # where the example is not installed
+    assert reported.returncode == 0, reported.stderr
+    assert "Not installed here: decant-example 1.0 (" in reported.stderr
+    page = (folder / "elsewhere.html").read_text()
+    assert "Not installed here: decant-example 1.0 (" in page
+    assert page.count("<td>deployment:cone") >= 2, "a line for each pour"
+    assert "failed: cups touch" in page
+    whole = decant("report", str(run), cwd=folder)
+    assert "Not installed" not in whole.stderr
+
 
 def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: Path, folder: Path) -> None:
     said = command(site)("doctor", "example.yaml", "--json", cwd=folder)

@@ -21,6 +21,7 @@ from orchestrator.config.yaml.sections import (
     PathOr,
     PositiveCount,
     Section,
+    Seed,
     Switch,
     Text,
     tagged,
@@ -265,7 +266,7 @@ class CampaignFile(Section):
     name: Name | None = None
     """Its name in run directories and figures."""
 
-    seed: Count = 0
+    seed: Seed = 0
     """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
     laboratory: PathOr[LaboratoryFile] | None = None

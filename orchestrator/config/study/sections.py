@@ -17,7 +17,7 @@ from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Text
+from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Seed, Text
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
@@ -55,7 +55,7 @@ class StudyFile(Section):
     name: Name | None = None
     """Its name; runs go to study-NAME."""
 
-    seed: Count = 0
+    seed: Seed = 0
     """Seed of every random choice."""
 
     campaign: Text | None = None

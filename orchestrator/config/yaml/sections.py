@@ -27,6 +27,13 @@ Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
 
 
+LARGEST_SEED = 2**63 - 1
+"""The largest integer that SQLite, NumPy and JSON readers with 64-bit integers can hold."""
+
+Seed = Annotated[int, Strict(), Field(ge=0, le=LARGEST_SEED)]
+"""The seed of random choices."""
+
+
 def _count_form(value: Any) -> str | None:
     if value == "free":
         return "word"

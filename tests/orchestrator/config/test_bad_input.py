@@ -127,6 +127,7 @@ BAD_CAMPAIGNS = {
         "deployment.per_pour: -1 is too small; at least 0",
     ),
     "negative seed": (CAMPAIGN, "name: test", "name: test\nseed: -1", "seed: -1 is too small; at least 0"),
+    "seed beyond 63 bits": (CAMPAIGN, "name: test", f"name: test\nseed: {2**63}", f"seed: {2**63} is too large; at"),
     "empty value": (CAMPAIGN, "name: test", "name:", "1:1: name: has no value; give one, or remove the key"),
     "missing key": (CAMPAIGN, "liquid: {name: water, mass: 200 g}\n", "", "key 'liquid' is missing; add for example"),
     "missing file": (CAMPAIGN, "beaker.yaml", "baeker.yaml", "4:9: pourer: no such file: "),

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from orchestrator.daemon.auth import Role
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
@@ -152,5 +155,32 @@ def test_one_emergency_stop_is_for_all_rigs(tmp_path: Path) -> None:
             assert [one.arm_stops for one in served.laboratories] == [1, 1]
             for key in keys:
                 await served.until(key, "unknown")
+
+    run(work())
+
+
+@pytest.mark.parametrize("lost", ["journal", "content", "folder"])
+def test_a_campaign_whose_journal_is_lost_while_it_is_paused_fails_and_pours_nothing(tmp_path: Path, lost: str) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, held) as served:
+            key = await served.submit()
+            laboratory = await served.pouring()
+            await served.post(f"/campaigns/{key}/pause")
+            await served.until(key, "pausing", "paused")
+            laboratory.bench.go.set()
+            found = await served.until(key, "paused")
+            run_folder = tmp_path / "state/runs" / found["run"]
+            if lost == "folder":
+                shutil.rmtree(run_folder)
+            elif lost == "journal":
+                (run_folder / JOURNAL_NAME).unlink()
+            else:
+                (run_folder / JOURNAL_NAME).write_bytes(b"")
+            await served.post(f"/campaigns/{key}/resume")
+            found = await served.until(key, "failed")
+            assert "Nothing was poured now" in found["reason"]
+            if lost != "folder":
+                assert "pours that may have been made: pour 1 of stage deployment:narrow (weighed: " in found["reason"]
+            assert [len(one.bench.poured) for one in served.laboratories] == [1]
 
     run(work())
