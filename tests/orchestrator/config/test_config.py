@@ -98,22 +98,43 @@ def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, mes
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("glycerin 80 %", "'glycerin 80 %' is not in the table; did you mean 'glycerol'?"),
-        ("honey 80 %", "'honey 80 %' is not in the table. Or give its 'viscosity' as well"),
-        ("ethanoll", "did you mean 'ethanol'?"),
+        ("glycerin 80 %", "'glycerin 80 %' is not in the table of liquids. Did you mean 'glycerol 80 %'?"),
+        ("ethanoll", "'ethanoll' is not in the table of liquids. Did you mean 'ethanol'?"),
+        ("honey 80 %", "'honey 80 %' is not in the table of liquids. The table has 'water', "),
+        ("honey", "'honey' is not in the table of liquids. The table has 'water', "),
+        ("olive oil", "'olive oil' is not in the table of liquids. The table has 'water', "),
     ],
 )
-def test_a_liquid_that_is_misspelt_is_not_poured_as_water(name: str, message: str, tmp_path: Path) -> None:
-    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
+def test_a_liquid_that_is_not_in_the_table_is_not_poured_as_water(name: str, message: str, tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
     path = tmp_path / "campaign.yaml"
     path.write_text(text.replace("name: water", f"name: {name}"), encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load_campaign(path)
-    assert message in str(caught.value)
+    (problem,) = caught.value.problems
+    assert message in problem.message
+    assert "give its 'density' and 'viscosity'" in problem.message
+    line = text.splitlines()[problem.line - 1]
+    assert (problem.path, line[problem.column - 1 :].startswith("water")) == (path, True)
+
     path.write_text(text.replace("name: water", f"name: {name}, viscosity: 50 mPa*s"), encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:  # for its vessels alone, which are not there
+    with pytest.raises(ConfigError, match="give its 'density' as well"):
         load_campaign(path)
-    assert "table" not in str(caught.value)
+    given = f"name: {name}, viscosity: 50 mPa*s, density: 1.4 g/cm^3"
+    path.write_text(text.replace("name: water", given), encoding="utf-8")
+    calibration = load_campaign(path).calibration
+    assert calibration is not None
+    liquid = calibration.scene.liquid
+    assert (liquid.name, liquid.density, liquid.dynamic_viscosity) == (name, pytest.approx(1400.0), 0.05)
+
+
+def test_a_temperature_next_to_a_liquid_that_is_not_in_the_table_is_refused(tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+    path = tmp_path / "campaign.yaml"
+    given = "name: honey, viscosity: 9 Pa*s, density: 1.4 g/cm^3, temperature: 30 degC"
+    path.write_text(text.replace("name: water", given), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"liquid\.temperature: has no effect: 'honey' is not in the table"):
+        load_campaign(path)
 
 
 def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_after_its_density_was(
