@@ -115,7 +115,7 @@ def plan(
     Raises:
         ValueError, LaboratoryError, RunError: see `run`.
     """
-    vessel = load_vessel(Path(receiver)) if isinstance(receiver, str | Path) else receiver
+    vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
     planned = planning_plan(campaign, theta, vessel, iterations)
     deployment = planned.deployment
     assert deployment is not None
@@ -143,7 +143,7 @@ def _run(
     pouring = any(stage.pours for stage in stages)
     spec = replace(campaign.laboratory, in_process=in_process or campaign.laboratory.in_process)
     check_laboratory(spec, need_bench=pouring)
-    begun = Path(resume) if resume is not None else directory or create_run(campaign)
+    begun = Path(resume).expanduser() if resume is not None else directory or create_run(campaign)
     work = run_campaign(
         campaign,
         open_laboratory(spec, need_bench=pouring),

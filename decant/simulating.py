@@ -79,7 +79,7 @@ def simulate(
 
     scene, space = scene_to_simulate(campaign)
     if receiver is not None:
-        vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver))
+        vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver).expanduser())
         scene = replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     chosen = assigned_action(
         [f"{name}={value}" for name, value in (action or {}).items()], fixed=scene.fixed, space=space

@@ -122,7 +122,8 @@ class LiquidFile(Section):
 
     viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] | None = None
     """Dynamic viscosity; the table's unless given. Required for a liquid that is not in the table. Above 5 mm²/s
-    (viscosity over density) it is simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is the parameter `viscosity`."""
+    (viscosity over density) it is simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is
+    the parameter `viscosity`."""
 
     contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = NEUTRAL
     """Contact angle on the vessels' walls. Held against theory where particles are finer than the capillary length

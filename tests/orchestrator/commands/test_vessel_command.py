@@ -211,6 +211,17 @@ def written(text: str) -> Door:
         (written("level_mm,mass_g\n10,20\n20,x\n"), r"fill.csv:3: should be two numbers"),
         (written("level_mm,mass_g\n10,20\n200,30\n"), r"fill.csv:3: level_mm is 200; should be .* at most 100"),
         (written("level_mm,mass_g\n10,20\n"), r"at least 3"),
+        (written("level_mm,mass_g\n50,20\n50,30\n50,40\n"), r"fill.csv: has 1 different value"),
+        (written("level_mm,mass_g\n10,90\n40,60\n80,30\n"), r"fill.csv:3: mass_g is 60 at 40, and 90 at 10 \(line 2\)"),
+        (written("level_mm,mass_g\n10,20\n50,90\n50,300\n90,400\n"), r"fill.csv:4: mass_g is 300 at 50, and 90 at 50"),
+        (written("level_mm,mass_g\n10,0\n40,0\n80,0\n"), r"fill.csv:2: 0 g below 10 mm make a vessel of 0 mm"),
+        (written("level_mm,mass_g\n10,9e4\n40,9.1e4\n80,9.2e4\n"), r"fill.csv:2: .* should be 4 to 1000 mm"),
+        (
+            lambda of, folder: replace(
+                written("tilt_deg,mass_g\n10,5\n50,60\n90,200\n")(of, folder), fill=None, tilt=folder / "fill.csv"
+            ),
+            r"fill.csv:3: mass_g is 60 at 50, and 5 at 10 \(line 2\); a vessel that is tilted further holds less",
+        ),
     ],
 )
 def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, door: Door, said: str) -> None:

@@ -6,6 +6,8 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from orchestrator.daemon.auth import Role
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
 from tests.orchestrator.daemon.served import HeldLaboratory, held, run, serving
@@ -74,6 +76,11 @@ def test_aborting_stops_the_arm_and_leaves_the_pour_to_the_person_who_brings_it_
             await served.post(f"/campaigns/{key}/resume")
             question = await served.question()
             assert question["kind"] == "unknown"
+            assert question["details"]["load_g"] == pytest.approx(100.0)
+            for answer in ("weighed 500 0", "weighed 500 0 600"):  # more than the load of 100 g
+                refused = await served.post(f"/questions/{question['id']}/answer", {"answer": answer}, status=422)
+                assert "load of 100 g" in refused["detail"]
+            assert len(await served.get("/questions")) == 1
             await served.post(f"/questions/{question['id']}/answer", {"answer": "lost"})
             served.laboratories[-1].bench.go.set()
             while len(served.laboratories) < 2:
