@@ -216,8 +216,8 @@ def test_doctor_fails_for_the_reason_for_which_the_driver_refuses(
         arm = cls(*given)
         try:
             assert arm.connect().problem == why
+            arm.release()
             with pytest.raises(ArmRefusedError, match=why):
-                arm.release()
                 arm.jog("joint 6", 0.02, 0.1)
         finally:
             arm.close()
