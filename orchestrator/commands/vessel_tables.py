@@ -208,20 +208,21 @@ def _loaded(path: Path) -> Any:
 
 
 def read_photograph(path: Path) -> Floats:
-    """Brightness of a picture, rows from the top, shape (rows, columns).
+    """Brightness of a picture as viewers show it, rows from the top, shape (rows, columns).
 
     Raises:
         RefusalError: it is not a picture that can be read (exit code 2).
     """
     import numpy as np
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
     _check_size(path)
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of large pictures: see below
             if picture.width * picture.height > MOST_PIXELS:
                 raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller", BAD_INPUT)
-            return np.asarray(picture.convert("L"), dtype=float)
+            upright = ImageOps.exif_transpose(picture)  # cameras store the sensor's rows and how they were held
+            return np.asarray(upright.convert("L"), dtype=float)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # cut off, damaged
         raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
 
