@@ -197,19 +197,46 @@ def lay_out(connection: sqlite3.Connection, header: Header, path: Path) -> None:
         raise JournalError(f"{path}: can't be written ({error}; {free_space(path) / MB:.1f} MB are free)") from error
 
 
-def take_lock(path: Path) -> IO[str]:
-    """Hold the run for this process; the system lets go of it when the process ends, however it ends."""
-    file = path.with_suffix(".lock").open("a+", encoding="utf-8")
+def locked_alone(file: IO[str]) -> bool:
+    """Lock a file for this process; the system releases the lock when the process ends, however it ends.
+
+    Returns:
+        False if another process holds the lock.
+
+    Raises:
+        OSError: the file system can't lock files; the text says what to do.
+    """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        text = f"can't be locked ({error.strerror}); name a folder on a local disk, or mount this one with locks"
+        raise OSError(error.errno, text, file.name) from None
+    return True
+
+
+def take_lock(path: Path) -> IO[str]:
+    """Hold the run for this process.
+
+    Raises:
+        JournalLockedError: another process holds it.
+        JournalError: the file system can't lock files.
+    """
+    file = path.with_suffix(".lock").open("a+", encoding="utf-8")
+    try:
+        alone = locked_alone(file)
+    except OSError as error:
+        file.close()
+        raise JournalError(f"{error.filename}: {error.strerror}") from None
+    if not alone:
         file.seek(0)
         owner = file.read().strip()
         file.close()
         who = f"process {owner}" if owner else "another process"
         raise JournalLockedError(
             f"{path.parent}: {who} is running this campaign; wait for it, or stop it before you resume"
-        ) from None
+        )
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()

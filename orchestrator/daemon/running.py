@@ -30,6 +30,7 @@ from orchestrator.plan import CampaignPlan
 from orchestrator.publish import not_simulated, publish
 from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.runs import create_run
+from orchestrator.stages import scenes_of
 from orchestrator.states import State
 
 MOVING = ("approach", "tilt", "hold", "return")
@@ -139,6 +140,7 @@ class Running:
             spec, in_process=spec.in_process or self._common.settings.in_process, accepted_checksum=checksum, ray=None
         )
         asking, key, rig = self._common.asking, self.item.id, self._rig.name
+        load = next(iter(scenes_of(work.plan).values())).liquid.mass  # a campaign has one liquid
         operator = RemoteOperator(asking, key, rig, self._announce) if work.pours and needs_person(spec) else None
         self._laboratory = open_laboratory(
             spec,
@@ -154,7 +156,7 @@ class Running:
                 directory,
                 resume=begun,
                 watchers=watchers,
-                ask_operator=RunQuestions(asking, self._common.store, key, rig, lambda: self._look(work.plan)),
+                ask_operator=RunQuestions(asking, self._common.store, key, rig, load, lambda: self._look(work.plan)),
                 stages=work.stages,
             ),
             name=f"campaign {key}",

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.events import Event
+from orchestrator.monitor.server import environment
 from orchestrator.monitor.worker import QueueThread
 from orchestrator.monitor.writer import Closing, Missed, Opening
 from orchestrator.plan import CampaignPlan
@@ -115,13 +116,13 @@ class RerunMonitor:
 
 def _start_writer() -> subprocess.Popen[bytes]:
     # What is importable here is importable there: strategies and devices of others are among the settings.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "RERUN_ANALYTICS": "off"}
+    variables = environment() | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.Popen(
         [sys.executable, "-c", "from orchestrator.monitor.writer import main; main()"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=environment,
+        env=variables,
         start_new_session=True,  # Ctrl-C is for the campaign
     )
 

@@ -10,7 +10,7 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
-from orchestrator.config.yaml.sections import Count, Section
+from orchestrator.config.yaml.sections import PourCount, Section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -121,7 +121,7 @@ class DeploymentSettings(StrategySettings):
     simulates: ClassVar[bool] = True
     """Whether θ matters to it."""
 
-    pours: Count | None = None
+    pours: PourCount | None = None
     """Real pours per receiver."""
 
     noise: Literal["constant", "varying"] = "constant"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import signal
 import sqlite3
@@ -13,11 +15,14 @@ from pathlib import Path
 
 import pytest
 
+from orchestrator.daemon.store import Store, StoreError
 from orchestrator.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
 from orchestrator.journal_check import JournalDamagedError, check_journal
 from orchestrator.journal_file import FORMAT, Header, JournalError, JournalLockedError
 from orchestrator.pour_ledger import BEGUN, LEDGER_NAME, read_ledger
 from orchestrator.states import State
+from orchestrator.study.folder import StudyError, opened
+from tests.orchestrator.study_files import small
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
 
@@ -405,3 +410,20 @@ def test_a_run_can_be_checked_while_it_is_written(path: Path) -> None:
         journal.append(Kind.NOTE, {"text": "between"})
         assert check_journal(path).problems == ()
     journal.close()
+
+
+def test_a_file_system_without_locks_is_reported_as_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not as another process that runs the campaign, the study or the daemon: NFS without its lock service."""
+
+    def unsupported(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", unsupported)
+    cause = rf"can't be locked \({os.strerror(errno.ENOLCK)}\); name a folder on a local disk"
+    with pytest.raises(JournalError, match=rf"journal\.lock: {cause}") as refused:
+        Journal.create(tmp_path / "journal.sqlite", HEADER)
+    assert not isinstance(refused.value, JournalLockedError)
+    with pytest.raises(StoreError, match=cause):
+        Store(tmp_path / "daemon.sqlite")
+    with pytest.raises(StudyError, match=cause), opened(small(tmp_path)):
+        pass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -264,6 +265,30 @@ def test_file_that_is_no_mesh_is_refused(tmp_path: Path, name: str, content: byt
     path.write_bytes(content)
     with pytest.raises(VesselError, match=message):
         build_vessel(VesselSpec(name="broken", shape=MeshShape(path=path)))
+
+
+def test_a_home_that_can_not_be_written_costs_the_cache_and_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A file in the place of the folder stops every user, the superuser too."""
+    (tmp_path / "home").touch()
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path / "home" / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    directory = cache.cache_directory()
+    assert directory == cache.cache_directory()
+    assert directory.parent == tmp_path / "tmp"
+    assert directory.stat().st_mode & 0o777 == 0o700
+    (logged,) = caplog.messages
+    assert f"{tmp_path / 'home' / 'cache'} can't be written" in logged
+    assert "Not a directory" in logged
+    assert "Set $DECANT_CACHE_DIR to a folder that you can write" in logged
+    assert cache.store_arrays("some", {"x": np.ones(3)})
+    assert cache.load_arrays("some") is not None
+
+    directory.chmod(0o777)  # what anybody may have put there must not be executed
+    with pytest.raises(OSError, match="belongs to another user"):
+        cache.cache_directory()
 
 
 def test_missing_file_says_which(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Point
-from orchestrator.config.yaml.sections import PositiveCount
+from orchestrator.config.yaml.sections import PositiveSimulationCount
 from orchestrator.plan import CalibrationPlan
 from orchestrator.strategies.calibration.design import MeasuredPour, stratified
 from orchestrator.strategies.calibration.o1 import BestOfDesign
@@ -24,7 +24,7 @@ class C2Settings(DesignSettings):
     strategy: Literal["C2"] = "C2"
     """Stratified sampling."""
 
-    samples: PositiveCount | None = None
+    samples: PositiveSimulationCount | None = None
     """θ in all, in equal strata where the number fits, else a Latin hypercube."""
 
     @property

@@ -86,7 +86,7 @@ def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
         ({"frequency": 1.0}, "Hz"),
         ({"model": "ur5"}, "ur10"),
         ({"joints": [0.0, 1.0]}, "six numbers"),
-        ({"joints": [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]}, "joint 5"),
+        ({"joints": [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]}, "joint 6 \\(wrist 3\\)"),
     ],
 )
 def test_settings_that_make_no_sense_are_told(options: dict[str, object], says: str) -> None:

@@ -108,6 +108,42 @@ BAD_CAMPAIGNS = {
     "nothing to calibrate": (CAMPAIGN, "[0 N/m, 0.1 N/m]", "0.1 N/m", "10:1: calibration: has nothing to search"),
     "all pours held out": (CAMPAIGN, "holdout: 2", "holdout: 8", "keeps 8 of 8 pours for testing"),
     "too few simulations": (CAMPAIGN, "simulations: 20", "simulations: 4", "8 random parameters don't fit into 4"),
+    "too many pours": (
+        CAMPAIGN,
+        "count: 8",
+        "count: 1000000000",
+        "pours.count: 1000000000 is too large; at most 2,000: the surrogates are made for some hundreds of pours",
+    ),
+    "too many pours for a deployment": (
+        DEPLOYED,
+        "pours: 15",
+        "pours: 1000000000",
+        "deployment.pours: 1000000000 is too large; at most 2,000: the surrogates",
+    ),
+    "too many simulations between pours": (
+        DEPLOYED,
+        "pours: 15",
+        "pours: 15\n  per_pour: 1000000000",
+        "deployment.per_pour: 1000000000 is too large; at most 200,000: at ten simulations a second",
+    ),
+    "too many simulations before pours": (
+        DEPLOYED,
+        "pours: 15",
+        "pours: 15\n  prior_simulations: 1000000000",
+        "deployment.prior_simulations: 1000000000 is too large; at most 200,000",
+    ),
+    "too large a baseline": (
+        CAMPAIGN,
+        "simulations: 20",
+        "simulations: 20\n  random_baseline: 1000000000",
+        "calibration.random_baseline: 1000000000 is too large; at most 200,000",
+    ),
+    "home of nobody": (
+        CAMPAIGN,
+        "name: test",
+        "name: test\noutputs: {directory: ~nobody-of-this-name/runs}",
+        "outputs.directory: '~nobody-of-this-name' is not the home directory of any user",
+    ),
     "count as text": (
         CAMPAIGN,
         "count: 8",

@@ -78,6 +78,11 @@ def test_aborting_stops_the_arm_and_leaves_the_pour_to_the_person_who_brings_it_
             question = await served.question()
             assert question["kind"] == "unknown"
             assert (await served.get(f"/campaigns/{key}"))["pours_made"][0]["state"] == "unknown"
+            assert question["details"]["load_g"] == pytest.approx(100.0)
+            for answer in ("weighed 500 0", "weighed 500 0 600"):  # more than the load of 100 g
+                refused = await served.post(f"/questions/{question['id']}/answer", {"answer": answer}, status=422)
+                assert "load of 100 g" in refused["detail"]
+            assert len(await served.get("/questions")) == 1
             await served.post(f"/questions/{question['id']}/answer", {"answer": "lost"})
             served.laboratories[-1].bench.go.set()
             while len(served.laboratories) < 2:
