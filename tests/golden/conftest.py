@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from orchestrator.state_directory import VARIABLE
 from tests.golden.golden import Golden
 
 REGENERATE = "--regenerate"
@@ -28,11 +29,10 @@ def golden(request: pytest.FixtureRequest) -> Golden:
 def neutral(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """An environment of its own for every test."""
     for name in [name for name in os.environ if name.startswith(("DECANT_", "LC_", "TYPER_", "_TYPER", "GITHUB_"))]:
-        if name != "DECANT_STATE":
-            monkeypatch.delenv(name)
+        monkeypatch.delenv(name)
     home = tmp_path / "home"
     home.mkdir()
-    values = {"TZ": "UTC", "LC_ALL": "C.UTF-8", "LANG": "C.UTF-8", "HOME": str(home), "NO_COLOR": "1", "TERM": "dumb"}
+    values = {"TZ": "UTC", "LC_ALL": "C.UTF-8", "LANG": "C.UTF-8", "HOME": str(home), VARIABLE: str(tmp_path / "state"), "NO_COLOR": "1", "TERM": "dumb"}
     values |= {"COLUMNS": "120", "LINES": "40", "TERMINAL_WIDTH": "120", "MPLBACKEND": "agg"}
     for name in ("FORCE_COLOR", "PY_COLORS", "XDG_DATA_HOME", "XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)

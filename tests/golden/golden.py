@@ -8,9 +8,11 @@ be equal, because seeds and counts are integers.
 from __future__ import annotations
 
 import difflib
+import hashlib
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -135,15 +137,18 @@ LONGEST = 6
 
 
 def compact(value: Any) -> Any:
-    """A JSON-ready value with 12 significant digits, in which long lists of numbers are replaced by two sums.
+    """A JSON-ready value with 11 significant digits, in which long lists are replaced by sums.
 
-    The second sum is weighted by position, so that an exchange of two numbers shows.
+    Of numbers there are two sums. The second one is weighted by position, so that an exchange of two numbers shows.
+    Of mappings there are the sums of each key.
     """
     if isinstance(value, float):
         return _rounded(value)
     if isinstance(value, Mapping):
         return {str(key): compact(found) for key, found in value.items()}
     if isinstance(value, list | tuple):
+        if len(value) > LONGEST and all(isinstance(one, Mapping) for one in value):
+            return columns(value)
         numbers = _numbers(value)
         if numbers is not None and len(numbers) > LONGEST:
             weighted = math.fsum((i + 1) * number for i, number in enumerate(numbers)) / len(numbers)
@@ -152,9 +157,27 @@ def compact(value: Any) -> Any:
     return value
 
 
+def columns(table: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A long table by column: sums of numbers, and how often there is each other value."""
+    rows = [flat(row) for row in table]
+    found: dict[str, Any] = {"rows": len(rows)}
+    for key in dict.fromkeys(key for row in rows for key in row):
+        cells = [row[key] for row in rows if key in row]
+        numbers = [one for one in cells if _numbers(one) is not None]
+        others = Counter(text_digest(one) for one in cells if _numbers(one) is None)
+        found[key] = {"of": len(cells), **({} if not numbers else {"is": compact(numbers)}), **dict(sorted(others.items()))}
+    return found
+
+
+def text_digest(value: Any) -> str:
+    """A text as it is, if it is short; else a hash of its characters."""
+    text = value if isinstance(value, str) else json.dumps(compact(value), ensure_ascii=False)
+    return text if len(text) <= 40 else hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 def _rounded(value: float) -> float:
-    """12 significant digits; always written with a point or an exponent."""
-    return float(f"{value:.12g}") if math.isfinite(value) else value
+    """11 significant digits; always written with a point or an exponent."""
+    return float(f"{value:.11g}") if math.isfinite(value) else value
 
 
 def _numbers(value: Any) -> list[float] | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import functools
 import json
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from orchestrator.cli import app
+from orchestrator.state_directory import VARIABLE
 from tests.golden.golden import DATA, ROOT, Golden, normalised
 
 INPUTS = DATA / "bad_input"
@@ -91,7 +93,8 @@ def answered(case: Mapping[str, Any], folder: Path, monkeypatch: pytest.MonkeyPa
                 (folder / name).unlink()
     made = {path for path in folder.rglob("*") if path not in before and path.is_file()}
     assert not made, f"{case['command']} left {sorted(map(str, made))}"
-    printed = normalised(result.stdout + result.stderr, [(str(folder), "<here>"), (str(folder.parent), "<there>")])
+    places = [(str(folder), "<here>"), (str(folder.parent), "<there>"), (os.environ[VARIABLE], "<state>")]
+    printed = normalised(result.stdout + result.stderr, places)
     return f"{printed}exit {result.exit_code}\n"
 
 
