@@ -17,6 +17,7 @@ REGENERATE = "--regenerate"
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(REGENERATE, action="store_true", default=False, help="write the golden files anew")
+    parser.addoption("--rewrite-runs", action="store_true", default=False, help="make tests/data/old_runs anew, too")
 
 
 @pytest.fixture
@@ -32,7 +33,15 @@ def neutral(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
         monkeypatch.delenv(name)
     home = tmp_path / "home"
     home.mkdir()
-    values = {"TZ": "UTC", "LC_ALL": "C.UTF-8", "LANG": "C.UTF-8", "HOME": str(home), VARIABLE: str(tmp_path / "state"), "NO_COLOR": "1", "TERM": "dumb"}
+    values = {
+        "TZ": "UTC",
+        "LC_ALL": "C.UTF-8",
+        "LANG": "C.UTF-8",
+        "HOME": str(home),
+        VARIABLE: str(tmp_path / "state"),
+        "NO_COLOR": "1",
+        "TERM": "dumb",
+    }
     values |= {"COLUMNS": "120", "LINES": "40", "TERMINAL_WIDTH": "120", "MPLBACKEND": "agg"}
     for name in ("FORCE_COLOR", "PY_COLORS", "XDG_DATA_HOME", "XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)

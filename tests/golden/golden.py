@@ -87,8 +87,11 @@ def differing(expected: str, actual: str, rtol: float = RTOL) -> list[str]:
     """Lines of a unified difference, without those that agree within the tolerance; empty if all do."""
     before, now = expected.splitlines(), actual.splitlines()
     # Lines are paired by their text without numbers, so that one inserted line does not shift all others.
-    pairs = difflib.SequenceMatcher(None, [_masked(s) for s in before], [_masked(s) for s in now], autojunk=False) \
-        if before != now else None
+    pairs = (
+        difflib.SequenceMatcher(None, [_masked(s) for s in before], [_masked(s) for s in now], autojunk=False)
+        if before != now
+        else None
+    )
     if pairs is None:
         return []
     for first, second, size in pairs.get_matching_blocks():
@@ -159,20 +162,25 @@ def compact(value: Any) -> Any:
 
 def columns(table: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A long table by column: sums of numbers, and how often there is each other value."""
-    rows = [flat(row) for row in table]
+    rows = [flat(row, sums=True) for row in table]
     found: dict[str, Any] = {"rows": len(rows)}
     for key in dict.fromkeys(key for row in rows for key in row):
         cells = [row[key] for row in rows if key in row]
         numbers = [one for one in cells if _numbers(one) is not None]
         others = Counter(text_digest(one) for one in cells if _numbers(one) is None)
-        found[key] = {"of": len(cells), **({} if not numbers else {"is": compact(numbers)}), **dict(sorted(others.items()))}
+        found[key] = {
+            "of": len(cells),
+            **({} if not numbers else {"is": compact(numbers)}),
+            **dict(sorted(others.items())),
+        }
     return found
 
 
 def text_digest(value: Any) -> str:
-    """A text as it is, if it is short; else a hash of its characters."""
-    text = value if isinstance(value, str) else json.dumps(compact(value), ensure_ascii=False)
-    return text if len(text) <= 40 else hashlib.sha256(text.encode()).hexdigest()[:16]
+    """A text as it is, if it is short; else a hash of its characters, with five digits of its numbers."""
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    text = _NUMBER.sub(lambda found: f"{float(found[0]):.5g}", text)
+    return text if len(text) <= 40 else hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _rounded(value: float) -> float:
@@ -197,13 +205,13 @@ def _numbers(value: Any) -> list[float] | None:
     return found
 
 
-def flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    """A nested mapping as one mapping of dotted keys."""
-    if not isinstance(value, Mapping) or not value or "weighted" in value:
+def flat(value: Any, prefix: str = "", *, sums: bool = False) -> dict[str, Any]:
+    """A nested mapping as one mapping of dotted keys; those in which sums of numbers stand as they are, unless asked."""
+    if not isinstance(value, Mapping) or not value or ("weighted" in value and not sums):
         return {prefix: value}
     found: dict[str, Any] = {}
     for key, one in value.items():
-        found |= flat(one, f"{prefix}.{key}" if prefix else str(key))
+        found |= flat(one, f"{prefix}.{key}" if prefix else str(key), sums=sums)
     return found
 
 
@@ -239,8 +247,13 @@ _Replacement = str | Callable[[re.Match[str]], str]
 
 _PASSING: tuple[tuple[re.Pattern[str], _Replacement], ...] = (
     (re.compile(r"\b\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:\.\d+)?)?(?:Z|[+-]\d\d:\d\d)?"), "<time>"),
-    (re.compile(r"\b\d\d? (?:January|February|March|April|May|June|July|August|September|October|November|December) "
-                r"\d{4}(?:,? (?:at )?\d\d:\d\d(?: UTC)?)?"), "<time>"),
+    (
+        re.compile(
+            r"\b\d\d? (?:January|February|March|April|May|June|July|August|September|October|November|December) "
+            r"\d{4}(?:,? (?:at )?\d\d:\d\d(?: UTC)?)?"
+        ),
+        "<time>",
+    ),
     (re.compile(r"\b\d{4}-\d\d-\d\d\b"), "<date>"),
     (re.compile(r"-20\d{6}-(\d+)\b"), r"-<date>-\1"),
     (re.compile(r"\x1b\[[0-9;]*m"), ""),
