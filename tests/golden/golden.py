@@ -127,7 +127,7 @@ def _relative(path: Path) -> Path:
     return path.relative_to(ROOT)
 
 
-# -- what is stored ------------------------------------------------------------------------------------------------------
+# -- what is stored ----------------------------------------------------------------------------------------------------
 
 
 def line(value: Any) -> str:
@@ -206,7 +206,7 @@ def _numbers(value: Any) -> list[float] | None:
 
 
 def flat(value: Any, prefix: str = "", *, sums: bool = False) -> dict[str, Any]:
-    """A nested mapping as one mapping of dotted keys; those in which sums of numbers stand as they are, unless asked."""
+    """A nested mapping as one mapping of dotted keys; sums of numbers stay together, unless asked."""
     if not isinstance(value, Mapping) or not value or ("weighted" in value and not sums):
         return {prefix: value}
     found: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""A world of formulas: simulations, pours and answers of the optimiser, in arithmetic that is the same on any machine."""
+"""Simulations, pours and answers of the optimiser as formulas, in arithmetic that is the same on any machine."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def answer(problem: SuggestProblem) -> Suggestion:
     size = problem.map_resolution if dimension > 1 else 0
     row = tuple(0.1 + 0.01 * i for i in range(size))
     grid = SurrogateMap((row,) * size, (row,) * size, problem.space.names[:2], tuple(centre)) if size else None
-    adaptive = problem.mismatch is not None
+    adaptive, valued = problem.mismatch is not None, problem.acquisition == "knowledge"
     thetas = tuple(tuple(noise(name, "theta", i, axis) for axis in range(dimension)) for i in range(20))
     asked = len(problem.predict_at)
     return Suggestion(
@@ -144,8 +144,8 @@ def answer(problem: SuggestProblem) -> Suggestion:
         posterior=None if problem.posterior is None else Posterior(thetas, (0.02,) * len(thetas), 15.0),
         best_noise=0.01,
         risk=_risk(problem),
-        values=tuple(0.004 / (1 + len(problem.simulated)) for _ in points) if problem.acquisition == "knowledge" else (),
-        pour_value=0.01 / (1 + len(data)) if problem.acquisition == "knowledge" else None,
+        values=(0.004 / (1 + len(problem.simulated)),) * len(points) if valued else (),
+        pour_value=0.01 / (1 + len(data)) if valued else None,
         gains=() if problem.design is None else tuple(
             noise(name, "gain", i) for i in range(len(problem.design.candidates))
         ),
@@ -183,7 +183,7 @@ def _mismatch(problem: SuggestProblem, dimension: int) -> MismatchFound:
     )
 
 
-# -- a laboratory in it ------------------------------------------------------------------------------------------------------
+# -- a laboratory in it ------------------------------------------------------------------------------------------------
 
 
 class Simulators:
