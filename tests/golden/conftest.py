@@ -47,6 +47,9 @@ def neutral(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
         monkeypatch.delenv(name, raising=False)
     for name, value in values.items():
         monkeypatch.setenv(name, value)
+    # Both are read from the environment when typer is imported.
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 120)
+    monkeypatch.setattr("typer.rich_utils.FORCE_TERMINAL", None)
     time.tzset()
     yield
     monkeypatch.undo()
