@@ -14,6 +14,7 @@ import difflib
 import hashlib
 import json
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -63,7 +64,7 @@ class Golden:
         expected = path.read_text(encoding="utf-8")
         difference = differing(expected, text, rtol)
         if difference:
-            shown = "\n".join(difference[:SHOWN])
+            shown = "\n".join(_shortened(difference)[:SHOWN])
             more = f"\n… and {len(difference) - SHOWN} more lines" if len(difference) > SHOWN else ""
             pytest.fail(f"{_relative(path)} differs (- before, + now):\n{shown}{more}\n{ADVICE}", pytrace=False)
 
@@ -102,6 +103,24 @@ def differing(expected: str, actual: str, rtol: float = RTOL) -> list[str]:
             if agree(before[first + i], now[second + i], rtol):
                 now[second + i] = before[first + i]
     return [s for s in difflib.unified_diff(before, now, lineterm="", n=1) if not s.startswith(("---", "+++"))]
+
+
+def _shortened(difference: Sequence[str], width: int = 160) -> list[str]:
+    """Long lines that changed, each around the place where it begins to differ from its counterpart."""
+    found, start = list(difference), 0
+    while start < len(found):
+        end = start
+        while end < len(found) and found[end][:1] in ("-", "+"):
+            end += 1
+        old = [i for i in range(start, end) if found[i].startswith("-")]
+        new = [i for i in range(start, end) if found[i].startswith("+")]
+        for i, j in zip(old, new, strict=False):
+            same = len(os.path.commonprefix([found[i][1:], found[j][1:]]))
+            for k in (i, j):
+                if len(found[k]) > width and same > width // 2:
+                    found[k] = f"{found[k][:30]} … {found[k][same - width // 2 : same + width // 2]} …"
+        start = max(end, start + 1)
+    return [text if len(text) <= 2 * width else text[: 2 * width] + " …" for text in found]
 
 
 def agree(expected: str, actual: str, rtol: float = RTOL) -> bool:
