@@ -14,7 +14,6 @@ import difflib
 import hashlib
 import json
 import math
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -115,7 +114,7 @@ def _shortened(difference: Sequence[str], width: int = 160) -> list[str]:
         old = [i for i in range(start, end) if found[i].startswith("-")]
         new = [i for i in range(start, end) if found[i].startswith("+")]
         for i, j in zip(old, new, strict=False):
-            same = len(os.path.commonprefix([found[i][1:], found[j][1:]]))
+            same = next((n for n, (a, b) in enumerate(zip(found[i][1:], found[j][1:], strict=False)) if a != b), 0)
             for k in (i, j):
                 if len(found[k]) > width and same > width // 2:
                     found[k] = f"{found[k][:30]} … {found[k][same - width // 2 : same + width // 2]} …"
