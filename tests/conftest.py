@@ -15,6 +15,9 @@ from pathlib import Path
 import pytest
 
 from orchestrator.state_directory import VARIABLE
+from tests.depth import load_profile
+
+load_profile()
 
 # A shell that starts something in the background has it ignore Ctrl-C, and its children with it: those that are
 # interrupted here would go on.
