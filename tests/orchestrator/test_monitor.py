@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import PathCollection, QuadMesh
 
+from actors.child_process import child_environment
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.optimizer.core.propose import propose
 from actors.optimizer.core.slices import slices
@@ -244,6 +245,7 @@ def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_pat
         capture_output=True,
         text=True,
         timeout=PATIENCE,
+        env=child_environment(),
     )
     assert checked.returncode == 0, checked.stderr
 

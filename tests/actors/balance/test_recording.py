@@ -14,6 +14,7 @@ from actors.balance.record import main
 from actors.balance.recording import Event, Recording
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.virtual_serial.handle import RecordedBalance
+from actors.child_process import child_environment
 from tests.patience import PATIENCE
 
 from .conftest import spec_for
@@ -190,6 +191,7 @@ def test_the_recorder_is_a_command_and_says_why_it_can_not(tmp_path):
         capture_output=True,
         text=True,
         timeout=PATIENCE,
+        env=child_environment(),
     )
     assert ended.returncode == 1
     assert "/dev/no-balance): there is no such port" in ended.stderr

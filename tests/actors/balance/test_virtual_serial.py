@@ -17,6 +17,7 @@ from actors.balance.serial_balance import SerialBalance
 from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.handle import VirtualSerialBalance
 from actors.balance.virtual_serial.scale import Scale, ScaleSettings
+from actors.child_process import child_environment
 from actors.protocols import LaboratoryError
 from tests.patience import PATIENCE
 
@@ -241,7 +242,7 @@ def test_it_dies_with_a_parent_that_was_killed():
         "print(VirtualSerialBalance.start('kcp').pid, flush=True)\n"
         "time.sleep(60)\n"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=child_environment())
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
     assert psutil.pid_exists(child)
