@@ -58,6 +58,17 @@ def pytest_collection() -> Iterator[None]:
         gc.enable()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test that is tried again gets new fixtures of its module: what failed may be what these have seen or broken."""
+    if getattr(item, "execution_count", 1) < 2 or not isinstance(item, pytest.Function):
+        return
+    for definitions in item._fixtureinfo.name2fixturedefs.values():
+        for definition in definitions:
+            if definition.scope != "session":
+                definition.finish(item._request)
+
+
 @pytest.hookimpl(trylast=True)  # after those that were not chosen have gone
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """A starved machine misses deadlines, and no arm should move on then: what is `realtime` is tried thrice.
