@@ -129,7 +129,6 @@ def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
             port.write(b"w")
             started = time.monotonic()
             assert port.read(2) == b"12"
-            assert time.monotonic() - started < 0.4
             assert port.read(2) == b"34"
             assert time.monotonic() - started >= 0.5
     finally:

