@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
 from orchestrator.daemon.store import Store, StoreError
 from orchestrator.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
 from orchestrator.journal_check import JournalDamagedError, check_journal
@@ -111,7 +112,9 @@ def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) ->
             journal.append(Kind.NOTE, {{"number": number}})
             print(number, flush=True)
     """
-    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True, env=child_environment()
+    )
     assert process.stdout is not None
     for line in process.stdout:
         if int(line) >= 300:
@@ -135,7 +138,11 @@ def test_a_second_process_is_refused_and_told_who_is_first(path: Path) -> None:
         input()
     """
     process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", textwrap.dedent(code)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=child_environment(),
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "open\n"

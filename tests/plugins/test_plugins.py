@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
 from tests.end_to_end import small
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +28,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = tmp_path_factory.mktemp("source")
     shutil.copy(ROOT / "tests" / "plugins" / "pyproject.toml", source)
     shutil.copytree(ROOT / "tests" / "plugins" / "decant_example", source / "decant_example")
-    subprocess.run([*install, "--target", str(folder), str(source)], check=True)
+    subprocess.run([*install, "--target", str(folder), str(source)], check=True, env=child_environment())
     return folder
 
 
