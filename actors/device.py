@@ -22,7 +22,7 @@ LOOK_DEADLINE = 60.0
 """A process that was there once, and says nothing for so long, is lost [s]."""
 
 START_DEADLINE = 120.0
-"""So is one that has never been there [s]: machines may be busy while it starts."""
+"""Longest time for a process to start [s]: machines may be busy. Deadlines of calls begin after it."""
 
 
 class DeviceLostError(LaboratoryError):
@@ -47,7 +47,7 @@ class Device(Protocol):
         Args:
             method: name of the object's method.
             args: its arguments, values that travel.
-            deadline: longest time to wait [s].
+            deadline: longest time to wait [s], from the start of its process on.
             urgent: don't queue behind other calls.
 
         Raises:
@@ -162,21 +162,31 @@ class RayDevice:
             raise LaboratoryError(f"{self.name}: '{method}' failed: {error.cause!r}") from error
 
     async def _waited(self, future: asyncio.Future[Any], deadline: float) -> float:
-        """Wait for an answer until it is there, or not to be hoped for; how long that took [s]."""
+        """Wait for an answer until it is there, or not to be hoped for; how long that took [s].
+
+        The deadline begins when the process is there: its start has a deadline of its own. A busy machine needs more
+        time for it than a driver may take to answer.
+        """
         clock = asyncio.get_running_loop().time
+        started = clock()
+        if not self._met and not await self._answers(future, START_DEADLINE):
+            return clock() - started
+        self._met = True
         begin = clock()
         while not future.done() and (left := begin + deadline - clock()) > 0.0:
             await asyncio.wait({future}, timeout=min(left, LOOK_INTERVAL) if self._looked_after else left)
             if future.done() or not self._looked_after or clock() - begin >= deadline:
                 break
-            look = asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
-            look.add_done_callback(_seen)
-            patience = LOOK_DEADLINE if self._met else START_DEADLINE
-            await asyncio.wait({future, look}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
-            if not look.done() and not future.done():
+            if not await self._answers(future, LOOK_DEADLINE):
                 break
-            self._met = True
-        return clock() - begin
+        return clock() - started
+
+    async def _answers(self, future: asyncio.Future[Any], patience: float) -> bool:
+        """Whether the process answers anything within a time [s], be it the call that is waited for."""
+        look = asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
+        look.add_done_callback(_seen)
+        done, _ = await asyncio.wait({future, look}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
+        return bool(done)
 
     def abandon(self, reason: str) -> None:
         """Whoever waits for an answer, or will ask, is told that none comes: Ray itself is gone.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
+from actors.balance.spec import SerialBalanceSpec
 from actors.bench.opening import MakeDevice, OpenBench, needs_person, open_bench
 from actors.device import Device, LocalDevice, RayDevice
 from actors.operator import Operator
@@ -26,7 +27,7 @@ from actors.simulation.job_runner import Simulator, pour_simulator
 from actors.simulation.pool import RaySimulatorPool
 from actors.simulation.processes import ProcessSimulatorPool
 from actors.spec import LaboratorySpec, simulator_count
-from sim_engine.extras import installed
+from sim_engine.extras import EXTRAS, PACKAGES, installed
 
 if TYPE_CHECKING:
     from actors.cluster.joined import JoinedCluster
@@ -43,6 +44,8 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
     Raises:
         LaboratoryError: with what is wrong and what would be right.
     """
+    if need_bench:
+        check_bench_packages(spec)
     if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
@@ -57,6 +60,26 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
         from actors.cluster.probe import check_cluster
 
         check_cluster(spec.ray, need_bench=need_bench)
+
+
+def check_bench_packages(spec: LaboratorySpec) -> None:
+    """Whether the packages are installed that reach, or emulate, the arm and the balance of a laboratory.
+
+    Raises:
+        LaboratoryError: some are not; the text names them and their extra.
+    """
+    if spec.arm is None or (spec.arm.stand_in == "" and spec.arm.missing() is None and spec.balance is None):
+        return
+    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.stand_in else []
+    if spec.balance is not None and isinstance(spec.balance.device, SerialBalanceSpec):
+        needed.append("serial")
+    missing = [module for module in needed if not installed(module)]
+    if missing:
+        names = " and ".join(f"'{PACKAGES.get(module, module)}'" for module in missing)
+        raise LaboratoryError(
+            f"laboratory {spec.name}: arm and balance need {names}, not installed here: pip install "
+            f"'decant[{EXTRAS[missing[0]]}]'"
+        )
 
 
 def _without_ray(spec: LaboratorySpec, *, need_bench: bool, brief: bool) -> bool:

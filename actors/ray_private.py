@@ -13,17 +13,17 @@ import logging
 import os
 import re
 import secrets
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
 
+from actors.child_process import ChildProcess, python_module
 from actors.protocols import LaboratoryError
 from actors.ray_warden import MARK, end_cluster
 from actors.spec import LaboratorySpec, simulator_count
@@ -47,7 +47,7 @@ class PrivateRay:
 
     folder: Path
     lock: TextIOWrapper
-    warden: subprocess.Popen[bytes]
+    warden: ChildProcess
 
     def settings(self) -> dict[str, str]:
         """What has to be in the environment before Ray starts (`actors.ray_settings`)."""
@@ -124,13 +124,7 @@ def open_private() -> PrivateRay:
     token = folder / "token"
     token.touch(mode=0o600)
     token.write_text(_TOKEN)
-    warden = subprocess.Popen(
-        [sys.executable, "-m", "actors.ray_warden", str(folder)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C in the terminal is not meant for it
-    )
+    warden = ChildProcess(python_module("actors.ray_warden", str(folder)), output=False, errors="dropped")
     return PrivateRay(folder, lock, warden)
 
 
@@ -138,13 +132,7 @@ def close_private(private: PrivateRay) -> None:
     """End all its processes and remove its folder."""
     end_cluster(private.folder, patience=15.0)
     private.lock.close()
-    if private.warden.stdin is not None:
-        private.warden.stdin.close()
-    try:
-        private.warden.wait(timeout=15.0)
-    except subprocess.TimeoutExpired:
-        private.warden.kill()
-        private.warden.wait()
+    private.warden.close(15.0)
 
 
 def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
@@ -155,32 +143,27 @@ def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
     """
     import ray
 
-    os.environ[MARK] = str(private.folder)
-    try:
-        for attempt in range(3):
-            try:
-                with _bare_ray():
-                    ray.init(
-                        address="local",
-                        num_cpus=simulator_count(spec),
-                        num_gpus=0,
-                        object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
-                        include_dashboard=False,
-                        logging_level=logging.ERROR,
-                        log_to_driver=False,
-                        _temp_dir=str(private.folder),
-                        _node_ip_address="127.0.0.1",
-                    )
-                break
-            except Exception:
-                # Two programs that start at once may be given the same free port.
-                ray.shutdown()
-                if attempt == 2:
-                    raise
-                time.sleep(1.0 + attempt)
-    finally:
-        # Programs that this one starts later are not Ray's and must not be ended with it.
-        del os.environ[MARK]
+    for attempt in range(3):
+        try:
+            with _bare_ray(), _marked(private.folder):
+                ray.init(
+                    address="local",
+                    num_cpus=simulator_count(spec),
+                    num_gpus=0,
+                    object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
+                    include_dashboard=False,
+                    logging_level=logging.ERROR,
+                    log_to_driver=False,
+                    _temp_dir=str(private.folder),
+                    _node_ip_address="127.0.0.1",
+                )
+            break
+        except Exception:
+            # Two programs that start at once may be given the same free port.
+            ray.shutdown()
+            if attempt == 2:
+                raise
+            time.sleep(1.0 + attempt)
     address = ray.util.get_node_ip_address()
     if address != "127.0.0.1":
         raise LaboratoryError(f"Ray listens on {address} instead of this machine only; was it imported too early?")
@@ -206,6 +189,27 @@ def _bare_ray() -> Iterator[None]:
     finally:
         for name, method in before.items():
             setattr(Node, name, method)
+
+
+@contextlib.contextmanager
+def _marked(folder: Path) -> Iterator[None]:
+    """Ray's processes that are started within this carry the cluster's mark, and their children inherit it.
+
+    The mark is not in this program's own environment: programs that it starts meanwhile are not Ray's, and must not be
+    ended with it.
+    """
+    from ray._private import services
+
+    start = services.start_ray_process
+
+    def start_marked(*args: Any, env_updates: dict[str, str] | None = None, **settings: Any) -> Any:
+        return start(*args, env_updates={**(env_updates or {}), MARK: str(folder)}, **settings)
+
+    services.start_ray_process = start_marked
+    try:
+        yield
+    finally:
+        services.start_ray_process = start
 
 
 def forget_logs(private: PrivateRay) -> int:

@@ -21,6 +21,8 @@ from typing import Any
 from machine import describe, pin, say, show
 from standard_pour import check_particles
 
+from actors.child_process import child_environment
+
 SOURCE = Path(__file__).with_name("core_limit.c")
 MACHINES = {"x86_64": ("x86-64-v3", "native"), "AMD64": ("x86-64-v3", "native")}
 """What `-march` to try; short loops are often faster with narrower vectors than the processor has."""
@@ -45,8 +47,12 @@ def run(compiler: str, particles: int) -> list[dict[str, Any]]:
         for march in MACHINES.get(platform.machine(), ("native",)):
             flags = ["-O3", f"-march={march}", "-ffast-math"]
             try:
-                subprocess.run([compiler, *flags, str(SOURCE), "-lm", "-o", program], check=True)
-                done = subprocess.run([program, str(particles)], check=True, capture_output=True, text=True)
+                subprocess.run(
+                    [compiler, *flags, str(SOURCE), "-lm", "-o", program], check=True, env=child_environment()
+                )
+                done = subprocess.run(
+                    [program, str(particles)], check=True, capture_output=True, text=True, env=child_environment()
+                )
             except (OSError, subprocess.CalledProcessError) as problem:
                 raise SystemExit(f"{SOURCE.name} with -march={march}: {problem}") from None
             names = ("full_lists_ns", "full_iteration_ns", "half_lists_ns", "half_iteration_ns")

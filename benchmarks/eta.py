@@ -23,6 +23,8 @@ from typing import Any
 
 from machine import ROOT, describe, say, show
 
+from actors.child_process import child_environment
+
 LIMIT = 0.2
 """Largest error of a time that is told, as a share of the whole run."""
 
@@ -84,7 +86,9 @@ def run(bench: str, seed: int) -> dict[str, Any]:
         laboratory = configs / "laboratories" / LABORATORIES[bench]
         command = [sys.executable, "-c", program, "run", str(campaign), "--laboratory", str(laboratory)]
         command += ["--seed", str(seed), "--json"]
-        process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=child_environment()
+        )
         begun = closed = None
         started = time.monotonic()
         try:

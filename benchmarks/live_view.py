@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from actors.child_process import child_environment
 from actors.optimizer.core.problem import Data, SuggestProblem
 from actors.optimizer.core.propose import propose
 from actors.protocols import PourProgress
@@ -179,7 +180,9 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
     def full(folder: Path) -> Iterator[Watching]:
         mount = folder / "full"
         mount.mkdir()
-        done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(mount)], check=False)
+        done = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(mount)], check=False, env=child_environment()
+        )
         if done.returncode:
             raise SystemExit("the case of a full disk needs the right to mount a tmpfs of 1 MiB")
         try:
@@ -188,7 +191,7 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
                 yield Watching(monitor, {"writer": psutil.Process(monitor.pid)}, monitor.path)
                 monitor.close(PATIENCE)
         finally:
-            subprocess.run(["umount", "-l", str(mount)], check=False)
+            subprocess.run(["umount", "-l", str(mount)], check=False, env=child_environment())
 
     @contextlib.contextmanager
     def stopped_writer(folder: Path) -> Iterator[Watching]:
@@ -216,7 +219,9 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
 def viewer(view: LiveView, kept: Path) -> Iterator[int]:
     """One who watches; gives its process id."""
     command = [rerun_program(), "--save", str(kept), "--connect", view.stream, "--port", "auto"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment())
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=child_environment(environment())
+    )
     try:
         with guarded(process.pid):
             yield process.pid
@@ -231,7 +236,9 @@ _GUARD = "import os, sys; sys.stdin.read(); os.kill(int(sys.argv[1]), 9)"
 @contextlib.contextmanager
 def guarded(pid: int) -> Iterator[None]:
     """A process that would stay, stopped perhaps, if this script were killed, is ended then."""
-    guard = subprocess.Popen([sys.executable, "-c", _GUARD, str(pid)], stdin=subprocess.PIPE, start_new_session=True)
+    guard = subprocess.Popen(
+        [sys.executable, "-c", _GUARD, str(pid)], stdin=subprocess.PIPE, start_new_session=True, env=child_environment()
+    )
     try:
         yield
     finally:

@@ -15,6 +15,7 @@ from typing import Any
 
 import psutil
 
+from actors.child_process import child_environment
 from sim_engine.cache import ENVIRONMENT_VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -144,7 +145,9 @@ def _solver() -> str:
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(ROOT), *arguments, "--", "sim_engine"]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, env=child_environment()
+        ).stdout.strip()
 
     try:
         return git("log", "-1", "--format=%h") + (" with changes" if git("status", "--porcelain") else "")

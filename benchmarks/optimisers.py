@@ -33,6 +33,7 @@ from machine import describe, pin, say, show, single_threaded
 from optimiser_problems import BY_NAME, PROBLEMS, Instance
 from optimiser_rivals import RIVALS, luckiest, play
 
+from actors.child_process import child_environment
 from actors.optimizer.core.problem import Data, MeanName, NoiseName, SuggestProblem
 from actors.optimizer.core.propose import propose
 from sim_engine.cache import cache_directory
@@ -59,7 +60,7 @@ def environment() -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     venv.create(folder, with_pip=True)
     command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *REQUIREMENTS]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=child_environment())
     if done.returncode != 0:
         raise SystemExit(f"the others can't be installed; pip says:\n{done.stderr.strip()}")
     ready.touch()

@@ -31,6 +31,7 @@ from standard_pour import (
     vessels,
 )
 
+from actors.child_process import child_environment
 from sim_engine.cache import cache_directory
 from sim_engine.contact import rotations
 from sim_engine.fill import fill
@@ -120,7 +121,7 @@ def environment() -> Path:
 
 def _install(python: Path) -> None:
     command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *REQUIREMENTS]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=child_environment())
     if done.returncode != 0:
         raise SystemExit(
             f"{' '.join(REQUIREMENTS)} can't be installed for Python {sys.version_info[0]}.{sys.version_info[1]}: is "
@@ -130,7 +131,9 @@ def _install(python: Path) -> None:
 
 def _import_trouble(python: Path) -> str | None:
     """Why the peer can't be imported; None if it can. A segmentation fault is the usual way to fail."""
-    done = subprocess.run([str(python), "-c", f"import {MODULE}"], check=False, capture_output=True, text=True)
+    done = subprocess.run(
+        [str(python), "-c", f"import {MODULE}"], check=False, capture_output=True, text=True, env=child_environment()
+    )
     if done.returncode == 0:
         return None
     return f"signal {-done.returncode}" if done.returncode < 0 else done.stderr.strip().splitlines()[-1]
@@ -140,7 +143,9 @@ def _use_libraries_of_the_system(folder: Path) -> None:
     """Put links to the system's OpenGL libraries where the wheel's own are."""
     if not sys.platform.startswith("linux"):
         return
-    told = subprocess.run(["/sbin/ldconfig", "-p"], check=False, capture_output=True, text=True).stdout
+    told = subprocess.run(
+        ["/sbin/ldconfig", "-p"], check=False, capture_output=True, text=True, env=child_environment()
+    ).stdout
     here = dict(line.strip().split(" => ", 1) for line in told.splitlines() if " => " in line)
     paths = {name.split(" ", 1)[0]: path for name, path in reversed(list(here.items()))}
     for bundled in folder.glob(f"lib/python*/site-packages/{MODULE}.libs/*.so*"):

@@ -25,5 +25,5 @@ def build_campaign(content: Mapping[str, Any], folder: Path | str = ".") -> Camp
     Raises:
         ConfigError: anything is wrong with it; all problems at once, with their places.
     """
-    path = Path(folder).resolve() / "campaign.json"
+    path = Path(folder).expanduser().resolve() / "campaign.json"
     return campaign_from(Document.parse(json.dumps(content, indent=2, ensure_ascii=False), path))

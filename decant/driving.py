@@ -67,7 +67,7 @@ def run(
     """
     stages = stages_of(campaign)
     _check(campaign, stages, in_process)
-    directory = create_run(campaign) if resume is None else Path(resume)
+    directory = create_run(campaign) if resume is None else Path(resume).expanduser()
     return _begun(campaign, stages, watch, directory, in_process, resume=resume is not None)
 
 
@@ -153,7 +153,7 @@ def plan(
     for name, value in (("seeds", seeds), ("iterations", 1 if iterations is None else iterations)):
         if value < 1:
             raise InvalidArgumentError(f"{name}={value!r}: should be 1 or more")
-    vessel = load_vessel(receiver) if isinstance(receiver, str | Path) else receiver
+    vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
     given = _given(theta, campaign)
     found = planned(campaign, given.theta, vessel, iterations, given.draws, given.left_over)
     deployment = found.deployment
@@ -170,7 +170,7 @@ def _given(theta: SimulationParameters | Run | Path | str | None, campaign: Camp
     if isinstance(theta, SimulationParameters):
         return GivenTheta(theta)
     if not isinstance(theta, Run):
-        return read_theta(Path(theta), campaign)
+        return read_theta(Path(theta).expanduser(), campaign)
     found, recommended = theta.calibrated, theta.theta
     if found is None or recommended is None:
         raise InvalidArgumentError(f"theta: run {theta.directory} has found no θ*; give one that has calibrated")

@@ -128,7 +128,7 @@ class Run:
             OSError: it can't be written.
             RunError: the journal can't be read.
         """
-        return report_on(self.campaign, self.result, None if path is None else Path(path))[0]
+        return report_on(self.campaign, self.result, None if path is None else Path(path).expanduser())[0]
 
     def save_tables(self, directory: Path | str | None = None) -> list[Path]:
         """Write all tables as Parquet files.
@@ -140,7 +140,7 @@ class Run:
             MissingExtraError: pyarrow is not installed.
         """
         require("pyarrow", "Parquet")
-        folder = self.directory / "tables" if directory is None else Path(directory)
+        folder = self.directory / "tables" if directory is None else Path(directory).expanduser()
         folder.mkdir(parents=True, exist_ok=True)
         paths = []
         for name in ("pours", "simulations", "decisions", "curves", "outflows"):
@@ -237,7 +237,7 @@ def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run
         JournalError: its journal can't be read.
         ConfigError: its campaign can't be read.
     """
-    folder = Path(directory)
+    folder = Path(directory).expanduser()
     if not (folder / JOURNAL_NAME).is_file():
         raise FileNotFoundError(f"{folder}: there is no run in this folder (no {JOURNAL_NAME})")
     plan = load_campaign(folder / "resolved.json") if campaign is None else campaign

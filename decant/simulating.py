@@ -84,7 +84,7 @@ def simulate(
         raise InvalidArgumentError(f"seeds={seeds!r}: should be 1 or more")
     scene, space = scene_to_simulate(campaign)
     if receiver is not None:
-        vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver))
+        vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver).expanduser())
         scene = replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     chosen = assigned_action(
         [f"{name}={value}" for name, value in (action or {}).items()], fixed=scene.fixed, space=space

@@ -23,6 +23,8 @@ from typing import Any
 import httpx
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from actors.child_process import child_environment
+
 FOLDER = Path(__file__).parent / "images" / "daemon"
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1440, 1080)}
 PATIENCE = 300.0
@@ -89,7 +91,9 @@ class Lab:
         """`decant serve`."""
         command = [Path(sys.executable).with_name("decant"), "serve", settings, "--state", self.state]
         with (self.folder / "log").open("ab") as log:
-            self.process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, start_new_session=True)
+            self.process = subprocess.Popen(
+                command, cwd=self.folder, stdout=log, stderr=log, start_new_session=True, env=child_environment()
+            )
         until((self.state / "url").is_file)
         self.url = (self.state / "url").read_text().strip()
         lines = (self.state / "tokens").read_text().splitlines()

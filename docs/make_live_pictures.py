@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from actors.child_process import child_environment
 from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
 from orchestrator.monitor.live import LiveView
 
@@ -88,6 +89,7 @@ def running(campaign: Path) -> Iterator[tuple[subprocess.Popen[str], str, Path]]
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        env=child_environment(),
     )
     try:
         assert process.stdout is not None

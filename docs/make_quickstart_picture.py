@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from actors.child_process import child_environment
 from orchestrator.journal import JOURNAL_NAME, JournalReader
 from orchestrator.report import style
 from orchestrator.report.results import deployments_of
@@ -58,7 +59,9 @@ def simulate(path: Path, run: Path, learnt: Deployed) -> None:
     values = [f"--set={name}={best[name] / style.display_factor(name)}" for name in ("angular_velocity", "x_offset")]
     decant = str(Path(sys.executable).parent / "decant")
     theta = f"--parameters={run / 'theta.json'}"
-    subprocess.run([decant, "simulate", str(CAMPAIGN), *values, theta, f"--png={path}"], check=True)
+    subprocess.run(
+        [decant, "simulate", str(CAMPAIGN), *values, theta, f"--png={path}"], check=True, env=child_environment()
+    )
 
 
 def draw_pours(path: Path, runs: list[Deployed]) -> None:

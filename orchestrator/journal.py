@@ -3,8 +3,9 @@
 Every entry is one row: sequence number, stage, time, kind, JSON body. Nothing is ever changed or deleted (triggers
 refuse it). Entries written together (`append_all`) are there together or not at all, whenever the process dies. Pours
 are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL), everything else
-survives the death of the process, and a power cut but for its last moments. A full disk takes no pour's records away:
-see `orchestrator.reserve`.
+survives the death of the process, and a power cut but for its last moments. At a pour the write-ahead log is copied
+into the file, and the entry is repeated in a ledger (`orchestrator.pour_ledger`), so that a lost or changed journal is
+detected: see `orchestrator.journal_check`. A full disk takes no pour's records away: see `orchestrator.reserve`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import contextlib
 import json
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
@@ -22,16 +24,24 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from orchestrator.codec import canonical, digest, first_difference
+from orchestrator.journal_check import check_journal, has_begun, traces_of_a_run
 from orchestrator.journal_file import (
-    FORMAT,
+    WITHOUT_CHAIN,
+    EventRow,
     Header,
     JournalError,
+    add_chain,
+    chain_of,
+    chained,
+    check_format,
+    checkpoint,
     connect,
     connect_writer,
     has_tables,
     lay_out,
     take_lock,
 )
+from orchestrator.pour_ledger import BEGUN, LEDGER_NAME, LedgerLine, PourLedger, read_ledger
 from orchestrator.reserve import MB, Reserve, free_space
 from orchestrator.states import State
 
@@ -48,7 +58,7 @@ class Kind(StrEnum):
     REQUESTED = "requested"  # id, request
     STARTED = "started"  # id
     FINISHED = "finished"  # id, outcome, seconds
-    POUR_STARTED = "pour.started"  # id, attempt
+    POUR_STARTED = "pour.started"  # id, attempt, number
     POUR_WITHDRAWN = "pour.withdrawn"  # id, reason: nothing was poured, it may be poured later
     POUR_FINISHED = "pour.finished"  # id, outcome, seconds
     TOLD = "told"  # id
@@ -58,7 +68,8 @@ class Kind(StrEnum):
     NOTE = "note"  # text
 
 
-_DURABLE = frozenset({Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED, Kind.OPERATOR_ANSWERED})
+_IN_LEDGER = frozenset({Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED})
+_DURABLE = _IN_LEDGER | {Kind.OPERATOR_ANSWERED}
 
 
 @dataclass(frozen=True)
@@ -119,6 +130,9 @@ class JournalReader:
             after: only those with a larger sequence number.
             stage: only those of one stage.
             kinds: only those of some kinds.
+
+        Raises:
+            JournalError: the file is damaged.
         """
         query = "select seq, stage, t, kind, body from event where seq > ?"
         arguments: list[Any] = [after]
@@ -129,14 +143,22 @@ class JournalReader:
             names = [str(kind) for kind in kinds]
             query += f" and kind in ({', '.join('?' * len(names))})"
             arguments += names
-        for row in self._connection.execute(query + " order by seq", arguments):
-            yield Entry(row[0], row[1], row[2], row[3], json.loads(row[4]))
+        try:
+            for row in self._connection.execute(query + " order by seq", arguments):
+                yield Entry(row[0], row[1], row[2], row[3], _body(row[0], row[4]))
+        except (sqlite3.DatabaseError, _BodyError) as error:
+            raise JournalError(f"{self.path}: is damaged ({error}); see `decant runs check`") from error
 
     def state(self) -> State:
         """The campaign's last written state."""
         last = State.QUEUED
         for entry in self.entries(kinds=[Kind.CAMPAIGN_STATE]):
-            last = State(entry.body["after"])
+            try:
+                last = State(entry.body["after"])
+            except (KeyError, ValueError) as error:
+                raise JournalError(
+                    f"{self.path}: entry {entry.seq} is damaged ({error}); see `decant runs check`"
+                ) from None
         return last
 
     def stage_results(self) -> dict[str, dict[str, Any]]:
@@ -157,12 +179,25 @@ class JournalReader:
             raise JournalError(f"{self.path}: not a journal of Decant ({error})") from error
         if row is None:
             raise JournalError(f"{self.path}: the journal has no header; it is damaged")
-        if row[0] != FORMAT:
-            raise JournalError(
-                f"{self.path}: written in format {row[0]}, this version of Decant reads format {FORMAT}; "
-                "go on with the version that began the run (see versions.json beside it) or begin a new run"
-            )
-        return Header(row[1], json.loads(row[2]), row[3])
+        check_format(row[0], self.path)
+        try:
+            return Header(row[1], json.loads(row[2]), row[3])
+        except ValueError as error:
+            raise JournalError(f"{self.path}: the journal's header is damaged ({error})") from None
+
+
+class _BodyError(ValueError):
+    """The body of an entry is damaged."""
+
+
+def _body(seq: int, text: str) -> dict[str, Any]:
+    try:
+        body = json.loads(text)
+    except ValueError as error:
+        raise _BodyError(f"entry {seq}: {error}") from None
+    if not isinstance(body, dict):
+        raise _BodyError(f"entry {seq}: its body is not a mapping")
+    return body
 
 
 class Journal(JournalReader):
@@ -175,6 +210,9 @@ class Journal(JournalReader):
         self._durable = False
         self._reserve = Reserve(path.with_suffix(".reserve"))
         self.header = self._read_header()
+        self._last = _last_of_chain(connection)
+        self._unwritten: list[LedgerLine] = []
+        self._ledger: PourLedger
 
     @classmethod
     def create(cls, path: Path, header: Header) -> Journal:
@@ -182,36 +220,47 @@ class Journal(JournalReader):
 
         Raises:
             JournalLockedError: another process is writing it.
-            JournalError: it holds a run already, or can't be written.
+            JournalError: it holds a run already, or traces of one, or can't be written.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
+        # A recording may be there: the program that is about to run the campaign has opened it.
+        traces = [name for name in traces_of_a_run(path) if not name.endswith(".rrd")]
         with contextlib.ExitStack() as opened:
             lock = opened.enter_context(take_lock(path))
+            if traces and not path.is_file():
+                raise JournalError(
+                    f"{path}: a run was begun here ({', '.join(traces)}), and its journal is missing: pours could be "
+                    "repeated. Restore the journal, or begin in another directory"
+                )
             connection = opened.enter_context(closing(connect_writer(path)))
             if has_tables(connection, path):
                 raise JournalError(f"{path}: holds a run already; resume that one, or begin in another directory")
             lay_out(connection, header, path)
             journal = cls(path, lock, connection)
+            journal._ledger = journal._open_ledger()
             opened.pop_all()
             return journal
 
     @classmethod
     def resume(cls, path: Path, header: Header) -> Journal:
-        """Go on with a journal. One whose process died before it had written anything is begun anew.
+        """Go on with a journal. One whose process died before it had written anything is begun again.
 
         Raises:
             JournalLockedError: another process is writing it.
+            JournalDamagedError: it has lost or changed entries.
             JournalError: there is none, it has another format, or it belongs to another campaign.
         """
-        if not path.is_file():
+        if not has_begun(path):
             raise JournalError(f"{path}: there is no journal to resume; begin the campaign without --resume")
         with contextlib.ExitStack() as opened:
             lock = opened.enter_context(take_lock(path))
+            check_journal(path).require()
             connection = opened.enter_context(closing(connect_writer(path)))
             if not has_tables(connection, path):
                 lay_out(connection, header, path)
             journal = cls(path, lock, connection)
             journal._check_same_campaign(header)
+            journal._ledger = journal._open_ledger()
             opened.pop_all()
             return journal
 
@@ -245,35 +294,96 @@ class Journal(JournalReader):
         if durable != self._durable:
             self._connection.execute(f"pragma synchronous = {'full' if durable else 'normal'}")
             self._durable = durable
-        now = time.time()
-        rows = [(draft.stage, now, str(draft.kind), canonical(draft.body)) for draft in drafts]
+        now, (seq, digest) = time.time(), self._last
+        rows: list[EventRow] = []
+        links: list[tuple[int, bytes]] = []
+        lines: list[LedgerLine] = []
+        for draft in drafts:
+            seq += 1
+            rows.append((seq, draft.stage, now, str(draft.kind), canonical(draft.body)))
+            digest = chained(digest, rows[-1])
+            links.append((seq, digest))
+            if draft.kind in _IN_LEDGER:
+                lines.append(LedgerLine(seq, digest.hex(), now, str(draft.kind), draft.stage, draft.body))
         try:
-            try:
-                self._insert(rows)
-            except sqlite3.OperationalError:
-                if not self._reserve.release():
-                    raise
-                self._insert(rows)
-        except sqlite3.OperationalError as error:
+            self._with_reserve(lambda: self._insert(rows, links))
+            self._last = seq, digest
+            if lines:
+                self._unwritten += lines
+                self._with_reserve(lambda: self._ledger.append(self._unwritten))
+                self._unwritten = []
+        except (sqlite3.OperationalError, OSError) as error:
             raise JournalError(
                 f"{self.path}: can't be written ({error}; {free_space(self.path) / MB:.1f} MB are free on its disk); "
                 "what is in it is safe. Mend that and resume the run"
             ) from error
+        if durable:
+            checkpoint(self._connection)
 
-    def _insert(self, rows: Sequence[tuple[str, float, str, str]]) -> None:
+    def _with_reserve(self, write: Callable[[], None]) -> None:
+        """Write; if that fails, once more in the room of the reserve."""
+        try:
+            write()
+        except (sqlite3.OperationalError, OSError):
+            if not self._reserve.release():
+                raise
+            write()
+
+    def _insert(self, rows: Sequence[EventRow], links: Sequence[tuple[int, bytes]]) -> None:
         try:
             self._connection.execute("begin immediate")
-            self._connection.executemany("insert into event (stage, t, kind, body) values (?, ?, ?, ?)", rows)
+            self._connection.executemany("insert into event (seq, stage, t, kind, body) values (?, ?, ?, ?, ?)", rows)
+            self._connection.executemany("insert into chain values (?, ?)", links)
             self._connection.execute("commit")
         except BaseException:
             if self._connection.in_transaction:  # SQLite itself rolls back where the disk is full
                 self._connection.execute("rollback")
             raise
 
+    def _open_ledger(self) -> PourLedger:
+        """The ledger, with everything that the journal has about pours. A journal of an older version gets its chain.
+
+        Raises:
+            JournalError: it can't be written.
+        """
+        path = self.path.with_name(LEDGER_NAME)
+        try:
+            if not path.is_file():
+                old = self._lines_about_pours(after=0)
+                (seq, digest), created = self._last, self.header.created
+                body = {"name": self.header.name, "created": created, "entries": seq}
+                ledger = PourLedger.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body), *old])
+            else:
+                ledger = PourLedger.resume(path)
+                if missing := self._lines_about_pours(after=max(line.seq for line in read_ledger(path))):
+                    ledger.append(missing)
+            if self._connection.execute("select format from header").fetchone()[0] == WITHOUT_CHAIN:
+                add_chain(self._connection)
+                checkpoint(self._connection)
+            return ledger
+        except (sqlite3.OperationalError, OSError) as error:
+            raise JournalError(
+                f"{path}: can't be written ({error}; {free_space(self.path) / MB:.1f} MB are free)"
+            ) from error
+
+    def _lines_about_pours(self, *, after: int) -> list[LedgerLine]:
+        found = [
+            LedgerLine(row[0], digest.hex(), row[2], row[3], row[1], json.loads(row[4]))
+            for row, digest in chain_of(self._connection)
+            if row[0] > after and row[3] in _IN_LEDGER
+        ]
+        if any(line.kind == Kind.POUR_STARTED and "number" not in line.body for line in found):
+            asked = {entry.body["id"]: entry.body["request"] for entry in self.entries(kinds=[Kind.REQUESTED])}
+            for line in found:
+                if line.kind == Kind.POUR_STARTED:
+                    line.body["number"] = asked[line.body["id"]]["number"]
+        return found
+
     def close(self) -> None:
         """Give file, lock and reserve back. May be called twice."""
         self._reserve.release()
         self._connection.close()
+        self._ledger.close()
         self._lock.close()
 
     def _check_same_campaign(self, header: Header) -> None:
@@ -284,3 +394,9 @@ class Journal(JournalReader):
             f"{self.path}: this run was begun with other settings, and its next steps depend on them: {difference}. "
             "Set that back to resume it, or begin a new run"
         )
+
+
+def _last_of_chain(connection: sqlite3.Connection) -> tuple[int, bytes]:
+    """The last entry's sequence number and digest; the header's, as number 0, if there is none."""
+    ((row, digest),) = deque(chain_of(connection), maxlen=1)
+    return row[0], digest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Any
 
 from sim_engine.doors import Broken, Door
@@ -36,6 +37,17 @@ def doors() -> tuple[Door[Any], ...]:
 def installed() -> list[Plugin]:
     """What is usable, ours as everybody's, by door and name."""
     return [Plugin(door.group, name, door.package(name)) for door in doors() for name in door.names]
+
+
+def packages() -> dict[str, tuple[str, list[str]]]:
+    """Packages from outside that register something: version, and what ('decant.balances: spring'). Loads nothing."""
+    found: dict[str, tuple[str, list[str]]] = {}
+    for door in doors():
+        for entry in entry_points(group=door.group):
+            if entry.dist is not None and entry.dist.name != "decant":
+                _, names = found.setdefault(entry.dist.name, (entry.dist.version, []))
+                names.append(f"{door.group}: {entry.name}")
+    return found
 
 
 def broken() -> list[Broken]:

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from orchestrator.catalogue.reading import read_run
 from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal_check import check_journal
 from orchestrator.occupancy import occupancies
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import regimes
@@ -17,11 +19,12 @@ from orchestrator.report.campaign import draw_figures
 from orchestrator.report.names import receiver_names
 from orchestrator.report.record import read_record
 from orchestrator.report.results import evaluation_of, theta_of
-from orchestrator.report.run_page import REPORT_NAME, run_page
+from orchestrator.report.run_page import REPORT_NAME, reduced_run_page, run_page
 from orchestrator.report.summarise import summarise
-from orchestrator.report.summary import PoolUse, RunSummary, Totals, write_summary
+from orchestrator.report.summary import SUMMARY_NAME, PoolUse, RunSummary, Totals, write_summary
 from orchestrator.run_result import CampaignResult
-from orchestrator.runs import VERSIONS
+from orchestrator.runs import read_versions
+from orchestrator.states import State
 from orchestrator.strategies.calibration.base import CalibratedTheta
 from orchestrator.strategies.calibration.evaluation import Scores
 from orchestrator.strategies.calibration.scorecard import UNCALIBRATED, recommended_theta, shift_left_over
@@ -85,16 +88,38 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
     Raises:
         OSError: a file can't be written.
     """
-    directory = result.directory
     if recording is not None:
         recording.close()
+        return _write(plan, result, recording.path, recording.dropped)
+    return _write(plan, result, None, 0)
+
+
+def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
+    """Publish a finished run whose process ended before `summary.json` or `theta.json` was written.
+
+    Returns:
+        Whether anything was missing.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    expected = [SUMMARY_NAME, *([] if theta_of(result.results) is None else [THETA_FILE])]
+    if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
+        return False
+    recording = result.directory / "campaign.rrd"
+    _write(plan, result, recording if recording.is_file() else None, 0)
+    return True
+
+
+def _write(plan: CampaignPlan, result: CampaignResult, recording: Path | None, dropped: int) -> Published:
+    directory = result.directory
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
     summary = summary_of(
         plan,
         result,
         figures,
-        recording=None if recording is None else recording.path,
-        dropped_events=0 if recording is None else recording.dropped,
+        recording=recording,
+        dropped_events=dropped,
     )
     write_summary(directory, summary)
     found = theta_of(result.results)
@@ -108,7 +133,7 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
     except Exception as error:  # days of pouring don't end in a traceback about a page
         _log.warning("the report was not written: %s: %s", type(error).__name__, error)
         report = None
-    return Published(summary, figures, None if recording is None else recording.path, theta, report)
+    return Published(summary, figures, recording, theta, report)
 
 
 def summary_of(
@@ -162,14 +187,38 @@ def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory:
         OSError: it can't be written, or a figure can't be read.
         RunError: the journal can't be read.
     """
+    check = check_journal(directory / JOURNAL_NAME)
     with JournalReader(directory / JOURNAL_NAME) as journal:
         record = read_record(journal)
-    try:
-        versions = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        versions = {}
+    versions = read_versions(directory)
+    return _write_page(path, run_page(plan, summary, record, directory, versions=versions, check=check))
+
+
+def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
+    """Write the page about a run whose campaign or results can't be read: what its journal has without them.
+
+    Args:
+        path: of the page.
+        directory: of the run.
+        reason: why the whole report can't be made.
+
+    Raises:
+        OSError: it can't be written, or a figure can't be read.
+        RunError: the journal can't be read.
+    """
+    check = check_journal(directory / JOURNAL_NAME)
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        name, record = journal.header.name, read_record(journal)
+    found = read_run(directory).run
+    page = reduced_run_page(
+        name, record, directory, versions=read_versions(directory), check=check, reason=reason, found=found
+    )
+    return _write_page(path, page)
+
+
+def _write_page(path: Path, page: str) -> Path:
     draft = path.with_suffix(".html.part")
-    draft.write_text(run_page(plan, summary, record, directory, versions=versions), encoding="utf-8")
+    draft.write_text(page, encoding="utf-8")
     draft.replace(path)
     return path
 

@@ -8,6 +8,7 @@ import platform
 import re
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,11 @@ from orchestrator.catalogue.registry import register
 from orchestrator.codec import digest
 from orchestrator.fingerprint import fingerprint
 from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal_check import check_journal, has_begun
 from orchestrator.journal_file import JournalError
 from orchestrator.plan import CampaignPlan
+from orchestrator.plugins import packages as plugin_packages
+from orchestrator.pour_ledger import LEDGER_NAME, readable_lines
 from orchestrator.reserve import TO_BEGIN, require_space
 from orchestrator.states import State
 
@@ -63,7 +67,7 @@ def write_provenance(directory: Path, plan: CampaignPlan) -> None:
 
 
 def versions() -> dict[str, Any]:
-    """Versions of Python, platform, Decant and what it is built on."""
+    """Versions of Python, platform, Decant, what it is built on, and packages that add plug-ins."""
     packages: dict[str, str] = {}
     names = ["decant"]
     try:
@@ -75,12 +79,38 @@ def versions() -> dict[str, Any]:
             packages[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             packages[name] = "not installed"
+    plugins = plugin_packages()
+    packages |= {name: version for name, (version, _) in plugins.items()}
     return {
         "python": sys.version.split()[0],
         "platform": platform.platform(),
         "processor": platform.machine(),
         "packages": packages,
+        "plugins": {name: sorted(set(added)) for name, (_, added) in plugins.items()},
     }
+
+
+def missing_plugins(versions: Mapping[str, Any]) -> list[str]:
+    """Packages with plug-ins that a run had and that are not installed here: 'decant-example 1.0 (decant.arms: stand)'.
+
+    Args:
+        versions: as `versions.json` has them.
+    """
+    here, packages = plugin_packages(), versions.get("packages") or {}
+    return [
+        f"{name} {packages.get(name, '')} ({', '.join(added)})"
+        for name, added in (versions.get("plugins") or {}).items()
+        if name not in here
+    ]
+
+
+def read_versions(directory: Path) -> dict[str, Any]:
+    """`versions.json` of a run; empty where it is missing or damaged."""
+    try:
+        found = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
@@ -91,24 +121,33 @@ def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
 
     Raises:
         RunNotFoundError: no such run, or none that is unfinished.
+        JournalDamagedError: its journal has lost or changed entries, so that resuming it could repeat pours.
     """
     parent = plan.outputs.directory
     if run_id is not None:
         directory = parent / run_id
-        if not (directory / JOURNAL_NAME).is_file():
+        if not has_begun(directory / JOURNAL_NAME):
             known = sorted(p.parent.name for p in parent.glob(f"*/{JOURNAL_NAME}"))
             raise RunNotFoundError(f"{directory}: no such run; known: {', '.join(known) or 'none'}")
-        return directory
+    else:
+        directory = _newest_unfinished(plan, parent)
+    check_journal(directory / JOURNAL_NAME).require()
+    return directory
+
+
+def _newest_unfinished(plan: CampaignPlan, parent: Path) -> Path:
     mine = digest(fingerprint(plan))
     found: list[tuple[bool, float, Path]] = []
-    for path in parent.glob(f"*/{JOURNAL_NAME}") if parent.is_dir() else ():
+    for directory in sorted(parent.iterdir()) if parent.is_dir() else ():
         try:
-            with JournalReader(path) as journal:
+            with JournalReader(directory / JOURNAL_NAME) as journal:
                 if journal.header.name == plan.name and journal.state() is not State.FINISHED:
                     same = digest(journal.header.fingerprint) == mine
-                    found.append((same, journal.header.created, path.parent))
+                    found.append((same, journal.header.created, directory))
         except JournalError:
-            continue  # another program's, or another version's: not to be resumed by us
+            # Another program's or version's; a damaged run of this campaign is a candidate, and is refused.
+            begun = readable_lines(directory / LEDGER_NAME)[:1]
+            found += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
     if not found:
         raise RunNotFoundError(f"{parent}: no unfinished run of campaign '{plan.name}'; begin one without --resume")
     return max(found)[2]

@@ -199,7 +199,8 @@ class StageScheduler:
             nonlocal begin
             begin = time.monotonic()
             if isinstance(request, Pour):
-                self._append(Kind.POUR_STARTED, {"id": flight.id, "attempt": flight.attempt})
+                body = {"id": flight.id, "attempt": flight.attempt, "number": request.number}
+                self._append(Kind.POUR_STARTED, body)
             else:
                 self._append(Kind.STARTED, {"id": flight.id})
             flight.started = True

@@ -18,11 +18,11 @@ def state_directory() -> Path:
         OSError: nothing says where: none of these is set, and this user has no home.
     """
     if named := os.environ.get(VARIABLE):
-        return Path(named).absolute()
+        return Path(named).expanduser().absolute()
     if given := os.environ.get("STATE_DIRECTORY"):
         return Path(given.split(":")[0])
     if shared := os.environ.get("XDG_STATE_HOME"):
-        return Path(shared).absolute() / "decant"
+        return Path(shared).expanduser().absolute() / "decant"
     try:
         return Path.home() / ".local" / "state" / "decant"
     except RuntimeError:
@@ -47,4 +47,4 @@ def make_state_directory(path: Path) -> None:
 
 def use_state_directory(path: Path) -> None:
     """Have this process and those that it starts keep their state there: what `--state` does."""
-    os.environ[VARIABLE] = str(path.absolute())
+    os.environ[VARIABLE] = str(path.expanduser().absolute())

@@ -20,6 +20,9 @@ AskOperator = Callable[[str, Sequence[str]], str | Awaitable[str]]
 LOST, REPEAT, WEIGHED = "lost", "repeat", "weighed SPILLED RETAINED [LOADED]"
 _TRIES = 3
 
+LOAD_WITHIN, LOAD_WITHIN_MASS = 0.1, 5e-3
+"""How far a load that the operator weighed may lie from the nominal one: as a share of it, or [kg] if that is more."""
+
 
 class OperatorNeededError(RunError):
     """A person has to say what happened, and nobody is there to be asked."""
@@ -147,6 +150,12 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
     if len(masses) not in (2, 3):
         raise ValueError(f"'{answer}': two masses are needed, spilled and retained, e.g. weighed 3.2 0.4 (grams)")
     spilled, retained = masses[:2]
+    slack = max(LOAD_WITHIN * loaded, LOAD_WITHIN_MASS) + 1e-9
+    if len(masses) == 3 and not abs(masses[2] - loaded) <= slack:
+        raise ValueError(
+            f"'{answer}': the pour was to have a load of {loaded * 1e3:g} g, and {masses[2] * 1e3:g} g is more than "
+            f"{slack * 1e3:g} g away from that"
+        )
     loaded = masses[2] if len(masses) == 3 else loaded
     if not (min(spilled, retained) >= 0.0 and loaded > 0.0 and spilled + retained <= 1.02 * loaded):
         raise ValueError(

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import getpass
+import logging
 import os
+import stat
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -14,12 +18,53 @@ from numpy.typing import NDArray
 ENVIRONMENT_VARIABLE = "DECANT_CACHE_DIR"
 
 
+_log = logging.getLogger(__name__)
+_reported: set[Path] = set()
+
+
 def cache_directory() -> Path:
     """The cache directory, created on demand: $DECANT_CACHE_DIR, else the platform's user cache under 'decant'.
 
+    If it can't be written, such as in a home directory that is read-only, a folder of this user in the directory for
+    temporary files takes its place. That is logged once, with the cause.
+
     Raises:
-        OSError: it can't be created.
+        OSError: neither can be written; the text names both.
     """
+    directory = _configured()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if not os.access(directory, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(directory))
+    except OSError as error:
+        cause = f"{directory} can't be written ({error.filename}: {error.strerror})"
+        substitute = _temporary(cause)
+        if directory not in _reported:
+            _log.warning("the cache directory %s; %s is used. Set %s", cause, substitute, _CURE)
+            _reported.add(directory)
+        return substitute
+    return directory
+
+
+_CURE = f"${ENVIRONMENT_VARIABLE} to a folder that you can write"
+
+
+def _temporary(cause: str) -> Path:
+    """A folder that only this user can write: compiled kernels are executed, so that it must not be anybody else's."""
+    directory = Path(tempfile.gettempdir()) / f"decant-cache-{getpass.getuser() if os.name == 'nt' else os.getuid()}"
+    try:
+        directory.mkdir(mode=0o700, exist_ok=True)
+        found = directory.lstat()
+    except OSError as error:
+        text = f"the cache directory {cause}, and {directory} can't be made ({error.strerror}); set {_CURE}"
+        raise OSError(error.errno, text) from None
+    if not stat.S_ISDIR(found.st_mode) or (os.name != "nt" and (found.st_uid != os.getuid() or found.st_mode & 0o022)):
+        text = f"the cache directory {cause}, and {directory} belongs to another user; set {_CURE}"
+        raise OSError(errno.EPERM, text)
+    return directory
+
+
+def _configured() -> Path:
     chosen = os.environ.get(ENVIRONMENT_VARIABLE)
     if chosen:
         directory = Path(chosen).expanduser()
@@ -28,8 +73,7 @@ def cache_directory() -> Path:
     elif sys.platform == "win32":
         directory = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "decant" / "Cache"
     else:
-        directory = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "decant"
-    directory.mkdir(parents=True, exist_ok=True)
+        directory = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").expanduser() / "decant"
     return directory
 
 

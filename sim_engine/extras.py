@@ -25,6 +25,14 @@ EXTRAS = {
 }
 """Importable name → extra."""
 
+PACKAGES = {
+    "serial": "pyserial",
+    "rtde_receive": "ur-rtde",
+    "skimage": "scikit-image",
+    "pythonjsonlogger": "python-json-logger",
+}
+"""Importable name → name of the package that brings it, if they differ."""
+
 
 class MissingExtraError(DecantError, ImportError):
     """A package that belongs to an extra is not installed; the text says what to install."""
@@ -46,6 +54,7 @@ def require(module: str, what_for: str) -> None:
         MissingExtraError: it is not installed.
     """
     if not installed(module):
+        package, extra = PACKAGES.get(module, module), EXTRAS[module]
         raise MissingExtraError(
-            f"{what_for} needs the package '{module}', which is not installed: pip install 'decant[{EXTRAS[module]}]'"
+            f"{what_for} needs the package '{package}', which is not installed: pip install 'decant[{extra}]'"
         )

@@ -175,14 +175,19 @@ KNOWN: tuple[KnownLiquid, ...] = (
 _SHARE = re.compile(r"^(?P<name>.*?)\s+(?P<share>\d+(?:\.\d+)?)\s*%$")
 
 
+def split_share(name: str) -> tuple[str, float | None]:
+    """'glycerol 80 %' → ('glycerol', 80.0); the share [%] is None if the name has none."""
+    match = _SHARE.match(name.strip())
+    return (match["name"], float(match["share"])) if match else (name.strip(), None)
+
+
 def find(name: str) -> tuple[KnownLiquid, float] | None:
     """The table's liquid of a name and the share in it [%]; None if there is none of that name.
 
     Raises:
         ValueError: it is a solution and says no share, or one that is outside the data.
     """
-    match = _SHARE.match(name.strip())
-    plain, share = (match["name"], float(match["share"])) if match else (name.strip(), None)
+    plain, share = split_share(name)
     for liquid in KNOWN:
         if liquid.name == plain.lower():
             if liquid.share is None:

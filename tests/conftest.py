@@ -15,6 +15,9 @@ from pathlib import Path
 import pytest
 
 from orchestrator.state_directory import VARIABLE
+from tests.depth import load_profile
+
+load_profile()
 
 # A shell that starts something in the background has it ignore Ctrl-C, and its children with it: those that are
 # interrupted here would go on.
@@ -53,6 +56,17 @@ def pytest_collection() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test that is tried again gets new fixtures of its module: what failed may be what these have seen or broken."""
+    if getattr(item, "execution_count", 1) < 2 or not isinstance(item, pytest.Function):
+        return
+    for definitions in item._fixtureinfo.name2fixturedefs.values():
+        for definition in definitions:
+            if definition.scope != "session":
+                definition.finish(item._request)
 
 
 @pytest.hookimpl(trylast=True)  # after those that were not chosen have gone

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import psutil
 
+from actors.child_process import child_environment
 from actors.ray_warden import MARK, cluster_processes, end_cluster
 from tests.patience import PATIENCE
 
@@ -48,6 +49,7 @@ class LocalCluster:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
+            env=child_environment(),
         )
 
     @property

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.child_process import child_environment
 from sim_engine.fill import fill
 
 ROOT = Path(__file__).parent.parent
@@ -119,7 +120,7 @@ def test_liquid_is_measured_by_volume_and_place() -> None:
 @pytest.mark.slow
 def test_standard_pour_is_measured_and_told_as_json() -> None:
     command = [sys.executable, str(BENCHMARKS / "pour_speed.py"), "--particles=200", "--repeats=1", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT, env=child_environment())
     result = json.loads(done.stdout)
     needed = {"cpu_s", "wall_s", "steps", "iterations", "particle_iterations_per_s", "left", "delivered", "machine"}
     assert needed <= set(result)

@@ -13,6 +13,7 @@ from types import ModuleType
 import pytest
 import typer.main
 
+from actors.child_process import child_environment
 from orchestrator.cli import app
 from orchestrator.commands import common
 from orchestrator.config.load import load_campaign, load_vessel
@@ -199,7 +200,9 @@ def test_quickstart_is_what_the_guide_says() -> None:
 
 def test_changelog_has_every_version_that_was_released() -> None:
     """The version comes from the tag, so that a tag needs its chapter before the next change."""
-    tags = subprocess.run(["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    tags = subprocess.run(
+        ["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=True, env=child_environment()
+    ).stdout
     headings = set(re.findall(r"^## \[([^\]]+)\]", text_of(ROOT / "CHANGELOG.md"), re.MULTILINE))
     assert {tag.removeprefix("v") for tag in tags.split()} <= headings
     assert "Unreleased" in headings

@@ -9,13 +9,20 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
 from tests.patience import PATIENCE
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "pool_speed.py"
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, str(SCRIPT), *arguments], capture_output=True, text=True, timeout=PATIENCE)
+    return subprocess.run(
+        [sys.executable, str(SCRIPT), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        env=child_environment(),
+    )
 
 
 def test_pours_that_can_t_be_shared_out_evenly_are_refused() -> None:

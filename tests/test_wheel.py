@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
 from orchestrator.shipped import STARTING_SET
 from sim_engine.extras import EXTRAS
 
@@ -84,7 +85,11 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built from a copy of what git knows, so that the checkout stays clean."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env=child_environment(),
     )
     for name in listed.stdout.splitlines():
         if (ROOT / name).is_file() and not name.startswith(("tests/", "benchmarks/", "docs/")):
@@ -95,6 +100,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-q", "-w", str(out), str(source)],
         capture_output=True,
         text=True,
+        env=child_environment(),
     )
     assert built.returncode == 0, built.stderr[-2000:]
     (path,) = out.glob("*.whl")
@@ -178,7 +184,13 @@ def test_without_extras_a_table_says_what_to_install(tmp_path: Path) -> None:
 def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
     venv.create(tmp_path / "bare", with_pip=True)
     python = tmp_path / "bare" / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "-q", str(wheel)], check=True, cwd=tmp_path, timeout=1500)
+    subprocess.run(
+        [python, "-m", "pip", "install", "-q", str(wheel)],
+        check=True,
+        cwd=tmp_path,
+        timeout=1500,
+        env=child_environment(),
+    )
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
     def decant(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -11,6 +11,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+JOINT_NAMES = tuple(
+    f"joint {k} ({name})"
+    for k, name in enumerate(("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"), start=1)
+)
+"""What messages call the joints, in their order: numbered from 1, as on the axes of `decant jog`."""
+
 Vector = tuple[float, float, float]
 Joints = tuple[float, float, float, float, float, float]
 

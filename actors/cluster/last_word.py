@@ -9,30 +9,27 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import subprocess
 import sys
+
+from actors.child_process import ChildProcess, python_module
 
 GOODBYE = b"goodbye"
 
 
-def speaker(address: str) -> subprocess.Popen[bytes]:
+def speaker(address: str) -> ChildProcess:
     """Start the process.
 
     Args:
         address: of the cluster.
     """
-    return subprocess.Popen(
-        [sys.executable, "-m", "actors.cluster.last_word", address],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C in the terminal is not meant for it
-    )
+    return ChildProcess(python_module("actors.cluster.last_word", address), output=False, errors="shown")
 
 
-def dismiss(process: subprocess.Popen[bytes]) -> None:
+def dismiss(process: ChildProcess) -> None:
     """End it without a word."""
-    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-        process.communicate(GOODBYE, timeout=10.0)
+    with contextlib.suppress(OSError):
+        process.write(GOODBYE)
+    process.close()
 
 
 def main() -> None:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import socket
-import subprocess
 import sys
 from dataclasses import dataclass
 from typing import Any
 
+from actors.child_process import python_module, run
 from actors.cluster.versions import Versions, versions
 from actors.protocols import LaboratoryError
 from actors.spec import RaySpec
@@ -97,18 +96,10 @@ def _check_answers(address: str) -> None:
 
 
 def _ask(address: str) -> dict[str, Any]:
-    environment = {**os.environ, **_IMPATIENT}
     try:
-        process = subprocess.run(
-            [sys.executable, "-m", "actors.cluster.probe", address],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            env=environment,
-            timeout=JOIN_DEADLINE,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
+        command = python_module("actors.cluster.probe", address)
+        process = run(command, timeout=JOIN_DEADLINE, environment=_IMPATIENT)
+    except TimeoutError:
         return {
             "error": f"it could not be joined within {JOIN_DEADLINE:g} s; is it Ray that answers there, and can this "
             "machine and the cluster's reach each other on all of Ray's ports?"

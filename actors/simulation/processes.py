@@ -6,13 +6,12 @@
 from __future__ import annotations
 
 import contextlib
-import subprocess
 import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from actors.child import Child
+from actors.child_process import ConnectedProcess
 from actors.protocols import LaboratoryError, SimulationError
 from actors.simulation.in_process import ThreadedPool
 from actors.simulation.job_runner import RETRIES, JobCancelledError, JobRunner, Simulator, pour_simulator
@@ -50,8 +49,8 @@ class ProcessRunner:
         self._start()
 
     def _start(self) -> None:
-        self._child = Child(__name__)
-        self.pid = self._child.process.pid
+        self._child = ConnectedProcess(__name__)
+        self.pid = self._child.pid
         with contextlib.suppress(OSError):  # that it is gone is noticed with its first job
             self._child.connection.send(self._make)
 
@@ -68,9 +67,11 @@ class ProcessRunner:
             try:
                 answer = self._ask(task, cancelled)
             except (EOFError, OSError):
-                self._child.process.kill()
-                last_words = f"(status {self._child.process.wait()} at last){self._child.said()}"
+                self._child.kill()
+                said = f" (it said: {self._child.errors_kept})" if self._child.errors_kept else ""
+                last_words = f"(status {self._child.status} at last){said}"
                 self._child.connection.close()
+                self._child.release()
                 self._start()
                 continue
             if isinstance(answer, SimulatedPour):
@@ -91,11 +92,7 @@ class ProcessRunner:
     def close(self) -> None:
         """Hang up; a process that doesn't end by that is killed."""
         self._child.connection.close()
-        try:
-            self._child.process.wait(DEADLINE)
-        except subprocess.TimeoutExpired:
-            self._child.process.kill()
-            self._child.process.wait()
+        self._child.close(DEADLINE)
 
 
 def serve(connection: Connection) -> None:

@@ -36,6 +36,7 @@ class Faults:
             "emergency_stop": self.emergency_stop,
             "release_emergency_stop": self.release_emergency_stop,
             "safeguard": self.safeguard,
+            "reduced": self.reduced,
             "safety_fault": self.safety_fault,
             "stall": self.stall,
             "drop": self.drop,
@@ -115,6 +116,14 @@ class Faults:
     def release_emergency_stop(self, **when: Any) -> None:
         """The button is pulled out."""
         self._when(self._controller.release_emergency_stop, **when)
+
+    def reduced(self, active: bool = True, **when: Any) -> None:
+        """An input or a plane sets the reduced mode; its lower limits are not modelled."""
+
+        def apply() -> None:
+            self._controller.safety.reduced = bool(active)
+
+        self._when(apply, **when)
 
     def safeguard(self, active: bool = True, **when: Any) -> None:
         """Someone enters the guarded area, or leaves it."""

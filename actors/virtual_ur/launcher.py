@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import select
 import socket
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Sequence
 from math import degrees
 from types import TracebackType
 from typing import Any
+
+from actors.child_process import ChildProcess, python_module
 
 START_TIME = 40.0
 """Longest wait for the process to be ready [s]."""
@@ -33,7 +29,7 @@ class VirtualController:
         pid: of its process.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], address: str, fault_port: int) -> None:
+    def __init__(self, process: ChildProcess, address: str, fault_port: int) -> None:
         self._process = process
         self.address = address
         self.fault_port = fault_port
@@ -69,27 +65,25 @@ class VirtualController:
         Raises:
             VirtualControllerError: it did not get ready, with what it said.
         """
-        command = [sys.executable, "-m", "actors.virtual_ur", "--address", address, "--model", model]
+        command = python_module("actors.virtual_ur", "--address", address, "--model", model)
         command += ["--time-scale", repr(float(time_scale)), "--state", state, "--parent", str(os.getpid())]
         command += [] if frequency is None else ["--frequency", repr(float(frequency))]
         command += ["--local"] if local else []
         command += [] if prioritised else ["--normal-priority"]
         command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
-        with tempfile.TemporaryFile() as complaints:  # a pipe that nobody reads would fill up and hang the process
-            process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints, start_new_session=True
-            )
-            try:
-                ready = json.loads(_first_line(process, patience))
-                return cls(process, address, int(ready["fault_port"]))
-            except Exception as error:
-                process.kill()
-                process.communicate()
-                complaints.seek(0)
-                said = complaints.read().decode("utf-8", "replace").strip().splitlines()
-                raise VirtualControllerError(
-                    f"virtual controller at {address}: not ready within {patience:g} s: {said[-1] if said else error}"
-                ) from error
+        process = ChildProcess(command)
+        try:
+            ready = json.loads(process.read_line(patience))
+            return cls(process, address, int(ready["fault_port"]))
+        except BaseException as error:
+            process.kill()
+            said = process.last_error or str(error)
+            process.release()
+            if not isinstance(error, Exception):
+                raise
+            raise VirtualControllerError(
+                f"virtual controller at {address}: not ready within {patience:g} s: {said}"
+            ) from error
 
     def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
         """Ask for a fault, or for what the controller knows of itself; see docs/virtual-ur.md for names.
@@ -120,21 +114,11 @@ class VirtualController:
     @property
     def alive(self) -> bool:
         """Whether its process runs."""
-        return self._process.poll() is None
+        return self._process.alive
 
     def close(self, patience: float = 5.0) -> None:
         """End the process."""
-        with contextlib.suppress(OSError):
-            if self._process.stdin is not None:
-                self._process.stdin.close()
-        self._process.terminate()
-        try:
-            self._process.wait(patience)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        self._process.close(patience, terminate=True)
 
     def __enter__(self) -> VirtualController:
         return self
@@ -143,17 +127,3 @@ class VirtualController:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _first_line(process: subprocess.Popen[bytes], patience: float) -> bytes:
-    assert process.stdout is not None
-    end, line = time.monotonic() + patience, b""
-    while not line.endswith(b"\n"):
-        left = end - time.monotonic()
-        if left <= 0 or not select.select([process.stdout], [], [], left)[0]:
-            raise TimeoutError("it said nothing")
-        piece = os.read(process.stdout.fileno(), 4096)
-        if not piece:
-            raise EOFError("it ended")
-        line += piece
-    return line

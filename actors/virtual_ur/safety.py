@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from enum import IntEnum
 from math import degrees
 
+from actors.arm.geometry import JOINT_NAMES
 from actors.ur.models import Joints, RobotModel
 from actors.virtual_ur.poses import Vector
 
@@ -73,7 +74,8 @@ class SafetyConfiguration:
         """Why these joint positions are forbidden [rad]; None if they aren't."""
         for i, (angle, (low, high)) in enumerate(zip(q, self.joint_ranges, strict=True)):
             if not low <= angle <= high:
-                return f"joint {i} is at {degrees(angle):.1f} deg, outside {degrees(low):.0f} … {degrees(high):.0f} deg"
+                allowed = f"{degrees(low):.0f} … {degrees(high):.0f} deg"
+                return f"{JOINT_NAMES[i]} is at {degrees(angle):.1f} deg, outside {allowed}"
         return None
 
     def point_violation(self, point: Vector) -> str | None:

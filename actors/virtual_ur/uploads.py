@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import sys
 import time
 from collections import deque
 from typing import Protocol
 
+from actors.child_process import python_module, run_async
 from actors.virtual_ur.controller import Controller
 from actors.virtual_ur.urscript.errors import ScriptError
 from actors.virtual_ur.urscript.translate import LONGEST_HERE, Translated, question, read_answer
@@ -88,23 +87,11 @@ class Uploads:
             sender.refuse()
 
     async def _translate_apart(self, text: str) -> Translated:
+        asked = question(text, self._controller.known_commands)
         try:
-            process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                "-m",
-                "actors.virtual_ur.urscript",
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.DEVNULL,
-            )
-        except OSError as error:
-            raise ScriptError(f"no process to translate it could be started: {error}") from error
-        try:
-            asked = question(text, self._controller.known_commands)
-            answer, _ = await asyncio.wait_for(process.communicate(asked), PATIENCE)
+            answer = await run_async(python_module("actors.virtual_ur.urscript"), asked, timeout=PATIENCE)
         except TimeoutError:
             answer = b""
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
+        except OSError as error:
+            raise ScriptError(f"no process to translate it could be started: {error}") from error
         return read_answer(answer)

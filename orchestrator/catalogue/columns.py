@@ -38,7 +38,12 @@ RUNS = (
     Column("path", "text", "the run's folder"),
     Column("begun", "time", "when its journal was begun"),
     Column("ended", "time", "when the last entry was written; of a run that goes on, until now"),
-    Column("state", "text", "of the campaign, as in its journal; 'interrupted' where its process died without a word"),
+    Column(
+        "state",
+        "text",
+        "of the campaign, as in its journal; 'interrupted' where its process died without a word; "
+        "'unreadable' if its journal is missing or damaged",
+    ),
     Column("reason", "text", "why it is in that state, where there is something to report"),
     Column("laboratory", "text", "name of the laboratory"),
     Column("seed", "integer", "of every random choice"),

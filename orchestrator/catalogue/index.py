@@ -16,18 +16,19 @@ from types import TracebackType
 from typing import Any, Self
 
 from orchestrator.catalogue.columns import TABLES, Column
-from orchestrator.catalogue.reading import read_run
+from orchestrator.catalogue.reading import UNREADABLE, RunRead, read_run, unreadable
 from orchestrator.catalogue.registry import known
 from orchestrator.catalogue.remarks import REMARKS_NAME
 from orchestrator.errors import RunError
 from orchestrator.journal import JOURNAL_NAME
+from orchestrator.journal_check import has_begun
 from orchestrator.pour_rows import Row
 from orchestrator.state_directory import make_state_directory, state_directory
 from orchestrator.states import RESTING
 
 INDEX_NAME = "catalogue.sqlite"
 
-FORMAT = 1
+FORMAT = 2
 """Version of what is in the index; one of another version is made anew."""
 
 _SQL = {"text": "text", "texts": "text", "integer": "integer", "number": "real", "time": "real", "values": "text"}
@@ -152,6 +153,20 @@ class Catalogue:
 
     def _read(self, path: str, stamp: str) -> None:
         read = read_run(Path(path))
+        self._connection.execute("savepoint one_run")
+        try:
+            self._enter(path, stamp, read)
+        except (sqlite3.Error, OverflowError, TypeError, ValueError) as error:
+            if isinstance(error, sqlite3.OperationalError):
+                raise  # a full disk, a locked index: not the run's fault
+            # Its content doesn't fit the columns: damaged, or beyond what SQLite can hold.
+            self._connection.execute("rollback to one_run")
+            problem = f"{path}: its journal has values that can't be entered ({error}); see `decant runs check`"
+            self._enter(path, stamp, unreadable(Path(path), problem))
+        finally:
+            self._connection.execute("release one_run")
+
+    def _enter(self, path: str, stamp: str, read: RunRead) -> None:
         for table in ("run", "pour", "source"):
             self._connection.execute(f"delete from {table} where path = ?", [path])
         self._drop_former_place(read.run)
@@ -214,7 +229,7 @@ def _stamp(run: Path) -> str:
             found = (run / name).stat()
             marks.append(f"{found.st_mtime_ns}:{found.st_size}")
         except OSError:
-            if name == JOURNAL_NAME:
+            if name == JOURNAL_NAME and not has_begun(run / JOURNAL_NAME):
                 return ""
             marks.append("")
     return " ".join(marks)
@@ -235,7 +250,7 @@ def _read_value(column: Column, value: Any) -> Any:
 def _state_now(run: Row) -> str:
     """The state in the journal; a run that should be busy and whose journal nobody holds was interrupted."""
     state = str(run["state"] or "")
-    busy = state and state not in RESTING
+    busy = state not in ("", UNREADABLE, *RESTING)
     return "interrupted" if busy and not _held(Path(run["path"]) / JOURNAL_NAME) else state
 
 

@@ -5,6 +5,7 @@ What is not needed is not asked for: vessels are not built, meshes and plug-ins 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,18 +45,34 @@ class RunRead:
     problem: str = ""
 
 
+UNREADABLE = "unreadable"
+"""The state of a run of which nothing but its folder is known."""
+
+
 def read_run(directory: Path) -> RunRead:
     """Read a run, also one that is being written. What can't be read is written into `problem`; it is never raised."""
-    row: Row = {"run": directory.name, "path": str(directory)}
+    row: Row = {}
     try:
         remarks = read_remarks(directory)
         row |= {"tags": remarks.tags, "notes": [note.text for note in remarks.notes]}
         with JournalReader(directory / JOURNAL_NAME) as journal:
-            return _Reading(journal, row).read()
+            return _Reading(journal, {"run": directory.name, "path": str(directory), **row}).read()
     except (RunError, CodecError, RemarksError, OSError) as error:
-        return RunRead(row, problem=str(error))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        return RunRead(row, problem=f"{directory}: its journal can't be understood ({type(error).__name__}: {error})")
+        return unreadable(directory, str(error), row)
+    except Exception as error:  # damaged content can be anything, and must not hide other runs
+        return unreadable(directory, f"{directory}: its journal is damaged ({type(error).__name__}: {error})", row)
+
+
+def unreadable(directory: Path, problem: str, remarks: Row | None = None) -> RunRead:
+    """A run that is listed with its folder, the time of its last change, and the reason why it can't be read.
+
+    Args:
+        remarks: its tags and notes.
+    """
+    row: Row = {"run": directory.name, "path": str(directory), "state": UNREADABLE, "reason": problem}
+    with contextlib.suppress(OSError):
+        row["begun"] = row["ended"] = directory.stat().st_mtime
+    return RunRead(row | (remarks or {}), problem=problem)
 
 
 class _Reading:

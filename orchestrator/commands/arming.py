@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from actors.arm.geometry import JOINT_NAMES
 from actors.arm.protocol import PathReport
 from actors.arm.spec import ArmSpec
 from actors.optimizer.core.problem import Linear
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
 CORNERS, INTERIOR = 32, 12
 """Actions of each space whose paths are planned for the envelope, beside its middle."""
-
-JOINT_NAMES = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
 
 
 @dataclass(frozen=True)
@@ -218,7 +217,7 @@ def report_lines(report: PathReport) -> list[str]:
         "box            " + ", ".join(f"{n} {a} … {b} mm" for n, a, b in zip("xyz", low, high, strict=True)),
         f"tool, pourer   up to {1e3 * report.tool_speed:.0f} mm/s",
         *(
-            [f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s ({JOINT_NAMES[report.fastest_joint]})"]
+            [f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s, {JOINT_NAMES[report.fastest_joint]}"]
             if report.joint_speed > 0.0
             else []
         ),

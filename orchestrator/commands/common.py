@@ -170,6 +170,7 @@ def run_in_front_of_people(
     from orchestrator.campaign import run_campaign
     from orchestrator.commands.interrupted import (
         file_trouble,
+        finished_without_report,
         given_up_pours,
         interruption,
         report_of_what_stands,
@@ -226,7 +227,9 @@ def run_in_front_of_people(
             raise  # not a file's: a defect, which wants its traceback
         raise RefusalError(f"{file_trouble(error, directory)}{_way_on(directory, again, not_resumed)}") from None
     except (asyncio.CancelledError, KeyboardInterrupt):
-        if not_resumed:
+        if done := finished_without_report(directory):
+            way_on = done
+        elif not_resumed:
             unknown = "".join(
                 f" while {pour} was under way: what it poured is unknown" for pour in given_up_pours(directory)
             )
@@ -235,14 +238,22 @@ def run_in_front_of_people(
             way_on = interruption(directory, plan, again)
         raise RefusalError(f"interrupted{way_on}", INTERRUPTED) from None
     finally:
+        if result is None:
+            if monitor is not None:
+                monitor.close()
+            if live is not None:
+                live.close()
+            if (page := report_of_what_stands(plan, directory)) is not None:
+                mention(f"report of what stands  {page}")
+    try:
         if monitor is not None:
             monitor.close()
         if live is not None:
             live.close()
-        if result is None and (page := report_of_what_stands(plan, directory)) is not None:
-            mention(f"report of what stands  {page}")
-    published = publish(plan, result, monitor)
-    print_summary(plan, published.summary)
+        published = publish(plan, result, monitor)
+        print_summary(plan, published.summary)
+    except KeyboardInterrupt:
+        raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
     if published.report is not None:
         mention(f"report  {published.report}")
     return Finished(result, published)

@@ -51,7 +51,9 @@ def serve(path: Path | None, *, state: Path | None, port: int | None, simulators
     except RunError as error:
         raise RefusalError(str(error), error.exit_code) from None
     except OSError as error:
-        raise RefusalError(f"{error.filename or 'state directory'}: {error.strerror}", BAD_INPUT) from None
+        where = error.filename or "state directory"
+        cure = "--state or $DECANT_STATE names another folder"
+        raise RefusalError(f"{where}: {error.strerror}; {cure}", BAD_INPUT) from None
 
 
 def _require_extra() -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 from actors.arm.look import ArmLook, SafetyRecord
 from actors.checks import Check
+from actors.laboratory import check_bench_packages, check_laboratory
+from actors.protocols import LaboratoryError
 from orchestrator.commands.doctor_balance import look_at_balance
 from orchestrator.commands.hands_on import reached
 from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, Refused, print_json, say
@@ -50,13 +52,16 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
         if not accept_safety:
             raise RefusalError(str(error), BAD_INPUT) from None
         record = None
-    with reached(spec) as ready:
+    with Refused(LaboratoryError):
+        check_bench_packages(spec)
+    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
         assert ready.arm is not None
         look = ready.arm.look()
         if accept_safety and not virtual:
             record = _accept(path, look)
         checks = look.checks(record, accept=f"decant doctor {path} --accept-safety", virtual=virtual)
         checks += look_at_balance(ready.balance, tare=tare)
+    checks += _packages(spec)
     checks += [Check("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
     failed = [check for check in checks if check.state == "fail"]
     if as_json:
@@ -67,6 +72,15 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are mended")
     say("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
+
+
+def _packages(spec: LaboratorySpec) -> list[Check]:
+    """Whether a run would find the packages that it needs, by the run's own check."""
+    try:
+        check_laboratory(dataclasses.replace(spec, ray=None), need_bench=True)
+    except LaboratoryError as error:
+        return [Check("packages", "fail", str(error), "install them into the environment that Decant runs in")]
+    return []
 
 
 def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:

@@ -24,7 +24,14 @@ T = TypeVar("T")
 
 @contextlib.contextmanager
 def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
-    """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this."""
+    """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this.
+
+    Raises:
+        LaboratoryError: a package that it needs is not installed, or what is started does not start.
+    """
+    from actors.laboratory import check_bench_packages
+
+    check_bench_packages(spec)
     if spec.mode == "hardware":
         yield spec
         return

@@ -39,6 +39,21 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
     )
 
 
+def finished_without_report(directory: Path) -> str:
+    """Follows 'interrupted' if all stages of a run are done and its results may not be published; empty otherwise."""
+    from orchestrator.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.journal_file import JournalError
+    from orchestrator.states import State
+
+    with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:
+        if journal.state() is State.FINISHED:
+            return (
+                " after the last stage, while the results were written; the run is finished, and nothing is lost. "
+                f"Write its summary, figures and report with: decant report {directory}"
+            )
+    return ""
+
+
 def given_up_pours(directory: Path) -> list[str]:
     """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
     from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind

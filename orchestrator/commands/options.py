@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from orchestrator.commands.speaking import INTERRUPTED, RefusalError, fail, hush
+from orchestrator.commands.speaking import BAD_INPUT, INTERRUPTED, RefusalError, fail, hush
 
 Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
@@ -37,7 +38,11 @@ Quiet = Annotated[
         help="Only results, questions, warnings of a run, and errors: no progress, no notes.",
     ),
 ]
-Seed = Annotated[int | None, typer.Option(min=0, help="In place of the campaign's.", show_default=False)]
+Seed = Annotated[
+    int | None,
+    # The largest is the schema's, whose module takes longer to import than `--help` may.
+    typer.Option(min=0, max=2**63 - 1, help="In place of the campaign's.", show_default=False),
+]
 Assignments = Annotated[
     list[str] | None,
     typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
@@ -106,10 +111,31 @@ def given(options: dict[str, Any], *left_out: str) -> dict[str, Any]:
     return {name: value for name, value in options.items() if name not in ("quiet", *left_out)}
 
 
-def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
-    """Run a verb; a refusal is printed, and ends with its exit code."""
+def _expanded(path: Path) -> Path:
+    from orchestrator.config.yaml.files import in_home
+
     try:
-        verb(*args, **kwargs)
+        return Path(in_home(str(path)))
+    except ValueError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+
+
+def _in_home(value: Any) -> Any:
+    """An argument with its paths expanded: a shell leaves `--state=~/lab` as it is."""
+    if isinstance(value, Path):
+        return _expanded(value)
+    if isinstance(value, list | tuple):
+        return type(value)(_in_home(item) for item in value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        paths = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return dataclasses.replace(value, **{name: _in_home(item) for name, item in paths.items()})
+    return value
+
+
+def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
+    """Run a verb; a refusal is printed, and ends with its exit code. `~` in paths is the home directory."""
+    try:
+        verb(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
     except RefusalError as refusal:
         fail(refusal)
     except KeyboardInterrupt:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from orchestrator.commands.options import Json, Quiet, call, examples
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json
-
-if TYPE_CHECKING:
-    from orchestrator.plan import CampaignPlan
+from orchestrator.commands.speaking import BAD_INPUT, RefusalError, Refused, mention, print_json, say
 
 EXAMPLES = examples(
     "decant report quickstart-20300131-1              # a run of the folder runs/",
@@ -70,7 +67,10 @@ def _report(what: Path, *, output: Path | None, pdf: bool, as_json: bool) -> Non
 
 def _nothing_there(folder: Path) -> str:
     from orchestrator.journal import JOURNAL_NAME
+    from orchestrator.journal_check import check_journal, has_begun
 
+    if has_begun(folder / JOURNAL_NAME):
+        return f"{folder}: {check_journal(folder / JOURNAL_NAME).verdict}"
     near = sorted(path.parent.name for path in folder.absolute().parent.glob(f"*/{JOURNAL_NAME}"))
     known = f"; runs there: {', '.join(near)}" if near else ""
     return (
@@ -80,31 +80,43 @@ def _nothing_there(folder: Path) -> str:
 
 
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
+    from orchestrator.config.load import load_campaign
+    from orchestrator.config.yaml.errors import ConfigError
     from orchestrator.errors import RunError
     from orchestrator.journal import JOURNAL_NAME, JournalReader
-    from orchestrator.publish import report_on
+    from orchestrator.journal_check import check_journal
+    from orchestrator.publish import publish_if_missing, report_on, write_reduced_report
+    from orchestrator.report.run_page import REPORT_NAME
     from orchestrator.run_result import read_result
+    from orchestrator.runs import RESOLVED, missing_plugins, read_versions
 
-    plan = _plan_of(folder)
-    mention("drawing the figures …")
+    check = check_journal(folder / JOURNAL_NAME)
+    for problem in check.problems:
+        say(f"warning: {problem}")
     try:
-        with JournalReader(folder / JOURNAL_NAME) as journal:
-            result = read_result(journal, folder)
+        try:
+            plan = load_campaign(folder / RESOLVED)
+            with JournalReader(folder / JOURNAL_NAME) as journal:
+                result = read_result(journal, folder)
+        except (ConfigError, RunError) as error:
+            reason = f"Its campaign or its results can't be read: {error}"
+            if missing := missing_plugins(read_versions(folder)):
+                reason = f"Not installed here: {'; '.join(missing)}. Install what is missing for the whole report."
+            say(f"warning: the report is reduced to what the journal has. {reason}")
+            return write_reduced_report(output or folder / REPORT_NAME, folder, reason), []
+        mention("drawing the figures …")
+        if publish_if_missing(plan, result):
+            mention("summary.json and theta.json were missing, and are written now")
         page, figures = report_on(plan, result, output, formats)
     except RunError as error:
         raise RefusalError(str(error)) from None
     except OSError as error:
         raise RefusalError(f"{error.filename or folder}: {error.strerror}") from None
+    except (LookupError, TypeError, ValueError, AttributeError):
+        if not check.problems:
+            raise
+        raise RefusalError(f"{folder}: no report can be made of damaged records; {check.verdict}") from None
     return page, list(figures.values())
-
-
-def _plan_of(folder: Path) -> CampaignPlan:
-    from orchestrator.config.load import load_campaign
-    from orchestrator.config.yaml.errors import ConfigError
-    from orchestrator.runs import RESOLVED
-
-    with Refused(ConfigError, at="the run's own campaign can't be read:\n"):
-        return load_campaign(folder / RESOLVED)
 
 
 def _of_study(what: Path) -> Path:

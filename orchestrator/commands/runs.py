@@ -19,7 +19,7 @@ from orchestrator.commands.runs_shown import (
     percent,
     print_pours,
 )
-from orchestrator.commands.speaking import BAD_INPUT, RefusalError, mention, print_json, say
+from orchestrator.commands.speaking import BAD_INPUT, FAILED, RefusalError, mention, print_json, say
 from orchestrator.report.table import print_table
 
 if TYPE_CHECKING:
@@ -104,6 +104,39 @@ def show(name: str, *, daemon: bool = False, as_json: bool) -> None:
     if run["list_of_pours"]:
         print()
         print_pours(run["list_of_pours"], of_one_run=True)
+
+
+def check(name: str, *, as_json: bool) -> None:
+    """Check a run's records; exit code 1 if they are damaged or incomplete."""
+    from orchestrator.journal import JOURNAL_NAME
+    from orchestrator.journal_check import check_journal, has_begun
+
+    folder = Path(name)
+    if folder.is_dir():
+        if not has_begun(folder / JOURNAL_NAME):
+            raise RefusalError(f"{folder}: there is no run in this folder", BAD_INPUT)
+    else:
+        with _desk(daemon=False) as desk:
+            folder = Path(desk.run(name)["path"])
+    with _refusing():
+        found = check_journal(folder / JOURNAL_NAME)
+    if as_json:
+        print_json(
+            {
+                "run": folder,
+                "complete": not found.problems,
+                "problems": found.problems,
+                "entries": found.entries,
+                "entries_without_chain": found.unchecked,
+                "pours": found.pours,
+            }
+        )
+    else:
+        print(f"{folder}: {found.verdict}")
+        for pour in found.pours:
+            print(f"  {pour}")
+    if found.problems:
+        raise RefusalError(f"{folder}: {len(found.problems)} problem(s) found", FAILED)
 
 
 def compare(names: Sequence[str], *, daemon: bool = False, as_json: bool) -> None:

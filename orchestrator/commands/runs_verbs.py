@@ -151,6 +151,19 @@ def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json 
     call(verb.show, run, daemon=daemon, as_json=as_json)
 
 
+@runs.command(
+    epilog=examples("decant runs check quickstart-20300301-1", "decant runs check runs/quickstart-20300301-1")
+)
+def check(run: Which, state: State = None, as_json: Json = False) -> None:
+    """Check a run's records: SQLite's own check, the hash chain over all entries, and the ledger of pours.
+
+    Exit code 0: complete and unchanged, or of an older version without a hash chain. 1: damaged or incomplete.
+    """
+    from orchestrator.commands import runs as verb
+
+    call(verb.check, run, as_json=as_json)
+
+
 @runs.command(epilog=examples("decant runs compare quickstart-20300301-1 quickstart-20300301-2"))
 def compare(
     which: Annotated[list[str], typer.Argument(help="Two runs or more.", show_default=False)],

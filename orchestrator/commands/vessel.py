@@ -180,7 +180,7 @@ def _measured(sources: Sources, height: float) -> list[Evidence]:
     """Callipers and tables."""
     import numpy as np
 
-    from orchestrator.commands.vessel_tables import read_diameters, read_table
+    from orchestrator.commands.vessel_tables import read_diameters, read_fill_table, read_tilt_table
     from sim_engine.vessel.sources.evidence import FillTable, Radii, TiltTable
 
     found: list[Evidence] = []
@@ -189,15 +189,20 @@ def _measured(sources: Sources, height: float) -> list[Evidence]:
         found.append(Radii("callipers", heights, widths / 2.0, np.full(len(heights), CALLIPERS)))
     balance = _volume(sources, BALANCE)
     if sources.fill is not None:
-        levels, masses = read_table(sources.fill, "level_mm", upper=1e3 * height)
+        levels, masses = read_fill_table(
+            sources.fill,
+            height=1e3 * height,
+            density=1e-6 * BALANCE / balance,
+            ruler=1e3 * RULER,
+            balance=1e3 * BALANCE,
+        )
         volumes = np.array([_volume(sources, mass) for mass in masses / 1e3])
         radius = float(np.sqrt(volumes.max() / (np.pi * levels.max() / 1e3)))
         found.append(FillTable(levels / 1e3, volumes, RULER, balance, radius))
     if sources.tilt is not None:
-        tilts, masses = read_table(sources.tilt, "tilt_deg", upper=90.0)
-        order = np.argsort(tilts)
-        volumes = np.array([_volume(sources, mass) for mass in masses[order] / 1e3])
-        found.append(TiltTable(np.radians(tilts[order]), volumes, ANGLE, balance))
+        tilts, masses = read_tilt_table(sources.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE)
+        volumes = np.array([_volume(sources, mass) for mass in masses / 1e3])
+        found.append(TiltTable(np.radians(tilts), volumes, ANGLE, balance))
     return found
 
 

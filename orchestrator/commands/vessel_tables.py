@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,11 @@ LARGEST_FILE = 200_000_000
 """Bytes of a file that is read whole."""
 
 MOST_ROWS = 10_000
+
+FEWEST_ROWS = 3
+
+NARROWEST_MM, WIDEST_MM = 4.0, 1000.0
+"""Mean inner diameters of vessels [mm]."""
 
 MOST_PIXELS = 60_000_000
 
@@ -56,20 +62,82 @@ def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
     return np.array(heights), np.array(widths)
 
 
-def read_table(path: Path, column: str, *, upper: float) -> tuple[Floats, Floats]:
-    """A column and the masses beside it [g].
+def read_fill_table(
+    path: Path, *, height: float, density: float, ruler: float, balance: float
+) -> tuple[Floats, Floats]:
+    """Levels above the inner floor [mm], ascending, and the masses below them [g].
 
     Args:
-        column: 'level_mm' or 'tilt_deg'.
-        upper: largest value that it may have.
+        height: of the rim [mm].
+        density: of what was weighed [g/mm³].
+        ruler, balance: standard deviations of a level [mm] and of a mass [g].
 
     Raises:
         RefusalError: with the file, the line, and what would be right (exit code 2).
     """
+    rows = _read_rows(path, "level_mm", upper=height)
+    rows.sort(key=lambda row: row[1:])
+    table = _monotonic(path, rows, "a higher level holds more", 1.0, ruler, balance)
+    for line, level, mass in rows:
+        diameter = math.sqrt(4.0 * mass / density / (math.pi * level))
+        if not NARROWEST_MM <= diameter <= WIDEST_MM:
+            raise RefusalError(
+                f"{path}:{line}: {mass:g} g below {level:g} mm make a vessel of {diameter:.3g} mm in diameter; should "
+                f"be {NARROWEST_MM:g} to {WIDEST_MM:g} mm. Are the levels in mm above the inner floor, the masses in g "
+                "of the liquid alone?",
+                BAD_INPUT,
+            )
+    return table
+
+
+def read_tilt_table(path: Path, *, angle: float, balance: float) -> tuple[Floats, Floats]:
+    """Tilts [deg], ascending, and the masses that the vessel still held there [g].
+
+    Args:
+        angle, balance: standard deviations of a tilt [deg] and of a mass [g].
+
+    Raises:
+        RefusalError: with the file, the line, and what would be right (exit code 2).
+    """
+    rows = _read_rows(path, "tilt_deg", upper=90.0)
+    rows.sort(key=lambda row: (row[1], -row[2]))
+    return _monotonic(path, rows, "a vessel that is tilted further holds less", -1.0, angle, balance)
+
+
+def _monotonic(
+    path: Path, rows: list[tuple[int, float, float]], rule: str, sign: float, reading: float, balance: float
+) -> tuple[Floats, Floats]:
+    """The columns of sorted rows, whose masses rise (sign 1) or fall (-1) but for the errors of reading them."""
     import numpy as np
 
+    table = np.array([row[1:] for row in rows])
+    values, masses = table[:, 0], table[:, 1]
+    if (different := len(np.unique(values))) < FEWEST_ROWS:
+        raise RefusalError(
+            f"{path}: has {different} different value(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT
+        )
+    steepness = float(np.ptp(masses) / np.ptp(values))
+    # three standard deviations of a difference of two
+    allowed = 3.0 * math.sqrt(2.0) * math.hypot(balance, steepness * reading)
+    best = 0
+    for k in range(1, len(rows)):
+        back = sign * (masses[best] - masses[k])
+        repeated = values[k] == values[k - 1] and abs(masses[k] - masses[k - 1]) > allowed
+        if back > allowed or repeated:
+            other = k - 1 if repeated else best
+            raise RefusalError(
+                f"{path}:{rows[k][0]}: mass_g is {masses[k]:g} at {values[k]:g}, and {masses[other]:g} at "
+                f"{values[other]:g} (line {rows[other][0]}); {rule}",
+                BAD_INPUT,
+            )
+        best = k if back <= 0.0 else best
+    return values, masses
+
+
+def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, float, float]]:
+    """Lines of a table with the value of a column and the mass in each [g]; see `read_fill_table`."""
     _check_size(path)
-    found: list[tuple[float, float]] = []
+    found: list[tuple[int, float, float]] = []
     with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         rows = csv.DictReader(file)
         missing = [name for name in (column, "mass_g") if name not in (rows.fieldnames or ())]
@@ -85,13 +153,14 @@ def read_table(path: Path, column: str, *, upper: float) -> tuple[Floats, Floats
                 raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}", BAD_INPUT)
             if not 0.0 <= mass < 1e5:
                 raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0", BAD_INPUT)
-            found.append((value, mass))
+            found.append((rows.line_num, value, mass))
             if len(found) > MOST_ROWS:
                 raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows", BAD_INPUT)
-    if len(found) < 3:
-        raise RefusalError(f"{path}: has {len(found)} row(s); at least 3 say something about a shape", BAD_INPUT)
-    table = np.array(found)
-    return table[:, 0], table[:, 1]
+    if len(found) < FEWEST_ROWS:
+        raise RefusalError(
+            f"{path}: has {len(found)} row(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT
+        )
+    return found
 
 
 def read_points(path: Path, unit: LengthUnit | None, up: str) -> Floats:
@@ -139,20 +208,21 @@ def _loaded(path: Path) -> Any:
 
 
 def read_photograph(path: Path) -> Floats:
-    """Brightness of a picture, rows from the top, shape (rows, columns).
+    """Brightness of a picture as viewers show it, rows from the top, shape (rows, columns).
 
     Raises:
         RefusalError: it is not a picture that can be read (exit code 2).
     """
     import numpy as np
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
     _check_size(path)
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of large pictures: see below
             if picture.width * picture.height > MOST_PIXELS:
                 raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller", BAD_INPUT)
-            return np.asarray(picture.convert("L"), dtype=float)
+            upright = ImageOps.exif_transpose(picture)  # cameras store the sensor's rows and how they were held
+            return np.asarray(upright.convert("L"), dtype=float)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # cut off, damaged
         raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
 

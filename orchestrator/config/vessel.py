@@ -14,7 +14,7 @@ from orchestrator.config.yaml.quantities import Quantity, parse_quantity
 from orchestrator.config.yaml.sections import MADE, FilePath, Name, Number, Section, Text
 from orchestrator.config.yaml.source import Place, Report
 from sim_engine.liquid import NEUTRAL, Liquid
-from sim_engine.liquids import KNOWN, ROOM, Properties, look_up
+from sim_engine.liquids import KNOWN, ROOM, Properties, find, look_up, split_share
 from sim_engine.vessel.spec import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -100,7 +100,8 @@ class LiquidFile(Section):
     """What is poured: by its name, if it is in the [table](liquids.md#the-table), or by its properties."""
 
     name: Text = "water"
-    """For people; and in the table: 'ethanol', 'glycerol 80 %', 'sugar syrup 60 %', 'rapeseed oil' …"""
+    """A name in the table: 'ethanol', 'glycerol 80 %', 'sugar syrup 60 %', 'rapeseed oil' … Any other name needs
+    `density` and `viscosity` next to it."""
 
     temperature: Annotated[float, Quantity("degC", "20 degC", lower=0.0, upper=100.0)] | None = None
     """Temperature at which the table is read; 20 °C unless given."""
@@ -112,15 +113,17 @@ class LiquidFile(Section):
     """Volume that is loaded, from which the mass follows; or give `mass`, which a balance tells better."""
 
     density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] | None = None
-    """Density; the table's unless given, else 998 kg/m³."""
+    """Density; the table's unless given. Required for a liquid that is not in the table."""
 
     surface_tension: Annotated[float, Quantity("N/m", "72.8 mN/m", lower=1e-3, upper=1.0)] | None = None
-    """Surface tension against air; the table's unless given, else 72.8 mN/m. Liquids above 5 mm²/s are simulated with
-    it; for thinner ones the simulator's own knob is the parameter `cohesion`."""
+    """Surface tension against air; the table's unless given, water's 72.8 mN/m for a liquid that is not in the table.
+    Liquids above 5 mm²/s are simulated with it; for thinner ones the simulator's own knob is the parameter
+    `cohesion`."""
 
     viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] | None = None
-    """Dynamic viscosity; the table's unless given, else 1 mPa*s. Above 5 mm²/s (viscosity over density) it is
-    simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is the parameter `viscosity`."""
+    """Dynamic viscosity; the table's unless given. Required for a liquid that is not in the table. Above 5 mm²/s
+    (viscosity over density) it is simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is
+    the parameter `viscosity`."""
 
     contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = NEUTRAL
     """Contact angle on the vessels' walls. Held against theory where particles are finer than the capillary length
@@ -249,27 +252,44 @@ def _first(given: float | None, known: float) -> float:
 
 
 PLAIN_WATER = Properties(density=998.0, dynamic_viscosity=1.0e-3, surface_tension=0.0728)
-"""What a liquid is like whose properties are not given."""
+"""Properties of water without a temperature; the tension of a liquid that gives its other properties itself."""
 
 
 def _known(section: LiquidFile, place: Place, report: Report) -> Properties | None:
-    """Properties by the table; plain water's for a name that it does not have."""
+    """Properties from the table; a liquid that is not in it gives its own density and viscosity."""
     if section.name == "water" and section.temperature is None:
         return PLAIN_WATER
     try:
-        found = look_up(section.name, ROOM if section.temperature is None else section.temperature)
+        in_table = find(section.name) is not None
     except ValueError as problem:
-        report.add(place.at("name" if "%" in str(problem) else "temperature"), str(problem))
+        report.add(place.at("name"), str(problem))
         return None
-    if found is None and section.temperature is not None:
-        names = ", ".join(f"'{one.name}{' 60 %' if one.share else ''}'" for one in KNOWN)
-        report.add(place.at("temperature"), f"says nothing of a liquid that is not in the table; it has {names}")
-        return None
-    if found is None and section.viscosity is None:
-        meant = did_you_mean(section.name.partition(" ")[0], [one.name for one in KNOWN])
-        if meant is not None or section.name.endswith("%"):
-            which = f"; did you mean '{meant}'?" if meant else "."
-            text = f"'{section.name}' is not in the table{which} Or give its 'viscosity' as well"
-            report.add(place.at("name"), text)
+    if in_table:
+        try:
+            return look_up(section.name, ROOM if section.temperature is None else section.temperature)
+        except ValueError as problem:
+            report.add(place.at("temperature"), str(problem))
             return None
-    return found or PLAIN_WATER
+    missing = [key for key in ("density", "viscosity") if section.value(key) is None]
+    if any(report.is_broken(place.at(key)) for key in missing):
+        return None
+    if missing:
+        wanted = " and ".join(f"'{key}'" for key in missing)
+        report.add(place.at("name"), f"{_not_in_table(section.name)} To pour it, give its {wanted} as well")
+        return None
+    if section.temperature is not None:
+        report.add(place.at("temperature"), f"has no effect: {_not_in_table(section.name)} Remove the temperature")
+        return None
+    return PLAIN_WATER
+
+
+def _not_in_table(name: str) -> str:
+    plain, share = split_share(name)
+    meant = did_you_mean(plain, [one.name for one in KNOWN])
+    if meant is not None:
+        solution = next(one.share for one in KNOWN if one.name == meant) is not None
+        guess = f" Did you mean '{meant}{f' {60.0 if share is None else share:g} %' if solution else ''}'?"
+    else:
+        guess = ""
+    names = ", ".join(f"'{one.name}{' 60 %' if one.share else ''}'" for one in KNOWN)
+    return f"'{name}' is not in the table of liquids.{guess} The table has {names}."

@@ -18,6 +18,9 @@ from orchestrator.unknown import parse_answer
 
 GIVE_UP = "give up"
 
+LOAD = "load_g"
+"""Detail of a question about an unknown pour: the load that the campaign asks for [g]."""
+
 _WORDS = {"done": {"done": "done", "d": "done"}, "yes or no": {"yes": "yes", "y": "yes", "no": "no", "n": "no"}}
 
 _WANTED = {
@@ -101,7 +104,7 @@ def understood(question: Question, answer: str) -> str:
             return meant
         if question.kind == "unknown":
             try:
-                parse_answer(said, question.options, 1e6)
+                parse_answer(said, question.options, 1e-3 * float(question.details[LOAD]))
                 return said
             except ValueError as error:
                 raise AnswerError(str(error)) from None
@@ -165,20 +168,23 @@ class RunQuestions:
     Args:
         asking: puts the questions.
         campaign, rig: that they are about.
+        load: of every pour of the campaign [kg].
         look: says what arm and balance show now, for a pour whose outcome nobody knows; may take a while.
     """
 
     def __init__(
-        self, asking: Asking, store: Store, campaign: str, rig: str, look: Callable[[], dict[str, str]]
+        self, asking: Asking, store: Store, campaign: str, rig: str, load: float, look: Callable[[], dict[str, str]]
     ) -> None:
-        self._asking, self._store, self._campaign, self._rig, self._look = asking, store, campaign, rig, look
+        self._asking, self._store, self._campaign, self._rig = asking, store, campaign, rig
+        self._load, self._look = load, look
 
     async def __call__(self, text: str, options: Sequence[str]) -> str:
         """Put a question with its options."""
         unknown = "lost" in options
         question, _, problem = text.partition("\n")
-        details: dict[str, str] = {}
+        details: dict[str, float | str] = {}
         if unknown:
+            details[LOAD] = 1e3 * self._load
             details |= await asyncio.to_thread(self._look)
             before = [q for q in self._store.questions(only_open=False, campaign=self._campaign) if q.text == question]
             if before and before[0].answer and not problem:

@@ -22,12 +22,15 @@ from orchestrator.daemon.watching import Watching
 from orchestrator.events import CampaignStateChanged, Watcher
 from orchestrator.jobs import Job, Verb, check_job, job, read_theta
 from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal_check import check_journal, has_begun
+from orchestrator.journal_file import JournalError
 from orchestrator.monitor.live import LiveView, recorder_of
 from orchestrator.monitor.monitor import RerunMonitor
 from orchestrator.plan import CampaignPlan
 from orchestrator.publish import not_simulated, publish
 from orchestrator.run_result import CampaignResult, read_result
 from orchestrator.runs import create_run
+from orchestrator.stages import scenes_of
 from orchestrator.states import State
 
 MOVING = ("approach", "tilt", "hold", "return")
@@ -108,11 +111,13 @@ class Running:
             RunError, LaboratoryError, ConfigError, OSError: it can't go on.
         """
         work = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
-        begun = self.item.run is not None
+        submitted_before = self.item.run is not None
         directory = await asyncio.to_thread(self._directory, work.plan)
-        if not begun:
+        if not submitted_before:
             for text in await asyncio.to_thread(_warnings_of, work.plan):
                 self._log_warning(text)
+        # Before anything is written: a lost journal must not look like a run that was never begun.
+        begun = await asyncio.to_thread(self._begun, directory)
         await self._common.warm.open()
         self.watching = Watching(work.plan)
         monitor = self._recording(work.plan, directory)
@@ -120,19 +125,22 @@ class Running:
         if monitor is not None:
             watchers.append(monitor)
         try:
-            result = await self._run(work, directory, watchers, checksum)
+            result = await self._run(work, directory, begun, watchers, checksum)
         finally:
             if monitor is not None:
                 await asyncio.to_thread(monitor.close)
         await asyncio.to_thread(publish, work.plan, result, monitor)
         return result
 
-    async def _run(self, work: Job, directory: Path, watchers: list[Watcher], checksum: str) -> CampaignResult:
+    async def _run(
+        self, work: Job, directory: Path, begun: bool, watchers: list[Watcher], checksum: str
+    ) -> CampaignResult:
         spec = work.plan.laboratory
         spec = replace(
             spec, in_process=spec.in_process or self._common.settings.in_process, accepted_checksum=checksum, ray=None
         )
         asking, key, rig = self._common.asking, self.item.id, self._rig.name
+        load = next(iter(scenes_of(work.plan).values())).liquid.mass  # a campaign has one liquid
         operator = RemoteOperator(asking, key, rig, self._announce) if work.pours and needs_person(spec) else None
         self._laboratory = open_laboratory(
             spec,
@@ -146,9 +154,9 @@ class Running:
                 work.plan,
                 self._laboratory,
                 directory,
-                resume=(directory / JOURNAL_NAME).is_file(),
+                resume=begun,
                 watchers=watchers,
-                ask_operator=RunQuestions(asking, self._common.store, key, rig, lambda: self._look(work.plan)),
+                ask_operator=RunQuestions(asking, self._common.store, key, rig, load, lambda: self._look(work.plan)),
                 stages=work.stages,
             ),
             name=f"campaign {key}",
@@ -158,9 +166,27 @@ class Running:
         return await self._task
 
     def _directory(self, plan: CampaignPlan) -> Path:
-        if self.item.run is not None:
-            return self._common.settings.runs / self.item.run
-        return create_run(plan)
+        if self.item.run is None:
+            return create_run(plan)
+        directory = self._common.settings.runs / self.item.run
+        if not directory.is_dir():
+            raise JournalError(
+                f"{directory}: the folder of this run is missing, and pours may have been made in it. Nothing was "
+                "poured now. Restore the folder from a copy, or submit the campaign again"
+            )
+        return directory
+
+    def _begun(self, directory: Path) -> bool:
+        """Whether a run was begun in that folder.
+
+        Raises:
+            JournalDamagedError: its journal is lost or damaged.
+        """
+        path = directory / JOURNAL_NAME
+        if has_begun(path):
+            check_journal(path).require()
+            return True
+        return False
 
     def note_run(self, directory: Path) -> None:
         """Write down which folder the run has, before anything happens in it."""

@@ -5,7 +5,6 @@ A run's own journal stays the truth about what happened in it. Here stands what 
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import sqlite3
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.errors import RunError
+from orchestrator.journal_file import locked_alone
 from orchestrator.state_directory import make_state_directory
 
 FORMAT = 1
@@ -161,20 +161,26 @@ class Store:
         make_state_directory(path.parent)
         self._lock = path.with_suffix(".lock").open("a+", encoding="utf-8")
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            alone = locked_alone(self._lock)
+        except OSError as error:
+            self._lock.close()
+            raise StoreError(f"{error.filename}: {error.strerror}; --state names the folder") from None
+        if not alone:
             self._lock.seek(0)
             owner = self._lock.read().strip() or "unknown"
             self._lock.close()
             raise StoreError(
                 f"{path.parent}: another daemon (process {owner}) has this state directory; 'decant shutdown' ends it, "
                 "--state names another one"
-            ) from None
+            )
         self._lock.truncate(0)
         self._lock.write(str(os.getpid()))
         self._lock.flush()
         try:
             self._open()
+        except sqlite3.OperationalError as error:  # the disk, the folder or their permissions, not the content
+            self._lock.close()
+            raise StoreError(f"{path}: can't be opened for writing ({error}); --state names another folder") from error
         except sqlite3.DatabaseError as error:
             self._lock.close()
             raise StoreError(f"{path}: not the daemon's memory, or damaged ({error})") from error

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from orchestrator.monitor.blueprint import beside_blueprint
-
-os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 
 def put_beside(recordings: Mapping[str, Path], path: Path) -> Path:

@@ -13,18 +13,15 @@ campaign can be changed through it. So it listens on this machine only, unless t
 
 from __future__ import annotations
 
-import contextlib
 import socket
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import Self
 from urllib.parse import quote
 
+from actors.child_process import ChildProcess, python_module
 from orchestrator.errors import RunError
 from orchestrator.monitor.monitor import CAPACITY, RerunMonitor
 from orchestrator.monitor.server import environment
@@ -72,7 +69,7 @@ class LiveView:
         shown: tuple[Path, ...] = (),
     ) -> None:
         self.address, self._web_port, self._memory, self._shown = address, web_port, memory, shown
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
         self._ports = (0, 0)
 
     def __enter__(self) -> Self:
@@ -95,32 +92,22 @@ class LiveView:
             )
         web_port = self._web_port or free_port(self.address, WEB_PORT)
         port = free_port(self.address, STREAM_PORT)
-        complaints = tempfile.TemporaryFile()  # noqa: SIM115 - read below, gone with this call
-        self._process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "orchestrator.monitor.server", self.address, str(port), str(web_port)),
-                *(self._memory, *(str(path.absolute()) for path in self._shown)),
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=complaints,
-            env=environment(),
-            start_new_session=True,
-        )
+        shown = [str(path.absolute()) for path in self._shown]
+        values = (self.address, str(port), str(web_port), self._memory, *shown)
+        self._process = ChildProcess(python_module("orchestrator.monitor.server", *values), environment=environment())
         self._ports = (port, web_port)
-        self._await_ports(complaints)
+        self._await_ports()
         return self.url
 
-    def _await_ports(self, complaints: IO[bytes]) -> None:
+    def _await_ports(self) -> None:
         assert self._process is not None
         end = time.monotonic() + _START_TIME
         wanted = list(self._ports)
         while wanted:
-            if self._process.poll() is not None or time.monotonic() > end:
-                complaints.seek(0)
-                said = complaints.read().decode(errors="replace").strip().splitlines()
+            if not self._process.alive or time.monotonic() > end:
+                said = self._process.last_error or "it says nothing"
                 self.close()
-                raise LiveError(f"the live view's server does not start: {said[-1] if said else 'it says nothing'}")
+                raise LiveError(f"the live view's server does not start: {said}")
             if answers(self.host, wanted[0]):
                 wanted.pop(0)
             else:
@@ -145,13 +132,12 @@ class LiveView:
     def server_pid(self) -> int:
         """The process id of Rerun's server; asked for once, since it is the first line of its output."""
         assert self._process is not None
-        assert self._process.stdout is not None
-        return int(self._process.stdout.readline())
+        return int(self._process.read_line(_START_TIME))
 
     @property
     def alive(self) -> bool:
         """Whether it still serves."""
-        return self._process is not None and self._process.poll() is None
+        return self._process is not None and self._process.alive
 
     def watcher_for(self, plan: CampaignPlan, run: Path, *, capacity: int = CAPACITY) -> RerunMonitor:
         """A watcher that writes a run's recording and shows the same here. To be closed when the run has ended.
@@ -169,18 +155,8 @@ class LiveView:
     def close(self) -> None:
         """Stop serving. Viewers keep what they have. May be called again."""
         process, self._process = self._process, None
-        if process is None:
-            return
-        with contextlib.suppress(OSError):
-            if process.stdin is not None:
-                process.stdin.close()
-        try:
-            process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+        if process is not None:
+            process.close(5.0)
 
 
 def is_free(address: str, port: int) -> bool:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+from actors.child_process import ChildProcess
 from orchestrator.events import Event
+from orchestrator.monitor.server import environment
 from orchestrator.monitor.worker import QueueThread
 from orchestrator.monitor.writer import Closing, Missed, Opening
 from orchestrator.plan import CampaignPlan
@@ -82,29 +82,25 @@ class RerunMonitor:
         """Write out what waits; False if the file could not be completed within `timeout` [s]. Never raises."""
         if not self._worker.close(timeout):
             _log.warning("recording %s: could not be completed within %g s", self.path.name, timeout)
-        with contextlib.suppress(OSError):
-            self._process.kill()  # done, or past help
+        self._process.kill()  # done, or past help
         self._worker.close(1.0)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(5.0)
         return self._report.get("complete", False) is True
 
     def _send(self, item: Event | Opening | Missed | Closing) -> None:
         if (dropped := self._worker.dropped if isinstance(item, Event) else 0) > self._told:
             self._told = dropped
             self._send(Missed(dropped))
-        assert self._process.stdin is not None
-        self._process.stdin.write(pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL))
-        self._process.stdin.flush()
+        self._process.write(pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL))
 
     def _finish(self) -> None:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         self._send(Closing(self.dropped))
-        self._process.stdin.close()
-        said = self._process.stdout.readline()
-        if not said:
-            raise ChildProcessError(f"the process that writes {self.path} has died; what it had written is kept")
+        self._process.close_input()
+        try:
+            said = self._process.read_line()
+        except EOFError:
+            raise ChildProcessError(
+                f"the process that writes {self.path} has died; what it had written is kept"
+            ) from None
         self._report = {"complete": True} | json.loads(said)
         if self._report["failed"]:
             _log.warning(
@@ -113,17 +109,11 @@ class RerunMonitor:
             )
 
 
-def _start_writer() -> subprocess.Popen[bytes]:
+def _start_writer() -> ChildProcess:
     # What is importable here is importable there: strategies and devices of others are among the settings.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "RERUN_ANALYTICS": "off"}
-    return subprocess.Popen(
-        [sys.executable, "-c", "from orchestrator.monitor.writer import main; main()"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=environment,
-        start_new_session=True,  # Ctrl-C is for the campaign
-    )
+    variables = environment() | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", "from orchestrator.monitor.writer import main; main()"]
+    return ChildProcess(command, environment=variables, errors="dropped")
 
 
 def free_path(path: Path) -> Path:

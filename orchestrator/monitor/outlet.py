@@ -8,7 +8,6 @@ Rows are gathered, and those of one entity sent as columns: a call for each row 
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 import uuid
@@ -16,9 +15,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-# Said before the SDK is loaded: a laboratory's daemon talks to nobody unasked.
-os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

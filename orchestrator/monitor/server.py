@@ -7,17 +7,15 @@ program and not its Python package, which serves the viewer's page on all addres
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
-import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-OPTIMISING_TIME = 120.0
+from actors.child_process import ChildProcess, Completed, run
 
-_PR_SET_PDEATHSIG = 1
+OPTIMISING_TIME = 120.0
 
 
 def rerun_program() -> str:
@@ -33,28 +31,24 @@ def rerun_program() -> str:
     return str(bundled if bundled.exists() else folder / "rerun")
 
 
-def environment() -> dict[str, str]:
-    """For Rerun's program: a laboratory talks to nobody unasked."""
-    return os.environ | {"RERUN_ANALYTICS": "off", "RUST_LOG": "warn"}
+def environment() -> dict[str, str | None]:
+    """What the environment of processes that load Rerun differs in: there it sends no usage statistics.
+
+    Rerun 0.41 reads its settings file and `CI`; `RERUN_ANALYTICS` has no effect. With `CI` it neither reads nor writes
+    that file, so that the user's own choice stays as it is.
+    """
+    return {"CI": "1", "RUST_LOG": "warn", "FORCE_RERUN_ANALYTICS": None}
 
 
-def run_rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
+def run_rerun(*arguments: str) -> Completed:
     """Run one of its commands to its end.
 
     Raises:
         OSError: it doesn't start, or takes longer than two minutes.
     """
     try:
-        return subprocess.run(
-            [rerun_program(), *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=OPTIMISING_TIME,
-            env=environment(),
-            stdin=subprocess.DEVNULL,
-        )
-    except (subprocess.TimeoutExpired, ModuleNotFoundError) as error:
+        return run([rerun_program(), *arguments], timeout=OPTIMISING_TIME, environment=environment())
+    except ModuleNotFoundError as error:
         raise OSError(str(error)) from error
 
 
@@ -76,27 +70,6 @@ def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence
     ]
 
 
-def ended_with_parent() -> Callable[[], None] | None:
-    """For `subprocess.Popen(preexec_fn=)`: the kernel kills the child when this process dies, by SIGKILL even.
-
-    Only for a process with one thread: what runs between fork and exec must not wait for a lock that another one holds,
-    and the kernel means the thread that forked when it speaks of the parent. None where there is no such call: Linux
-    alone has it.
-
-    Source: prctl(2), PR_SET_PDEATHSIG.
-    """
-    if not sys.platform.startswith("linux"):
-        return None
-    prctl, parent = ctypes.CDLL(None, use_errno=True).prctl, os.getpid()
-
-    def tie() -> None:
-        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it died before that was asked for
-            os._exit(1)
-
-    return tie
-
-
 def main(arguments: Sequence[str]) -> None:
     """Serve until stdin ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -105,13 +78,9 @@ def main(arguments: Sequence[str]) -> None:
         os.nice(5)
     address, port, web_port, memory, *shown = arguments
     command = serving(address, int(port), int(web_port), memory, shown)
-    process = subprocess.Popen(
-        command,
-        env=environment(),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        start_new_session=True,
-        preexec_fn=ended_with_parent(),  # noqa: PLW1509 - there is one thread here
+    # One thread runs here, so that the kernel may be asked to end the server with it.
+    process = ChildProcess(
+        command, environment=environment(), input=False, output=False, errors="shown", dies_with_parent=True
     )
     print(process.pid, flush=True)
     try:
@@ -119,7 +88,6 @@ def main(arguments: Sequence[str]) -> None:
             pass
     finally:
         process.kill()
-        process.wait()
 
 
 if __name__ == "__main__":

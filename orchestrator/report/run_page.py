@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from orchestrator.journal_check import JournalCheck
 from orchestrator.plan import CampaignPlan
 from orchestrator.report import style
 from orchestrator.report.asked import what_was_asked
@@ -77,7 +78,13 @@ _FIGURES: dict[str, tuple[str, str]] = {
 
 
 def run_page(
-    plan: CampaignPlan, summary: RunSummary, record: Record, directory: Path, *, versions: Mapping[str, Any]
+    plan: CampaignPlan,
+    summary: RunSummary,
+    record: Record,
+    directory: Path,
+    *,
+    versions: Mapping[str, Any],
+    check: JournalCheck,
 ) -> str:
     """The page of a run.
 
@@ -87,6 +94,7 @@ def run_page(
         record: what its journal says was done.
         directory: its folder.
         versions: as `versions.json` has them; empty where that is missing.
+        check: of its journal; a journal that fails is reported at the top of the page.
 
     Returns:
         HTML.
@@ -106,7 +114,7 @@ def run_page(
         state=str(record.state),
         finished=record.state is State.FINISHED,
         lead=f"Begun {_date(record.created)}, last entry {ended}. Seed {plan.seed}.",
-        standing=standing(record, directory.name),
+        standing=[*_damage(check), *standing(record, directory.name)],
         advice=said,
         no_advice=[] if said else _without_advice(plan, summary, record),
         open=unknown_of_all(plan, summary, record),
@@ -123,12 +131,118 @@ def run_page(
         pours=pour_tables(plan, record, names),
         no_pours="No pour was asked for." if not record.pours else "",
         not_simulated=_not_simulated(summary, names),
-        settings=_settings(plan, summary, directory, versions),
+        settings=[*_settings(plan, summary, directory, versions), ("records", check.verdict)],
         decisions=record.decisions[-MOST_DECISIONS:],
         notes=[(_date(when), text) for when, text in record.notes],
         resolved=_resolved(plan),
         footer=f"Made by Decant {dict(versions.get('packages', {})).get('decant', '')} from the run's journal.",
     )
+
+
+def reduced_run_page(
+    name: str,
+    record: Record,
+    directory: Path,
+    *,
+    versions: Mapping[str, Any],
+    check: JournalCheck,
+    reason: str,
+    found: Mapping[str, Any],
+) -> str:
+    """The page of a run whose campaign or results can't be read, because a plug-in of it is not installed, say.
+
+    Args:
+        name: of its campaign.
+        record: what its journal says was done.
+        directory: its folder.
+        versions: as `versions.json` has them.
+        check: of its journal.
+        reason: why the whole page can't be made.
+        found: its row of the catalogue: mode, seed, θ*, recommended actions.
+
+    Returns:
+        HTML.
+    """
+    mode = found.get("mode") or "none"
+    advice = [
+        f"Recommended for {receiver} by {one['strategy']} (degrees, millimetres, seconds): "
+        f"{', '.join(f'{key} {value:.4g}' for key, value in one['action'].items() if value is not None)}."
+        for receiver, one in (found.get("recommended") or {}).items()
+    ]
+    theta = found.get("theta") or {}
+    advice += [f"θ* (SI units): {', '.join(f'{key} {value:.4g}' for key, value in theta.items())}."] if theta else []
+    pours = [
+        Row(
+            [
+                str(pour.request.number),
+                pour.stage,
+                pour.request.scene,
+                style.display_values({k: v for k, v in pour.request.action.values().items() if v is not None}),
+                pour.came if pour.measured is not None else f"{pour.came}: {pour.reason}".rstrip(": "),
+                "—" if pour.measured is None else f"{1e3 * pour.measured.spilled:.1f}",
+                "—" if pour.measured is None else f"{1e3 * pour.measured.retained:.1f}",
+            ]
+        )
+        for pour in record.pours
+    ]
+    header = ["pour", "stage", "scene", "action", "outcome", "spilled [g]", "retained [g]"]
+    packages = dict(versions.get("packages", {}))
+    settings = {
+        "campaign": Path(versions.get("campaign", name)).name,
+        "seed": str(found.get("seed", "not recorded")),
+        "Python": f"{versions.get('python', 'not recorded')}",
+        "packages": ", ".join(f"{k} {v}" for k, v in packages.items() if v != "not installed") or "not recorded",
+        "records": check.verdict,
+    }
+    nothing = Table("", [], [])
+    cost = [
+        Row(["pours weighed", str(len(record.weighed))]),
+        Row(["simulations", str(sum(stage.simulations for stage in record.stages.values()))]),
+        Row(["at work", f"{record.at_work_s / 60.0:.1f} min"]),
+    ]
+    return render(
+        "run.html.j2",
+        title=f"{name}: {directory.name}",
+        kicker=f"Reduced report of a pouring campaign · run {directory.name}",
+        heading=name,
+        mode=MODES.get(mode, mode),
+        mode_look=mode,
+        state=str(record.state),
+        finished=record.state is State.FINISHED,
+        lead=f"Begun {_date(record.created)}, last entry {_date(record.ended)}.",
+        standing=[f"This report is reduced to what the journal has. {reason}", *_damage(check)],
+        advice=[],
+        no_advice=advice or ["This run recommends no action that can be read here."],
+        open=[],
+        asked=[("campaign", name)],
+        stages=stage_table(record),
+        cost=Table("What the run took", ["", ""], cost, frozenset({1})),
+        questions=question_table(record),
+        theta=None,
+        theta_lines=[],
+        scores=nothing,
+        theta_figures=[],
+        receivers=nothing,
+        figures=[_picture(file.stem.replace("-", " "), file) for file in sorted((directory / "figures").glob("*.png"))],
+        pours=[Table("Every pour that was asked for", header, pours, frozenset({0, 5, 6}))] if pours else [],
+        no_pours="No pour was asked for.",
+        not_simulated=nothing,
+        settings=list(settings.items()),
+        decisions=record.decisions[-MOST_DECISIONS:],
+        notes=[(_date(when), text) for when, text in record.notes],
+        resolved="",
+        footer=f"Made by Decant {packages.get('decant', '')} from the run's journal.",
+    )
+
+
+def _damage(check: JournalCheck) -> list[str]:
+    if not check.problems:
+        return []
+    made = f" The ledger of pours names: {'; '.join(check.pours)}." if check.pours else ""
+    return [
+        "WARNING: the records of this run are damaged or incomplete. Numbers on this page may be wrong or missing. "
+        f"Problems: {'; '.join(check.problems)}.{made}"
+    ]
 
 
 def _resolved(plan: CampaignPlan) -> str:

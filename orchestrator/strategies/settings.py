@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from orchestrator.config.yaml.sections import Complaints, Count, Section
+from orchestrator.config.yaml.sections import Complaints, PourCount, Section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -101,7 +101,7 @@ class DeploymentSettings(StrategySettings):
     simulates: ClassVar[bool] = True
     """Whether θ matters to it."""
 
-    pours: Count | None = None
+    pours: PourCount | None = None
     """Real pours per receiver."""
 
     noise: Literal["constant", "varying"] = "constant"

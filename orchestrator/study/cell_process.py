@@ -23,6 +23,7 @@ from actors.spec import LaboratorySpec
 from orchestrator.campaign import run_campaign
 from orchestrator.errors import RunError
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal_check import has_begun
 from orchestrator.stages import CALIBRATION
 from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import Cell, cells_of
@@ -59,7 +60,7 @@ def run_cell(study: StudyPlan, cell: Cell, folder: Path, make: Make) -> CellResu
     plan, stages = campaign_of(study, cell, lambda other: read_result(folder, other).results, directory)
     directory.mkdir(parents=True, exist_ok=True)
     laboratory = make(plan.laboratory, any(stage.pours for stage in stages))
-    begun = (directory / JOURNAL_NAME).is_file()
+    begun = has_begun(directory / JOURNAL_NAME)
     result = asyncio.run(run_campaign(plan, laboratory, directory, resume=begun, stages=stages))
     kept = CellResult(
         results=dict(result.results),

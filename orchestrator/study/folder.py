@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from pydantic import SerializeAsAny, field_validator
 
 from orchestrator.codec import digest, first_difference, from_json, to_json
 from orchestrator.errors import RunError
+from orchestrator.journal_file import locked_alone
 from orchestrator.results import decode_result
 from orchestrator.strategies.learnt import Learnt, Part
 from orchestrator.study.cells import Cell
@@ -115,9 +115,11 @@ def opened(study: StudyPlan) -> Iterator[Path]:
         raise StudyError(f"{folder}: can't be written: {error.strerror}") from None
     with (folder / "study.lock").open("a") as lock:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise StudyError(f"{folder}: another process is running this study; wait for it, or stop it") from None
+            alone = locked_alone(lock)
+        except OSError as error:
+            raise StudyError(f"{error.filename}: {error.strerror}") from None
+        if not alone:
+            raise StudyError(f"{folder}: another process is running this study; wait for it, or stop it")
         check_settings(study)
         text = json.dumps(study_fingerprint(study), indent=1, ensure_ascii=False)
         write_whole(folder / SETTINGS, text + "\n")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from actors.child_process import ChildProcess, python_module
 from orchestrator.study.cells import Cell, cells_of, estimated_seconds
 from orchestrator.study.folder import LOG, is_finished
 from orchestrator.study.plan import StudyPlan
@@ -54,7 +52,7 @@ Watch = Callable[[Status], None]
 
 def cell_command(study: StudyPlan) -> list[str]:
     """What runs cells in a process of its own."""
-    return [sys.executable, "-m", "orchestrator.study.cell_process", str(study.source)]
+    return python_module("orchestrator.study.cell_process", str(study.source))
 
 
 class CellProcess:
@@ -71,50 +69,36 @@ class CellProcess:
     def __init__(self, command: Sequence[str], log: Path) -> None:
         self._log = log
         with log.open("wb") as errors:
-            # A session of its own: Ctrl-C reaches this process alone, which then ends its cells' processes.
-            self.popen = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, start_new_session=True
-            )
-        assert self.popen.stdout is not None
-        os.set_blocking(self.popen.stdout.fileno(), False)
-        self._heard = b""
+            self.child = ChildProcess(command, errors=errors)
         self.cell: Cell | None = None
 
     def begin(self, cell: Cell) -> None:
         """Give it a cell."""
-        assert self.popen.stdin is not None
         self.cell = cell
-        try:
-            self.popen.stdin.write(f"{cell.id}\n".encode())
-            self.popen.stdin.flush()
-        except BrokenPipeError:
-            pass  # it has died; `ended` says so
+        with contextlib.suppress(BrokenPipeError):  # it has died; `ended` says so
+            self.child.write(f"{cell.id}\n".encode())
 
     def ended(self) -> tuple[Cell, str | None] | None:
         """The cell that has just ended, if one has, and what went wrong with it."""
-        assert self.popen.stdout is not None
+        if self.cell is None:
+            return None
         dead = self.dead  # before the last look at what it wrote
-        self._heard += self.popen.stdout.read() or b""
-        line, newline, rest = self._heard.partition(b"\n")
-        if self.cell is None or not (newline or dead):
+        line = None
+        with contextlib.suppress(TimeoutError, EOFError):
+            line = self.child.read_line(0.0)
+        if line is None and not dead:
             return None
         cell, self.cell = self.cell, None
-        if not newline:
-            return cell, last_words(self._log)
-        self._heard = rest
-        return cell, json.loads(line)[1]
+        return cell, last_words(self._log) if line is None else json.loads(line)[1]
 
     @property
     def dead(self) -> bool:
         """Its process has ended."""
-        return self.popen.poll() is not None
+        return not self.child.alive
 
     def close(self) -> None:
         """Let go of its pipes."""
-        for pipe in (self.popen.stdin, self.popen.stdout):
-            if pipe is not None:
-                with contextlib.suppress(BrokenPipeError):
-                    pipe.close()
+        self.child.release()
 
 
 def run_cells(
@@ -201,14 +185,11 @@ def _end(processes: Iterable[CellProcess]) -> None:
     mine = list(processes)
     for process in mine:
         if process.cell is None:
-            process.close()  # it keeps what it has compiled
+            process.child.close_input()  # it keeps what it has compiled
         else:
-            process.popen.terminate()
+            process.child.terminate()
     deadline = time.monotonic() + GRACE
     for process in mine:
-        try:
-            process.popen.wait(max(deadline - time.monotonic(), 0.1))
-        except subprocess.TimeoutExpired:
-            process.popen.kill()
-            process.popen.wait()
+        if not process.child.wait(max(deadline - time.monotonic(), 0.1)):
+            process.child.kill()
         process.close()

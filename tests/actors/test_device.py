@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from actors.device import DeviceLostError, LocalDevice
+from actors import device
+from actors.device import DeviceLostError, LocalDevice, RayDevice
 
 
 class Stuck:
@@ -46,3 +49,58 @@ def test_what_a_call_says_after_nobody_waits_for_it_any_more_is_no_stray_message
 
     asyncio.run(play())
     assert [context["message"] for context in stray] == []
+
+
+class Held:
+    """Its process is not up before a file is there."""
+
+    def __init__(self, file: Path) -> None:
+        import time
+
+        while not file.exists():
+            time.sleep(0.01)
+
+    def value(self) -> int:
+        return 5
+
+    def hang(self) -> None:
+        threading.Event().wait()
+
+
+@pytest.fixture
+def held(ray_running: None, tmp_path: Path) -> tuple[RayDevice, Path]:
+    import ray
+
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers can't import test modules
+    file = tmp_path / "go on"
+    return RayDevice("balance", Held, file), file
+
+
+@pytest.mark.ray
+def test_a_deadline_does_not_count_the_start_of_the_process(held: tuple[RayDevice, Path]) -> None:
+    balance, file = held
+
+    async def play() -> None:
+        calls = [asyncio.create_task(balance.call("value", deadline=0.05, urgent=urgent)) for urgent in (True, False)]
+        done, _ = await asyncio.wait(calls, timeout=1.0)
+        assert not done, "a process that starts is neither given up nor killed"
+        file.touch()
+        assert await asyncio.gather(*calls) == [5, 5]
+        with pytest.raises(DeviceLostError, match=r"no answer to 'hang' within 0\.\d+ s"):
+            await balance.call("hang", deadline=0.05)
+        await balance.close()
+
+    asyncio.run(play())
+
+
+@pytest.mark.ray
+def test_a_process_that_never_starts_is_lost(held: tuple[RayDevice, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    balance, _ = held
+    monkeypatch.setattr(device, "START_DEADLINE", 0.2)
+
+    async def play() -> None:
+        with pytest.raises(DeviceLostError, match="balance: no answer to 'value'"):
+            await balance.call("value", deadline=60.0)
+        await balance.close()
+
+    asyncio.run(play())

@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+from actors.child_process import child_environment
+
 PROGRAM = """
 import json
 import psutil
@@ -30,7 +32,9 @@ print(json.dumps([given, before, full, freed, resident()]))
 def test_what_is_freed_below_something_that_is_kept_goes_back_to_the_system() -> None:
     if not hasattr(ctypes.CDLL(None), "malloc_trim"):
         pytest.skip("another C library than glibc")
-    said = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, env=child_environment()
+    ).stdout
     given, before, full, freed, after = json.loads(said)
     assert given
     taken = full - before

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from actors.optimizer.core.problem import Data, Effort, Linear, SuggestProblem
@@ -69,8 +69,26 @@ def questions(draw):
     )
 
 
+SQUARES_TO_ZERO = SuggestProblem(
+    Space((Axis("x0", 0.0, 1.0), Axis("x1", 0.0, 1.0))),
+    Data((), ()),
+    count=0,
+    seed=0,
+    mean="simulated",
+    simulated=Data(((0.0, 0.0), (0.0, 0.0)), (0.0, 8.64e-207)),
+    acquisition="knowledge",
+)
+"""Costs other than zero whose squares are zero as floats."""
+
+
 @settings(max_examples=examples(80), deadline=None)
 @given(question=questions())
+@example(question=SQUARES_TO_ZERO)
+@example(question=replace(SQUARES_TO_ZERO, count=2))
+@example(question=replace(SQUARES_TO_ZERO, mean="pooled", count=1))
+@example(question=replace(SQUARES_TO_ZERO, mean="scaled", count=1))
+@example(question=replace(SQUARES_TO_ZERO, data=SQUARES_TO_ZERO.simulated, count=1))
+@example(question=replace(SQUARES_TO_ZERO, data=SQUARES_TO_ZERO.simulated, mean="zero", acquisition="lcb", count=1))
 def test_proposals_are_finite_and_keep_to_bounds_whole_numbers_and_constraints(question):
     answer = propose(question)
     assert len(answer.points) == question.count

@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from actors import ray_private, ray_runtime
+from actors.child_process import ChildProcess, child_environment
 from actors.protocols import LaboratoryError
 from actors.spec import LaboratorySpec
 from tests.patience import PATIENCE
@@ -154,6 +155,7 @@ def test_clusters_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        env=child_environment(),
     )
     try:
         holder.stdout.readline()
@@ -179,14 +181,16 @@ def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(
 def test_logs_of_workers_that_are_gone_are_removed_and_those_of_living_ones_kept(tmp_path: Path) -> None:
     logs = tmp_path / "session_1" / "logs"
     logs.mkdir(parents=True)
-    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone = subprocess.Popen([sys.executable, "-c", ""], env=child_environment())
     gone.wait()
     names = {pid: [f"worker-a1-01-{pid}.out", f"worker-a1-01-{pid}.err", f"python-core-worker-a1_{pid}.log"]
              for pid in (gone.pid, os.getpid())}  # fmt: skip
     for name in [*names[gone.pid], *names[os.getpid()], "raylet.out", "python-core-driver-01_1.log"]:
         (logs / name).write_text("a line")
-    with (tmp_path / "alive").open("w") as lock, subprocess.Popen(["true"]) as warden:
+    warden = ChildProcess(["true"])
+    with (tmp_path / "alive").open("w") as lock:
         assert ray_private.forget_logs(ray_private.PrivateRay(tmp_path, lock, warden)) == 3
+    warden.close()
     assert {path.name for path in logs.iterdir()} == {
         *names[os.getpid()], "raylet.out", "python-core-driver-01_1.log"
     }  # fmt: skip

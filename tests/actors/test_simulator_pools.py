@@ -141,21 +141,18 @@ def test_a_cancelled_simulation_really_stops_and_the_next_one_runs_at_once(make_
     log = tmp_path / "log"
 
     async def play():
-        pool = make_pool(fake(30.0, log))
+        pool = make_pool(fake(2 * PATIENCE, log))
         job = asyncio.create_task(pool.simulate(task()))
         await until(lambda: count(log, "begin") == 1)
         job.cancel()
         with pytest.raises(asyncio.CancelledError):
             await job
-        started = time.monotonic()
         await pool.simulate(task(name="quick"))
-        waited = time.monotonic() - started
         statistics = pool.statistics()
         await pool.close()
-        return waited, statistics
+        return statistics
 
-    waited, statistics = asyncio.run(play())
-    assert waited < 5.0
+    statistics = asyncio.run(play())
     assert count(log, "cancelled") == 1
     assert count(log, "made") == 1, "the member was kept, its compiled kernels with it"
     assert statistics.cancelled == 1
@@ -294,17 +291,16 @@ def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_o
         long, other, waiting = (asyncio.create_task(pool.simulate(task(seed=s))) for s in range(3))
         await until(lambda: count(log, "begin") == 2)
         other.cancel()  # its simulator becomes idle; the third job was sent behind the first or behind this one
-        begun = time.monotonic()
         await until(lambda: count(log, "begin") == 3)
-        idle = time.monotonic() - begun
+        waited_for_the_first = long.done()
         assert (await waiting).outcome.seed == 2
         assert (await long).outcome.seed == 0
         deaths = pool.statistics().deaths
         await pool.close()
-        return idle, deaths
+        return waited_for_the_first, deaths
 
-    idle, deaths = asyncio.run(play())
-    assert idle < 2.0
+    waited_for_the_first, deaths = asyncio.run(play())
+    assert not waited_for_the_first
     assert deaths == 0
     assert count(log, "begin") == 3
 

@@ -128,7 +128,7 @@ def test_the_operator_takes_bench_time(open_bench, scene, action):
             return time.monotonic() - started
 
     # 85 s of operator and some 30 s of everything else, a hundred times as fast.
-    assert 0.85 < asyncio.run(play()) < 3.0
+    assert asyncio.run(play()) > 0.85 + 0.1
 
 
 @pytest.mark.realtime

@@ -9,6 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from actors.child_process import child_environment
 from tests.end_to_end.test_daemon_killed import opened
 from tests.patience import PATIENCE
 
@@ -23,7 +24,7 @@ def certificate(folder: Path, name: str) -> Path:
     subject = ["-subj", f"/CN={name}", "-addext", "subjectAltName=IP:127.0.0.1", "-days", "2", "-nodes"]
     files = ["-keyout", str(folder / f"{name}.key"), "-out", str(folder / f"{name}.crt")]
     command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
-    subprocess.run([*command, *subject, *files], check=True, capture_output=True)
+    subprocess.run([*command, *subject, *files], check=True, capture_output=True, env=child_environment())
     return folder / f"{name}.crt"
 
 

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from actors.child_process import child_environment
 from orchestrator.monitor.server import environment, rerun_program
 from tests.orchestrator.recorded import Contents
 from tests.patience import PATIENCE
@@ -21,7 +22,7 @@ def viewer(stream: str, kept: Path) -> Iterator[subprocess.Popen[bytes]]:
         [rerun_program(), "--save", str(kept), "--connect", stream, "--port", "auto"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        env=environment(),
+        env=child_environment(environment()),
     )
     try:
         yield process

@@ -61,15 +61,25 @@ def test_first_simulations_and_rivals_are_there_when_the_calibration_pours_are_m
 def test_the_next_receivers_prior_is_made_beside_this_ones_pours(tmp_path: Path) -> None:
     bench = laboratory(separate=True, pour=0.2)
     events: list[Event] = []
-    run(tmp_path / "run", bench, plan=campaign(tmp_path, calibration=None), watchers=[events.append])
+    made: list[PourTask] = []
+
+    def watch(event: Event) -> None:
+        events.append(event)
+        if isinstance(event, StageClosed) and event.stage == "deployment:cup":
+            made.extend(bench.simulators.tasks)
+
+    run(tmp_path / "run", bench, plan=campaign(tmp_path, calibration=None), watchers=[watch])
     first, second = (
         [e for e in events if isinstance(e, RequestFinished) and e.stage == stage]
         for stage in ("deployment:cup", "deployment:narrow")
     )
     assert any(isinstance(event.request, Pour) for event in first)
     prior = [event for event in second if isinstance(event.request, Simulate) and event.request.purpose == "prior"]
-    at_once = [event for event in prior if event.seconds < 0.002]
-    assert len(at_once) >= len(prior) - 2  # those with frames are made when they are asked for
+    seeds = {event.request.seed for event in prior if isinstance(event.request, Simulate)}
+    ahead = [task for task in made if task.scene.name == "narrow" and task.seed in seeds]
+    assert len(ahead) >= len(prior) - 2 > 0  # those with frames are made when they are asked for
+    again = [task for task in bench.simulators.tasks[len(made) :] if task in ahead]
+    assert not again, "what was made ahead is not made twice"
 
 
 def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:

@@ -9,6 +9,7 @@ import os
 import shlex
 import shutil
 import signal
+import sqlite3
 import time
 from datetime import datetime
 from pathlib import Path
@@ -274,3 +275,54 @@ def test_the_state_directory_is_where_its_variables_say(monkeypatch: pytest.Monk
     assert state_directory() == Path("/var/lib/decant")
     monkeypatch.setenv(VARIABLE, "/mine")
     assert state_directory() == Path("/mine")
+
+
+def damaged(directory: Path, statement: str) -> None:
+    """Valid SQLite, with content that no run has written."""
+    connection = sqlite3.connect(directory / JOURNAL_NAME)
+    for (name,) in connection.execute("select name from sqlite_master where type = 'trigger'").fetchall():
+        connection.execute(f"drop trigger {name}")
+    connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        f"update header set fingerprint = json_set(fingerprint, '$.seed', json('{2**63}'))",
+        "update header set fingerprint = json_set(fingerprint, '$.seed', json('[1]'))",
+        "update header set fingerprint = '[]'",
+        "update event set body = json_set(body, '$.after', json('{}')) where kind = 'campaign.state'",
+        "update event set body = '7' where kind = 'pour.finished'",
+        "update event set body = json_set(body, '$.id', 999) where kind = 'pour.started'",
+        "update event set kind = 'told' where kind = 'requested'",
+        "drop table event",
+    ],
+)
+def test_a_bad_run_is_listed_as_unreadable_and_hides_no_other(tmp_path: Path, state: Path, statement: str) -> None:
+    good, bad = made(tmp_path), made(tmp_path)
+    damaged(bad, statement)
+    shown = invoke("runs")
+    assert shown.exit_code == 0, shown.output
+    (line,) = (line for line in shown.stdout.splitlines() if good.name in line)
+    assert "finished" in line
+    (line,) = (line for line in shown.stdout.splitlines() if bad.name in line)
+    assert "unreadable" in line
+    assert f"note: {bad}" in shown.stderr  # its path, with the reason
+    found = {run["run"]: run for run in json.loads(invoke("runs list --json").stdout)["runs"]}
+    assert found[bad.name]["path"] == str(bad)
+    assert {run["run"] for run in asked("pour")} == {good.name}
+
+
+@pytest.mark.parametrize("lost", ["deleted", "empty", "garbage"])
+def test_a_run_that_lost_its_journal_is_listed_as_unreadable(tmp_path: Path, state: Path, lost: str) -> None:
+    good, bad = made(tmp_path), made(tmp_path)
+    if lost == "deleted":
+        (bad / JOURNAL_NAME).unlink()
+    else:
+        (bad / JOURNAL_NAME).write_bytes(b"" if lost == "empty" else b"coffee " * 1000)
+    assert {run["run"]: run["state"] for run in asked()} == {good.name: "finished", bad.name: "unreadable"}
+    checked = invoke(f"runs check {bad.name}")
+    assert checked.exit_code == 1
+    assert checked.output.count("(weighed: ") == 4  # the ledger has the pours

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from actors.child_process import child_environment
 from actors.protocols import Notice, ProgressCallback
 from orchestrator.commands.campaigns import run_directory
 from orchestrator.commands.common import BAD_INPUT, RefusalError
@@ -33,14 +34,17 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     place = tmp_path / "disk"
     place.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "tmpfs", str(place)], capture_output=True, check=False
+        ["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "tmpfs", str(place)],
+        capture_output=True,
+        check=False,
+        env=child_environment(),
     )
     if mounted.returncode != 0:
         pytest.skip("only root may mount a small disk")
     try:
         yield place
     finally:
-        subprocess.run(["umount", "--lazy", str(place)], check=True)
+        subprocess.run(["umount", "--lazy", str(place)], check=True, env=child_environment())
 
 
 def fill(disk: Path, leave: int = 0) -> None:

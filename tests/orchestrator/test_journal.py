@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import signal
 import sqlite3
 import subprocess
 import sys
 import textwrap
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
+from orchestrator.daemon.store import Store, StoreError
 from orchestrator.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
+from orchestrator.journal_check import JournalDamagedError, check_journal
 from orchestrator.journal_file import FORMAT, Header, JournalError, JournalLockedError
+from orchestrator.pour_ledger import BEGUN, LEDGER_NAME, read_ledger
 from orchestrator.states import State
+from orchestrator.study.folder import StudyError, opened
+from tests.orchestrator.study_files import small
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
 
@@ -103,7 +112,9 @@ def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) ->
             journal.append(Kind.NOTE, {{"number": number}})
             print(number, flush=True)
     """
-    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True, env=child_environment()
+    )
     assert process.stdout is not None
     for line in process.stdout:
         if int(line) >= 300:
@@ -127,7 +138,11 @@ def test_a_second_process_is_refused_and_told_who_is_first(path: Path) -> None:
         input()
     """
     process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", textwrap.dedent(code)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=child_environment(),
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "open\n"
@@ -216,3 +231,206 @@ def test_a_full_disk_is_named_and_nothing_written_is_lost(path: Path) -> None:
     journal.append(Kind.NOTE, {"text": "after"})  # there is room for little things
     assert [entry.body["text"] for entry in journal.entries()] == ["before", "after"]
     journal.close()
+
+
+# -- lost and changed entries ------------------------------------------------------------------------------------------
+
+
+def pour(journal: Journal, number: int) -> None:
+    """One pour, from its intent to its outcome."""
+    measurement = {"loaded": 0.2, "spilled": 0.003, "retained": 0.001}
+    journal.append(Kind.POUR_STARTED, {"id": number, "attempt": 1, "number": number}, stage="pours")
+    outcome = {"type": "Poured", "measurement": measurement}
+    journal.append(Kind.POUR_FINISHED, {"id": number, "outcome": outcome}, stage="pours")
+
+
+def poured(path: Path, *, until: str) -> None:
+    """Two pours by a process that is killed right after a statement in this module's journal."""
+    code = f"""
+        import os, signal
+        from pathlib import Path
+        from orchestrator import journal as module
+        from orchestrator.journal import Journal, Kind
+        from orchestrator.journal_file import Header
+        from tests.orchestrator.test_journal import pour
+        journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
+        pour(journal, 1)
+        {until}
+        pour(journal, 2)
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    process = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=False, env={**os.environ})
+    assert process.returncode == -signal.SIGKILL
+
+
+KILLED_BEFORE_THE_LEDGER = "journal._ledger.append = lambda lines: os.kill(os.getpid(), signal.SIGKILL)"
+
+
+def test_at_a_pour_the_entries_leave_the_write_ahead_log(path: Path) -> None:
+    poured(path, until="")
+    for suffix in ("-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+    with JournalReader(path) as reader:
+        assert [entry.kind for entry in reader.entries()] == [Kind.POUR_STARTED, Kind.POUR_FINISHED] * 2
+
+
+def test_a_log_that_a_reader_kept_from_being_copied_and_that_is_lost_is_detected(path: Path) -> None:
+    journal = Journal.create(path, HEADER)
+    reading = sqlite3.connect(path)
+    reading.execute("begin")
+    reading.execute("select count(*) from event").fetchone()  # pages that it reads stay in the file until it ends
+    pour(journal, 1)
+    copied = path.with_name("copied") / JOURNAL_NAME
+    copied.parent.mkdir()
+    for name in (JOURNAL_NAME, LEDGER_NAME):  # the folder as it is on the disk, without the log
+        (copied.parent / name).write_bytes((path.parent / name).read_bytes())
+    reading.close()
+    journal.close()
+    with pytest.raises(JournalDamagedError, match=r"entries were lost\n.*made: pour 1 of stage pours \(weighed: 3.0 g"):
+        Journal.resume(copied, HEADER)
+    Journal.resume(path, HEADER).close()
+
+
+def test_a_process_killed_between_journal_and_ledger_is_resumed_and_the_ledger_completed(path: Path) -> None:
+    poured(path, until=KILLED_BEFORE_THE_LEDGER)
+    kinds = [line.kind for line in read_ledger(path.with_name(LEDGER_NAME))]
+    assert kinds == [BEGUN, Kind.POUR_STARTED, Kind.POUR_FINISHED]
+    Journal.resume(path, HEADER).close()
+    found = check_journal(path)
+    assert found.problems == ()
+    assert found.pours[0] == "pour 1 of stage pours (weighed: 3.0 g spilled, 1.0 g retained)"
+    assert found.pours[1].startswith("pour 2 of stage pours (began ")
+
+
+def test_a_half_written_last_line_of_the_ledger_is_no_damage(path: Path) -> None:
+    poured(path, until="")
+    ledger = path.with_name(LEDGER_NAME)
+    whole = ledger.read_bytes()
+    ledger.write_bytes(whole[:-10])
+    assert check_journal(path).problems == ()
+    Journal.resume(path, HEADER).close()
+    assert ledger.read_bytes() == whole
+
+
+@pytest.mark.parametrize("edit", [(b'"spilled":0.003', b'"spilled":0.002'), (b'"pour.started"', b'"pour.withdrawn"')])
+def test_a_changed_ledger_is_detected(path: Path, edit: tuple[bytes, bytes]) -> None:
+    poured(path, until="")
+    ledger = path.with_name(LEDGER_NAME)
+    ledger.write_bytes(ledger.read_bytes().replace(*edit, 1))
+    with pytest.raises(JournalDamagedError, match=r"pours.jsonl, line [23]: was changed after it was written"):
+        Journal.resume(path, HEADER)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "update event set body = replace(body, '0.003', '0.004') where seq = 2",
+        "update event set t = t + 1 where seq = 3",
+        "update header set name = 'other'",
+        "delete from event where seq = 2",
+        "delete from event where seq = 4",
+        "delete from chain where seq = 4",
+        "insert into event values (5, 'pours', 0.0, 'note', '{}')",
+    ],
+)
+def test_a_changed_removed_or_inserted_entry_is_detected(path: Path, change: str) -> None:
+    journal = Journal.create(path, HEADER)
+    pour(journal, 1)
+    journal.append(Kind.NOTE, {"text": "one"})
+    journal.append(Kind.NOTE, {"text": "two"})
+    journal.close()
+    assert check_journal(path).verdict == "complete and unchanged (4 entries)"
+    with closing(sqlite3.connect(path)) as connection:
+        for name in ("event_is_never_changed", "event_is_never_deleted", "chain_is_never_deleted"):
+            connection.execute(f"drop trigger {name}")
+        connection.execute(change)
+        connection.commit()
+    assert check_journal(path).problems
+    with pytest.raises(JournalDamagedError, match="Nothing was poured now"):
+        Journal.resume(path, HEADER)
+
+
+def test_every_flipped_byte_of_an_entry_is_detected(path: Path) -> None:
+    journal = Journal.create(path, HEADER)
+    pour(journal, 1)
+    journal.close()
+    content = path.read_bytes()
+    begin = content.index(b'{"id":1,"outcome"')
+    for place in range(begin, content.index(b'"Poured"', begin)):
+        changed = bytearray(content)
+        changed[place] ^= 1
+        path.write_bytes(changed)
+        assert check_journal(path).problems, f"byte {place - begin}"
+
+
+@pytest.mark.parametrize("trace", ["resolved.json", "journal.reserve", "journal.lock", LEDGER_NAME])
+def test_a_folder_with_traces_of_a_run_gets_no_new_journal(path: Path, trace: str) -> None:
+    path.parent.mkdir()
+    (path.parent / trace).touch()
+    with pytest.raises(JournalError, match=f"a run was begun here .*{trace}"):
+        Journal.create(path, HEADER)
+    with pytest.raises(JournalDamagedError, match="missing"):
+        Journal.resume(path, HEADER)
+    assert not path.exists()
+
+
+def test_an_empty_journal_next_to_a_recording_is_not_begun_again(path: Path) -> None:
+    path.parent.mkdir()
+    path.touch()
+    (path.parent / "campaign.rrd").touch()
+    with pytest.raises(JournalDamagedError, match=r"is empty, but the folder has campaign.rrd"):
+        Journal.resume(path, HEADER)
+
+
+def test_a_journal_of_the_version_before_is_read_not_verifiable_and_gets_its_chain_on_resume(path: Path) -> None:
+    journal = Journal.create(path, HEADER)
+    journal.append(Kind.REQUESTED, {"id": 1, "request": {"type": "Pour", "number": 1}}, stage="pours")
+    journal.append(Kind.POUR_STARTED, {"id": 1, "attempt": 1}, stage="pours")
+    journal.append(Kind.POUR_FINISHED, {"id": 1, "outcome": {"type": "Failed", "reason": "spilt"}}, stage="pours")
+    journal.close()
+    path.with_name(LEDGER_NAME).unlink()
+    with closing(sqlite3.connect(path)) as connection:  # what that version wrote
+        connection.execute("drop table chain")
+        connection.execute("update header set format = 2")
+        connection.commit()
+    found = check_journal(path)
+    assert (found.problems, found.verdict.partition(":")[0]) == ((), "not verifiable")
+    assert len(bodies(path)) == 3
+    resumed = Journal.resume(path, HEADER)
+    pour(resumed, 2)
+    resumed.close()
+    found = check_journal(path)
+    assert found.verdict == "complete; the first 3 of 5 entries are older than the hash chain"
+    assert found.pours == (
+        "pour 1 of stage pours (failed: spilt)",
+        "pour 2 of stage pours (weighed: 3.0 g spilled, 1.0 g retained)",
+    )
+    path.write_bytes(b"")
+    with pytest.raises(JournalDamagedError, match=r"pour 1 of stage pours .failed: spilt.; pour 2 of stage pours"):
+        Journal.resume(path, HEADER)
+
+
+def test_a_run_can_be_checked_while_it_is_written(path: Path) -> None:
+    journal = Journal.create(path, HEADER)
+    for number in range(1, 20):
+        pour(journal, number)
+        journal.append(Kind.NOTE, {"text": "between"})
+        assert check_journal(path).problems == ()
+    journal.close()
+
+
+def test_a_file_system_without_locks_is_reported_as_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not as another process that runs the campaign, the study or the daemon: NFS without its lock service."""
+
+    def unsupported(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", unsupported)
+    cause = rf"can't be locked \({os.strerror(errno.ENOLCK)}\); name a folder on a local disk"
+    with pytest.raises(JournalError, match=rf"journal\.lock: {cause}") as refused:
+        Journal.create(tmp_path / "journal.sqlite", HEADER)
+    assert not isinstance(refused.value, JournalLockedError)
+    with pytest.raises(StoreError, match=cause):
+        Store(tmp_path / "daemon.sqlite")
+    with pytest.raises(StudyError, match=cause), opened(small(tmp_path)):
+        pass

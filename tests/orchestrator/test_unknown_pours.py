@@ -119,6 +119,9 @@ def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
         ("weighed -1 0", "don't fit a load"),
         ("weighed 150 60", "don't fit a load of 200 g"),
         ("weighed nan 0", "don't fit a load"),
+        ("weighed 500 0", "don't fit a load of 200 g"),
+        ("weighed 500 0 600", "was to have a load of 200 g, and 600 g is more than 20 g away"),
+        ("weighed 1 0 nan", "was to have a load of 200 g"),
     ],
 )
 def test_an_answer_that_makes_no_sense_is_explained(answer: str, complaint: str) -> None:

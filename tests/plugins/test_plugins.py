@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
 from tests.end_to_end import small
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +28,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = tmp_path_factory.mktemp("source")
     shutil.copy(ROOT / "tests" / "plugins" / "pyproject.toml", source)
     shutil.copytree(ROOT / "tests" / "plugins" / "decant_example", source / "decant_example")
-    subprocess.run([*install, "--target", str(folder), str(source)], check=True)
+    subprocess.run([*install, "--target", str(folder), str(source)], check=True, env=child_environment())
     return folder
 
 
@@ -189,6 +190,20 @@ def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: 
     assert any(part["name"] == "gentle" for part in resolved["deployment"]["objectives"])
     again = decant("validate", str(run / "resolved.json"), cwd=folder)
     assert again.returncode == 0, again.stderr
+
+    versions = json.loads((run / "versions.json").read_text())
+    assert versions["packages"]["decant-example"] == "1.0"
+    assert {"decant.strategies: hypercube", "decant.arms: stand"} <= set(versions["plugins"]["decant-example"])
+
+    reported = command()("report", str(run), "-o", "elsewhere.html", cwd=folder)  # where the example is not installed
+    assert reported.returncode == 0, reported.stderr
+    assert "Not installed here: decant-example 1.0 (" in reported.stderr
+    page = (folder / "elsewhere.html").read_text()
+    assert "Not installed here: decant-example 1.0 (" in page
+    assert page.count("<td>deployment:cone") >= 2, "a line for each pour"
+    assert "failed: cups touch" in page
+    whole = decant("report", str(run), cwd=folder)
+    assert "Not installed" not in whole.stderr
 
 
 def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: Path, folder: Path) -> None:

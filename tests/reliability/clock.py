@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from actors.child_process import child_environment
+
 SOURCE = Path(__file__).with_name("clock.c")
 
 
@@ -21,7 +23,9 @@ def library() -> Path | None:
     if shutil.which("cc") is None:
         return None
     path = Path(tempfile.mkdtemp(prefix="clock")) / "clock.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-o", str(path), str(SOURCE), "-ldl"], check=True)
+    subprocess.run(
+        ["cc", "-shared", "-fPIC", "-O1", "-o", str(path), str(SOURCE), "-ldl"], check=True, env=child_environment()
+    )
     return path
 
 

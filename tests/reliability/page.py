@@ -25,6 +25,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from actors.child_process import child_environment
 from tests.reliability.case import FAULTS, NO_MEANING, TARGETS, Case
 from tests.reliability.rig import Rig
 from tests.reliability.strikes import can_mount
@@ -84,7 +85,7 @@ def commit() -> str:
     """Of the program that was tried."""
     floors = ("HEAD:orchestrator", "HEAD:actors", "HEAD:sim_engine")
     command = ["git", "-C", str(ROOT), "rev-parse", *floors]
-    said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    said = subprocess.run(command, capture_output=True, text=True, check=False, env=child_environment()).stdout
     return " ".join(word[:10] for word in said.split())
 
 
@@ -103,7 +104,11 @@ def run(targets: Sequence[str], jobs: int, results: Path, limit: int | None = No
             target, number, of = tasks.pop(0)
             arguments = ["--results", str(results), "--share", target, str(number), str(of)]
             arguments += [] if limit is None else ["--limit", str(limit)]
-            running.append(subprocess.Popen([sys.executable, "-m", "tests.reliability.page", *arguments], cwd=ROOT))
+            running.append(
+                subprocess.Popen(
+                    [sys.executable, "-m", "tests.reliability.page", *arguments], cwd=ROOT, env=child_environment()
+                )
+            )
         time.sleep(0.2)
         good &= all(process.returncode in (None, 0) for process in running)
         running = [process for process in running if process.poll() is None]

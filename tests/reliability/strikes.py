@@ -16,6 +16,8 @@ from pathlib import Path
 
 import psutil
 
+from actors.child_process import child_environment
+
 DISK_MB = 60
 
 PAUSE = 0.7
@@ -51,7 +53,9 @@ def stop(pids: Iterable[int], pause: float = PAUSE) -> None:
 
 def stop_this() -> None:
     """The same for this process: another one lets it go on."""
-    subprocess.Popen(["sh", "-c", f"sleep {PAUSE}; kill -CONT {os.getpid()}"], start_new_session=True)
+    subprocess.Popen(
+        ["sh", "-c", f"sleep {PAUSE}; kill -CONT {os.getpid()}"], start_new_session=True, env=child_environment()
+    )
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
@@ -122,11 +126,13 @@ def shift_clock(seconds: float) -> None:
 def disk(place: Path) -> Iterator[None]:
     """A small disk of its own."""
     place.mkdir(parents=True, exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(place)], check=True)
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(place)], check=True, env=child_environment()
+    )
     try:
         yield
     finally:
-        subprocess.run(["umount", "--lazy", str(place)], check=True)
+        subprocess.run(["umount", "--lazy", str(place)], check=True, env=child_environment())
         place.rmdir()
 
 

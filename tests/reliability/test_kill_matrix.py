@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
 from tests.reliability import strikes
 from tests.reliability.case import (
     BACK,
@@ -95,7 +96,7 @@ def test_points_are_chosen_by_kind_and_stage() -> None:
 
 def test_a_line_that_is_cut_is_cut_at_both_ends_and_a_threads_own_is_not() -> None:
     """In a process of its own: this one has lines to whoever runs the tests."""
-    subprocess.run([sys.executable, "-c", CUT], check=True, cwd=ROOT)
+    subprocess.run([sys.executable, "-c", CUT], check=True, cwd=ROOT, env=child_environment())
 
 
 CUT = """

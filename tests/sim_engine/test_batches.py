@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from actors.child_process import child_environment
 from sim_engine.action import DEG, Action
 from sim_engine.backend import BackendError, cuda_devices, require_backend
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
@@ -142,5 +143,6 @@ def test_engine_ends_cleanly_without_having_simulated() -> None:
         capture_output=True,
         text=True,
         timeout=PATIENCE,
+        env=child_environment(),
     )
     assert (done.returncode, done.stderr) == (0, "")

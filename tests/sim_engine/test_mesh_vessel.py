@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ import trimesh
 
 from sim_engine import cache
 from sim_engine.hydrostatics import retained_volume
+from sim_engine.vessel import mesh as mesh_module
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.mesh_distance import closest_points
@@ -173,7 +176,15 @@ def test_every_format_gives_the_same_vessel(build: Make, suffix: str) -> None:
     assert vessel.rim_height == pytest.approx(0.064, abs=1e-5)
 
 
-@pytest.mark.parametrize(("up", "turn"), [("y", (1, 0, 0)), ("-z", (1, 0, 0)), ("x", (0, 1, 0)), ("-x", (0, 1, 0))])
+@pytest.mark.parametrize(
+    ("up", "turn"),
+    [
+        ("y", (1, 0, 0)),
+        ("-x", (0, 1, 0)),
+        pytest.param("-z", (1, 0, 0), marks=pytest.mark.slow),
+        pytest.param("x", (0, 1, 0), marks=pytest.mark.slow),
+    ],
+)
 def test_up_axis_of_the_mesh_becomes_the_axis_of_the_vessel(build: Make, up: str, turn: tuple[int, int, int]) -> None:
     angle = {"y": -90.0, "-z": 180.0, "x": 90.0, "-x": -90.0}[up]
     mesh = cup()
@@ -266,6 +277,30 @@ def test_file_that_is_no_mesh_is_refused(tmp_path: Path, name: str, content: byt
         build_vessel(VesselSpec(name="broken", shape=MeshShape(path=path)))
 
 
+def test_a_home_that_can_not_be_written_costs_the_cache_and_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A file in the place of the folder stops every user, the superuser too."""
+    (tmp_path / "home").touch()
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path / "home" / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    directory = cache.cache_directory()
+    assert directory == cache.cache_directory()
+    assert directory.parent == tmp_path / "tmp"
+    assert directory.stat().st_mode & 0o777 == 0o700
+    (logged,) = caplog.messages
+    assert f"{tmp_path / 'home' / 'cache'} can't be written" in logged
+    assert "Not a directory" in logged
+    assert "Set $DECANT_CACHE_DIR to a folder that you can write" in logged
+    assert cache.store_arrays("some", {"x": np.ones(3)})
+    assert cache.load_arrays("some") is not None
+
+    directory.chmod(0o777)  # what anybody may have put there must not be executed
+    with pytest.raises(OSError, match="belongs to another user"):
+        cache.cache_directory()
+
+
 def test_missing_file_says_which(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere\.stl"):
         build_vessel(VesselSpec(name="missing", shape=MeshShape(path=tmp_path / "nowhere.stl")))
@@ -274,12 +309,23 @@ def test_missing_file_says_which(tmp_path: Path) -> None:
 def test_known_mesh_comes_from_the_cache_and_a_damaged_cache_is_rebuilt(
     build: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    measure = mesh_module._measure
+    measured: list[Vessel] = []
+
+    def once(*arguments: Any) -> Vessel:
+        """The first measurement; later ones of the same mesh would come to the same, seconds later."""
+        measured.append(measured[0] if measured else measure(*arguments))
+        return measured[0]
+
+    monkeypatch.setattr("sim_engine.vessel.mesh._measure", once)
     first = build(cup())
     (stored,) = cache.cache_directory().glob("*.npz")
     content = stored.read_bytes()
     for damaged in (content[: len(content) // 2], b"", b"PK\x03\x04 nonsense"):
         stored.write_bytes(damaged)
+        before = len(measured)
         rebuilt = build(cup())
+        assert len(measured) == before + 1
         np.testing.assert_array_equal(rebuilt.grid.values, first.grid.values)
         assert len(stored.read_bytes()) == len(content)
 

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.geometry import JOINT_NAMES
 from actors.arm.joint_path import JointPath
 from actors.arm.path.kinematics import beyond_reach, posture
-from actors.arm.path.limits import JOINT_NAMES, UPRIGHT
+from actors.arm.path.limits import UPRIGHT
 from actors.arm.path.solids import Nearest, hull, nearest_links, nearest_to_receiver
 from actors.arm.path.stretch import Stretch
 from actors.arm.path.travel import RacingJointError

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from actors.arm.geometry import JOINT_NAMES
 from actors.arm.path.kinematics import MODELS, beyond_reach, inverse, singularities
 from actors.arm.path.transforms import cell_transforms, flange_poses, flange_transforms, pourer_transforms
 from actors.arm.spec import UrArmSpec
@@ -16,8 +17,6 @@ UPRIGHT = math.radians(3.0)
 
 PARTS = ("shoulder", "elbow", "wrist")
 """As `singularities` counts."""
-
-JOINT_NAMES = tuple(f"joint {k} ({name})" for k, name in enumerate(("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"), 1))  # fmt: skip  # noqa: E501
 
 
 def check_limits(spec: UrArmSpec) -> list[str]:

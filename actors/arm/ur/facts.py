@@ -6,31 +6,7 @@ from dataclasses import dataclass, field
 
 from actors.arm.geometry import Joints, Pose, Vector
 from actors.arm.protocol import ArmFacts
-from actors.arm.ur.messages import Facts
-
-ROBOT_MODES = {
-    -1: "no controller",
-    0: "disconnected",
-    1: "confirm safety",
-    2: "booting",
-    3: "off",
-    4: "on",
-    5: "idle",
-    6: "backdrive",
-    7: "running",
-    8: "updating firmware",
-}
-SAFETY_MODES = {
-    1: "normal",
-    2: "reduced",
-    3: "protective stop",
-    4: "recovery",
-    5: "safeguard stop",
-    6: "system emergency stop",
-    7: "robot emergency stop",
-    8: "violation",
-    9: "fault",
-}
+from actors.arm.ur.messages import ROBOT_MODES, SAFETY_MODES, Facts, why_not_ready
 
 
 @dataclass(frozen=True)
@@ -73,16 +49,13 @@ def facts_of(told: Facts) -> UrFacts:
     r = told.reading
     a, b, c, d, e, f = r.joints
     x, y, z = r.centre
-    robot_mode = ROBOT_MODES.get(r.robot_mode, str(r.robot_mode))
-    safety_mode = SAFETY_MODES.get(r.safety_mode, str(r.safety_mode))
-    ready = robot_mode == "running" and safety_mode in ("normal", "reduced")
     return UrFacts(
         model=told.model,
         serial=told.serial,
         version=".".join(map(str, told.version)),
-        problem="" if ready else f"{robot_mode}, safety {safety_mode}",
-        robot_mode=robot_mode,
-        safety_mode=safety_mode,
+        problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider),
+        robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
+        safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
         remote=told.remote,
         checksum=told.checksum,
         tool=Pose(*told.tool),

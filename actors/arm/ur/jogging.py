@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from actors.arm.errors import ArmRefusedError
-from actors.arm.geometry import Joints
+from actors.arm.geometry import JOINT_NAMES, Joints
 from actors.arm.joint_path import FloatArray, JointPath
 from actors.arm.path.kinematics import MODELS, forward, inverse
 from actors.arm.path.limits import outside
@@ -90,9 +90,9 @@ def _turn(axis: FloatArray, angle: float) -> FloatArray:
 
 def _check(spec: UrArmSpec, points: FloatArray) -> None:
     model = MODELS[spec.model]
-    for number, (positions, most) in enumerate(zip(points.T, model.joint_range, strict=True), 1):
+    for name, positions, most in zip(JOINT_NAMES, points.T, model.joint_range, strict=True):
         if np.abs(positions).max() > most:
-            raise ArmRefusedError(f"joint {number} would leave its range")
+            raise ArmRefusedError(f"{name} would leave its range")
     flange = flange_transforms(points[[0, -1]], spec)
     frames = {"tool": cell_transforms(spec).tool.position, "pourer": cell_transforms(spec).pourer.position}
     for thing, place in frames.items():

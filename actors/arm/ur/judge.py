@@ -8,7 +8,8 @@ from actors.arm.look import ArmLook, SafetyRecord
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.judge_settings import home_check, limit_checks, mount_check, payload_check, tool_check
 from actors.arm.ur.look import Findings, look_at
-from actors.arm.ur.survey import PORTS, SCRIPTS, Exchange, SurveyError
+from actors.arm.ur.messages import why_not_ready
+from actors.arm.ur.survey import PORTS, SCRIPTS, SLIDER, Exchange, SurveyError
 from actors.checks import Check, State
 
 ANSWERS = "is this a UR controller? If it is, and has booted, it hangs: restart it"
@@ -97,7 +98,7 @@ def judge(
     if found.state is not None and found.exchange is not None:
         checks.append(mount_check(spec, found.state, found.exchange))
     if found.exchange is not None:
-        checks += [payload_check(spec, found.exchange), _network(found.exchange)]
+        checks += [payload_check(spec, found.exchange), *_motion(found.exchange), _network(found.exchange)]
     return checks
 
 
@@ -177,7 +178,7 @@ def _dashboard(spec: UrArmSpec, found: Findings, said: dict[str, str]) -> list[C
     program = said.get("programState", "").split(" ")[0]
     idle = program in ("STOPPED", "")
     advice = "" if idle else "stop it on the teach pendant, unless Decant runs there now"
-    checks.append(Check("program", "ok" if idle else "warn", f"{program.lower() or 'not told'}", advice))
+    checks.append(Check("program", "ok" if idle else "fail", f"{program.lower() or 'not told'}", advice))
     return checks
 
 
@@ -200,14 +201,14 @@ def _robot_mode(mode: str) -> Check:
 def _safety_mode(mode: str) -> Check:
     advice = {
         "NORMAL": "",
-        "REDUCED": "the reduced limits are in force; pours may break them and end in a protective stop",
+        "REDUCED": "pours are planned within the normal limits: end the reduced mode, at the pendant or its input",
         "PROTECTIVE_STOP": "find the cause, then unlock it on the teach pendant; Decant never does so by itself",
         "RECOVERY": "the arm is outside its limits: bring it back by hand in the recovery mode of the teach pendant",
         "SAFEGUARD_STOP": "a door, mat or light curtain holds it: close it",
         "SYSTEM_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
         "ROBOT_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
     }.get(mode, "look at the teach pendant; a fault of the safety system needs a restart, or the maker's service")
-    state: State = "ok" if mode == "NORMAL" else "warn" if mode == "REDUCED" else "fail"
+    state: State = "ok" if mode == "NORMAL" else "fail"
     return Check("safety", state, mode.lower().replace("_", " ") or "not told", advice)
 
 
@@ -245,6 +246,18 @@ def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virt
             f"find out who changed what on the teach pendant; when the settings are right: {accept}",
         )
     return Check("safety checksum", "ok", f"{checksum}, accepted on {record.date} by {record.accepted_by}")
+
+
+def _motion(exchange: Exchange) -> list[Check]:
+    """Whether a motion could begin now: the decision of the driver itself."""
+    values = [exchange.values.get(name) for name in ("robot_mode", "safety_mode", "runtime_state", SLIDER)]
+    if any(value is None for value in values):
+        return [Check("motion", "warn", "not told", "look at the teach pendant whether the arm is ready")]
+    robot, safety, runtime, slider = (value[0] for value in values if value is not None)
+    why = why_not_ready(int(robot), int(safety), int(runtime), slider)
+    if not why:
+        return [Check("motion", "ok", "the arm is ready to move")]
+    return [Check("motion", "fail", why, "mend that first: no motion begins before")]
 
 
 def _network(exchange: Exchange) -> Check:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from actors.arm.geometry import Pose
+from actors.arm.geometry import JOINT_NAMES, Pose
 from actors.arm.spec import UrArmSpec
 from actors.arm.ur.primary import RobotState
 from actors.arm.ur.survey import Exchange
@@ -88,7 +88,7 @@ def home_check(spec: UrArmSpec, state: RobotState) -> Check:
     return Check(
         "position",
         "warn",
-        f"not at home: joint {worst} is {math.degrees(away[worst]):.1f} deg away",
+        f"not at home: {JOINT_NAMES[worst]} is {math.degrees(away[worst]):.1f} deg away",
         "bring it home slowly with 'decant jog', watching it, before a pour",
     )
 
@@ -115,7 +115,9 @@ def limit_checks(spec: UrArmSpec, state: RobotState) -> list[Check]:
     ]
     if out:
         checks.append(
-            Check("home", "fail", f"joint {out[0]} of 'home' is outside the controller's range", "correct 'home'")
+            Check(
+                "home", "fail", f"{JOINT_NAMES[out[0]]} of 'home' is outside the controller's range", "correct 'home'"
+            )
         )
     return checks
 

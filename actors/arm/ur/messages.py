@@ -26,6 +26,53 @@ SILENCE = 0.2
 """Data whose time stands still for so long, while the arm moves, are stale [s of the clock]."""
 
 
+ROBOT_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "safety to be confirmed",
+    2: "booting",
+    3: "off",
+    4: "on, not started",
+    5: "idle, brakes closed",
+    6: "being moved by hand",
+    7: "running",
+    8: "updating firmware",
+}
+SAFETY_MODES = {
+    1: "normal",
+    2: "reduced mode",
+    3: "protective stop",
+    4: "recovery mode",
+    5: "safeguard stop",
+    6: "emergency stop (system)",
+    7: "emergency stop (robot)",
+    8: "safety violation",
+    9: "fault of the safety system",
+}
+RUNNING_MODE, NORMAL, REDUCED = 7, 1, 2
+STOPPED_PROGRAM, PLAYING = 1, 2
+
+
+def why_not_ready(robot_mode: int, safety_mode: int, runtime: int, slider: float) -> str:
+    """Why an arm can't move; '' if it can. Driver, worker, `decant doctor` and what shows its lines all decide by this.
+
+    Reduced mode prevents motion: pours are planned within the normal limits, and would end in a protective stop.
+
+    Args:
+        robot_mode, safety_mode, runtime: as numbers of RTDE (`robot_mode`, `safety_mode`, `runtime_state`).
+        slider: `target_speed_fraction`, 0 … 1.
+    """
+    if safety_mode != NORMAL:
+        return f"{SAFETY_MODES.get(safety_mode, f'safety mode {safety_mode}')} is in force"
+    if robot_mode != RUNNING_MODE:
+        return f"the robot is {ROBOT_MODES.get(robot_mode, f'in mode {robot_mode}')}, not running"
+    if runtime != STOPPED_PROGRAM:
+        return "a program runs on the controller, or is paused; stop it at the pendant"
+    if slider < 0.999:
+        return f"the speed slider is at {100.0 * slider:.0f} %; a pour needs 100 %"
+    return ""
+
+
 class TroubleError(Exception):
     """The worker can't do what was asked.
 

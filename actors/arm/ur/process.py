@@ -7,7 +7,6 @@ moves. It ends when this process closes its side of the connection, in whatever 
 from __future__ import annotations
 
 import contextlib
-import subprocess
 import threading
 import time
 from concurrent.futures import Future
@@ -16,7 +15,7 @@ from typing import Any
 
 from actors.arm.errors import ArmLostError, ArmRefusedError
 from actors.arm.ur.messages import Progress, TroubleError
-from actors.child import Child
+from actors.child_process import ConnectedProcess
 
 SIGN_OF_LIFE = 0.1
 """Between two signs of life to the worker while a call is awaited [s]."""
@@ -31,9 +30,9 @@ class WorkerProcess:
     """
 
     def __init__(self) -> None:
-        self._child = Child("actors.arm.ur.worker")
-        self._process, self._connection = self._child.process, self._child.connection
-        self.pid = self._process.pid
+        self._child = ConnectedProcess("actors.arm.ur.worker")
+        self._connection = self._child.connection
+        self.pid = self._child.pid
         self._sending = threading.Lock()
         self._pending: dict[int, Future[Any]] = {}
         self._number = 0
@@ -75,9 +74,9 @@ class WorkerProcess:
             except TroubleError as trouble:
                 if trouble.kind == "refused":
                     raise ArmRefusedError(trouble.text) from None
-                raise ArmLostError(trouble.text + self._child.said()) from None
+                raise ArmLostError(trouble.text + self._errors()) from None
         self.kill()
-        raise ArmLostError(f"the arm's worker did not answer '{method}' within {deadline:g} s{self._child.said()}")
+        raise ArmLostError(f"the arm's worker did not answer '{method}' within {deadline:g} s{self._errors()}")
 
     def stop(self, stops: int) -> None:
         """Stop whatever moves; doesn't wait."""
@@ -85,9 +84,7 @@ class WorkerProcess:
 
     def kill(self) -> None:
         """End it: a motion under way ends by its watchdog."""
-        self._process.kill()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(5.0)
+        self._child.kill()
         self._gone.wait(2.0)
 
     def _send(self, message: Any) -> None:
@@ -108,8 +105,7 @@ class WorkerProcess:
                 elif future is not None:
                     future.set_exception(value)
         self._gone.set()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(5.0)
+        self._child.wait(5.0)
         with self._sending:
             pending = list(self._pending.values())
             self._pending.clear()
@@ -118,4 +114,8 @@ class WorkerProcess:
             future.set_exception(TroubleError("lost", self._obituary("a request")))
 
     def _obituary(self, method: str) -> str:
-        return f"the arm's worker died during {method} (status {self._process.poll()}); connect again"
+        return f"the arm's worker died during {method} (status {self._child.status}); connect again"
+
+    def _errors(self) -> str:
+        kept = self._child.errors_kept
+        return f" (it said: {kept})" if kept else ""

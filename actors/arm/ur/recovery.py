@@ -6,9 +6,8 @@ import time
 from collections.abc import Callable
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError
-from actors.arm.ur.messages import TroubleError
+from actors.arm.ur.messages import NORMAL, RUNNING_MODE, STOPPED_PROGRAM, TroubleError
 from actors.arm.ur.rtde_client import RtdeClient
-from actors.arm.ur.watch import NORMAL, RUNNING_MODE, STOPPED_PROGRAM
 
 UNLOCK_DELAY = 5.5
 """A protective stop can't be unlocked earlier [s of controller time]."""

@@ -41,6 +41,10 @@ QUESTIONS = (
 )
 """Asked on the dashboard; none of them does anything."""
 
+SLIDER = "target_speed_fraction"
+STATUS = ("robot_mode", "safety_mode", "runtime_state", SLIDER)
+"""Values over RTDE that decide whether the arm can move."""
+
 ROUND_TRIPS = 20
 
 
@@ -188,7 +192,7 @@ def _exchange(talk: _Rtde, rate: float, seconds: float) -> Exchange:
         asked = time.monotonic()
         version = struct.unpack(">4I", talk.ask(rtde.GET_URCONTROL_VERSION)[:16])
         trips.append(time.monotonic() - asked)
-    names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer")
+    names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer", *STATUS)
     known = _known(talk, names, rate)
     if talk.ask(rtde.START) != b"\x01":
         raise OSError("it doesn't begin to send")

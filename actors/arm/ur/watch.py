@@ -7,18 +7,26 @@ import threading
 import time
 from collections.abc import Callable
 
+from actors.arm.geometry import JOINT_NAMES
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
 from actors.arm.ur.messages import (
     DONE,
+    NORMAL,
+    PLAYING,
     READY,
+    ROBOT_MODES,
+    RUNNING_MODE,
+    SAFETY_MODES,
     SLOWEST_HEARTBEAT,
     STOPPED,
+    STOPPED_PROGRAM,
     DataPackage,
     MotionOrder,
     Outcome,
     Progress,
     Sample,
     TroubleError,
+    why_not_ready,
 )
 from actors.arm.ur.primary import Primary, PrimaryError
 from actors.arm.ur.rtde_client import AT_REST, RtdeClient
@@ -42,33 +50,8 @@ BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 OWNER_SILENCE = 3.0
 """After which a driver that says nothing is taken for dead [s of the clock]."""
 
-RUNNING_MODE, NORMAL, REDUCED = 7, 1, 2
-STOPPED_PROGRAM, PLAYING = 1, 2
-_SAFETY = {
-    3: ("protective stop", "protective stop"),
-    4: ("safety", "recovery mode"),
-    5: ("safeguard", "safeguard stop"),
-    6: ("emergency stop", "emergency stop (system)"),
-    7: ("emergency stop", "emergency stop (robot)"),
-    8: ("safety", "safety violation"),
-    9: ("safety", "fault of the safety system"),
-    REDUCED: ("safety", "reduced mode"),
-}
-_ROBOT = {-1: "no controller", 0: "disconnected", 1: "safety to be confirmed", 2: "booting", 3: "off", 4: "on"}
-_ROBOT |= {5: "idle, brakes closed", 6: "being moved by hand", 7: "running", 8: "updating"}
-
-
-def why_not_ready(reading: DataPackage) -> str:
-    """Why an arm can't move; '' if it can."""
-    if reading.safety_mode != NORMAL:
-        return f"{_SAFETY.get(reading.safety_mode, ('', f'safety mode {reading.safety_mode}'))[1]} is in force"
-    if reading.robot_mode != RUNNING_MODE:
-        return f"the robot is {_ROBOT.get(reading.robot_mode, f'in mode {reading.robot_mode}')}, not running"
-    if reading.runtime != STOPPED_PROGRAM:
-        return "a program runs on the controller, or is paused; stop it at the pendant"
-    if reading.slider < 0.999:
-        return f"the speed slider is at {100.0 * reading.slider:.0f} %; a pour needs 100 %"
-    return ""
+_KINDS = {3: "protective stop", 5: "safeguard", 6: "emergency stop", 7: "emergency stop"}
+"""Kinds of stops by safety mode; "safety" for all others."""
 
 
 class Watch:
@@ -115,7 +98,7 @@ class Watch:
             TroubleError: refused before anything moved.
         """
         reading = self._client.fresh()
-        self._refuse_if(why_not_ready(reading))
+        self._refuse_if(why_not_ready(reading.robot_mode, reading.safety_mode, reading.runtime, reading.slider))
         self._refuse_if(_elsewhere(reading.joints, self._motion.start))
         self._refuse_if(_not_remote(self._address))
         self._joints = reading.joints
@@ -216,9 +199,9 @@ class Watch:
 
     def _stopped_by_safety(self, reading: DataPackage) -> Outcome:
         # A safeguard stop would go on by itself once it is released, a protective stop at somebody's 'play'.
-        kind, text = _SAFETY.get(
-            reading.safety_mode, ("safety", f"the robot is {_ROBOT.get(reading.robot_mode, 'not running')}")
-        )
+        kind = _KINDS.get(reading.safety_mode, "safety")
+        text = SAFETY_MODES.get(reading.safety_mode, "") if reading.safety_mode != NORMAL else ""
+        text = text or f"the robot is {ROBOT_MODES.get(reading.robot_mode, 'not running')}"
         return self._broken_off(kind, text)
 
     def _stopped_by_program(self, primary: Primary) -> Outcome:
@@ -317,7 +300,7 @@ def _elsewhere(joints: tuple[float, ...], wanted: tuple[float, ...]) -> str:
     worst = max(range(6), key=errors.__getitem__)
     if errors[worst] <= AT_START:
         return ""
-    return f"joint {worst + 1} is {errors[worst] * 57.29578:.1f}° away from where it should be; stand there first"
+    return f"{JOINT_NAMES[worst]} is {errors[worst] * 57.29578:.1f}° away from where it should be; stand there first"
 
 
 def _not_remote(address: str) -> str:

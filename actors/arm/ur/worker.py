@@ -17,11 +17,19 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
-from actors.arm.ur.messages import DataPackage, Facts, MotionOrder, Outcome, Progress, TroubleError
+from actors.arm.ur.messages import (
+    STOPPED_PROGRAM,
+    DataPackage,
+    Facts,
+    MotionOrder,
+    Outcome,
+    Progress,
+    TroubleError,
+)
 from actors.arm.ur.primary import Primary, PrimaryError
 from actors.arm.ur.recovery import recover
 from actors.arm.ur.rtde_client import RtdeClient
-from actors.arm.ur.watch import STOPPED_PROGRAM, Watch
+from actors.arm.ur.watch import Watch
 
 HANDS_IN_TIME = 3.0
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import select
-import subprocess
-import sys
 import tempfile
 import threading
 from dataclasses import asdict
@@ -17,6 +14,7 @@ from typing import Any
 from actors.balance.doors import voices
 from actors.balance.virtual_balance import Load
 from actors.balance.virtual_serial.scale import ScaleSettings
+from actors.child_process import ChildProcess, python_module
 from actors.protocols import LaboratoryError
 from actors.ray_warden import MARK
 
@@ -45,12 +43,7 @@ class FarProcess:
         """Path of the line, which keeps its name when the plug is pulled and put in again."""
         self._lock = threading.Lock()
         text = json.dumps({**settings, "link": self.port, "baud": baud})
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "actors.balance.virtual_serial.server", text],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-        self._received = b""
+        self._process = ChildProcess(python_module("actors.balance.virtual_serial.server", text))
         try:
             self._answer()
         except BaseException:
@@ -78,43 +71,34 @@ class FarProcess:
         """
         with self._lock:
             try:
-                assert self._process.stdin is not None
-                self._process.stdin.write(json.dumps({"do": what, **values}).encode("ascii") + b"\n")
-                self._process.stdin.flush()
+                self._process.write(json.dumps({"do": what, **values}).encode("ascii") + b"\n")
             except (OSError, ValueError) as error:
-                raise LaboratoryError(f"virtual balance at {self.port}: its process is gone") from error
+                raise LaboratoryError(f"virtual balance at {self.port}: its process is gone{self._end()}") from error
             return self._answer()
 
     def close(self) -> None:
         """End it. May be called again."""
-        for pipe in (self._process.stdin, self._process.stdout):
-            with contextlib.suppress(OSError):
-                if pipe is not None:
-                    pipe.close()
-        try:
-            self._process.wait(GRACE)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.close(GRACE)
         with contextlib.suppress(OSError):
             Path(self.port).unlink(missing_ok=True)
             Path(self.port).parent.rmdir()
 
     def _answer(self) -> dict[str, Any]:
-        stdout = self._process.stdout
-        assert stdout is not None
-        while b"\n" not in self._received:
-            ready, _, _ = select.select([stdout], [], [], PATIENCE)
-            data = stdout.read1() if ready else b""  # type: ignore[attr-defined]
-            if not data:
-                state = "its process has ended" if ready else f"no answer within {PATIENCE:g} s"
-                raise LaboratoryError(f"virtual balance at {self.port}: {state}")
-            self._received += data
-        line, _, self._received = self._received.partition(b"\n")
-        answer: dict[str, Any] = json.loads(line)
+        try:
+            answer: dict[str, Any] = json.loads(self._process.read_line(PATIENCE))
+        except TimeoutError:
+            raise LaboratoryError(f"virtual balance at {self.port}: no answer within {PATIENCE:g} s") from None
+        except (EOFError, OSError, ValueError):
+            raise LaboratoryError(f"virtual balance at {self.port}: its process has ended{self._end()}") from None
         if "error" in answer:
             raise LaboratoryError(f"virtual balance at {self.port}: {answer['error']}")
         return answer
+
+    def _end(self) -> str:
+        """How its process ended, for an error message."""
+        self._process.wait(1.0)
+        said = f": {self._process.last_error}" if self._process.last_error else ""
+        return f" (status {self._process.status}{said})"
 
 
 class VirtualSerialBalance(FarProcess):

@@ -43,6 +43,9 @@ POOLED_PRIOR = HyperPrior(noise=(0.05, 0.4), simulated_noise=(0.3, 1.0))
 SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
 """Wide, so that a simulation that is the wrong way round can be found out."""
 
+SMALLEST_SCALE = 1e-60
+"""Smallest unit of costs; fourth powers of a smaller one (products of covariances) leave the range of floats."""
+
 VARYING_FROM = 20
 """Observations below which the noise is taken for constant: fewer can't tell."""
 
@@ -343,7 +346,11 @@ def _constant(value: float) -> Mean:
 
 
 def _scale(residuals: Array, costs: Array) -> float:
-    """Unit of the priors: the residuals' size, but on a plateau a tenth of the costs', so that doubt remains."""
+    """Unit of the priors: the residuals' size, but on a plateau a tenth of the costs', so that doubt remains.
+
+    Costs below `SMALLEST_SCALE` count as zero, and zero costs have the unit 1.
+    """
     size = float(np.sqrt(np.mean(residuals**2)))
     floor = 0.1 * float(np.max(np.abs(costs)))
-    return max(size, floor) or 1.0
+    scale = max(size, floor)
+    return scale if scale >= SMALLEST_SCALE else 1.0

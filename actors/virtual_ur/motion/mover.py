@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import degrees
 
+from actors.arm.geometry import JOINT_NAMES
 from actors.ur.models import Joints, RobotModel
 from actors.virtual_ur.motion.actions import STILL, Action, JointSpeed, Path, Servo, ToolSpeed
 from actors.virtual_ur.motion.lines import Arm, Line, UnreachableError
@@ -231,12 +232,12 @@ class Mover:
             speed = abs(q[i] - self.q[i]) / dt
             if not speed <= _SPEED_MARGIN * self.joint_speed[i]:  # so that what is not a number is caught too
                 raise ViolationError(
-                    f"joint {i} would turn at {degrees(speed):.0f} deg/s; "
+                    f"{JOINT_NAMES[i]} would turn at {degrees(speed):.0f} deg/s; "
                     f"its limit is {degrees(self.joint_speed[i]):.0f} deg/s"
                 )
             low, high = self.joint_range[i]
             if not low <= q[i] <= high and abs(q[i] - 0.5 * (low + high)) > abs(self.q[i] - 0.5 * (low + high)):
-                raise ViolationError(f"joint {i} would leave its range at {degrees(q[i]):.1f} deg")
+                raise ViolationError(f"{JOINT_NAMES[i]} would leave its range at {degrees(q[i]):.1f} deg")
 
     def _break_off(self, dt: float) -> None:
         self._action = stop = JointSpeed((0.0,) * 6, SAFETY_STOP)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from orchestrator.config.yaml.errors import Problem, did_you_mean
 from orchestrator.config.yaml.files import UnreadableError, read_text
+from orchestrator.config.yaml.sections import MOST_POURS
 from orchestrator.plan import RecordedPour
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
 
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
 MASS_COLUMNS = ("poured_g", "spilled_g", "retained_g")
 SPLITS = ("train", "test", "transfer")
 LIP_COLUMN = "lip_to_receiver_axis_mm"
-
-MOST_POURS = 2_000
-"""The surrogates take some hundreds."""
 
 MASS_TOLERANCE = 0.01
 """Largest relative difference between poured + retained and the load; spills and drips make a weighing no better."""

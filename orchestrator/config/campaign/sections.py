@@ -15,12 +15,16 @@ from orchestrator.config.vessel import LiquidFile, VesselFile
 from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.config.yaml.sections import (
     MADE,
-    Count,
     FilePath,
     Name,
     PathOr,
     PositiveCount,
+    PositivePourCount,
+    PositiveSimulationCount,
+    PourCount,
     Section,
+    Seed,
+    SimulationCount,
     Switch,
     Text,
     tagged,
@@ -54,16 +58,16 @@ class TransferSection(Section):
 class PoursSection(Section):
     """Pours to calibrate on: to be made (`count`), or weighed already (`from`, `from_run`)."""
 
-    count: PositiveCount | None = None
+    count: PositivePourCount | None = None
     """Pours to make on the bench."""
 
-    holdout: Count | None = None
+    holdout: PourCount | None = None
     """How many of them are kept for testing; an eighth unless given."""
 
     design: Design = "stratified"
     """stratified: spread evenly over the actions; active: each by what it will tell about what is to be deployed."""
 
-    simulations: PositiveCount | None = None
+    simulations: PositiveSimulationCount | None = None
     """active: simulations to learn from what pours would tell; 64 unless given."""
 
     holdout_receivers: list[PathOr[VesselFile]] | None = None
@@ -108,7 +112,7 @@ class CalibrationSection(Section):
     pours: PoursSection | None = None
     """Pours to calibrate on."""
 
-    random_baseline: Count = 0
+    random_baseline: SimulationCount = 0
     """Random parameters that are scored for comparison."""
 
     @property
@@ -182,7 +186,7 @@ class DeploymentSection(Section):
     floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
     """Share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless given."""
 
-    confirm: Count = 0
+    confirm: PourCount = 0
     """Pours of the recommended action at the end, which take no part in choosing it: what to expect of it."""
 
     @property
@@ -249,7 +253,7 @@ class OutputsSection(Section):
     record_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
     """Frames of particles per simulated second."""
 
-    recorded_simulations: Count = 6
+    recorded_simulations: SimulationCount = 6
     """How many simulations are recorded with their particles."""
 
 
@@ -265,7 +269,7 @@ class CampaignFile(Section):
     name: Name | None = None
     """Its name in run directories and figures."""
 
-    seed: Count = 0
+    seed: Seed = 0
     """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
     laboratory: PathOr[LaboratoryFile] | None = None

@@ -7,7 +7,14 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, create_model
 
-from orchestrator.config.yaml.sections import MADE, Count, PositiveCount, Section
+from orchestrator.config.yaml.sections import (
+    MADE,
+    PositiveCount,
+    PositivePourCount,
+    PositiveSimulationCount,
+    Section,
+    SimulationCount,
+)
 from orchestrator.strategies.calibration.c1 import C1Settings
 from orchestrator.strategies.calibration.c2 import C2Settings
 from orchestrator.strategies.calibration.c3 import C3Settings
@@ -57,24 +64,24 @@ D2Arm: Any = _arm(D2Settings, "pours", "mean", "initial", "kappa", pours="15")
 class D1ArmSection(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
     """A strategy that is compared: how often, and what it may spend."""
 
-    iterations: list[PositiveCount] = Field(default=[15])
+    iterations: list[PositiveSimulationCount] = Field(default=[15], min_length=1)
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
 class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
     """A strategy that is compared: how often, and what it may spend."""
 
-    per_pour: Count | None = None
+    per_pour: SimulationCount | None = None
     """Simulations told between two pours; not 'free', for then the clock would decide what is asked for."""
 
 
 class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial", "kappa", simulations="108", pours="6")):  # type: ignore[misc]
     """C4 on pours that it chooses itself, each by what it will tell about the deployments."""
 
-    pours: PositiveCount | None = None
+    pours: PositivePourCount | None = None
     """Training pours that it chooses; it is scored on the repetition's test pours."""
 
-    design_simulations: PositiveCount = 64
+    design_simulations: PositiveSimulationCount = 64
     """Simulations to choose them with."""
 
     def changes(self) -> dict[str, Any]:

@@ -17,7 +17,17 @@ from orchestrator.config.yaml.errors import ConfigError
 from orchestrator.config.yaml.files import missing_file, resolved
 from orchestrator.config.yaml.kinds import wrong_kind
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import Count, Name, PathOr, PositiveCount, Section, Text
+from orchestrator.config.yaml.sections import (
+    FilePath,
+    Name,
+    PathOr,
+    PositivePourCount,
+    PourCount,
+    Section,
+    Seed,
+    SimulationCount,
+    Text,
+)
 from orchestrator.config.yaml.source import Document, Place, Report
 from orchestrator.config.yaml.validate import validate
 from orchestrator.plan import CampaignPlan
@@ -55,10 +65,10 @@ class StudyFile(Section):
     name: Name | None = None
     """Its name; runs go to study-NAME."""
 
-    seed: Count = 0
+    seed: Seed = 0
     """Seed of every random choice."""
 
-    campaign: Text | None = None
+    campaign: FilePath | None = None
     """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""
 
     laboratory: PathOr[LaboratoryFile] | None = None
@@ -71,10 +81,10 @@ class StudyFile(Section):
     """Which of the campaign's searched parameters are searched; the others keep the default, or what comes nearest to
     it within the campaign's range."""
 
-    pours: PositiveCount | None = None
+    pours: PositivePourCount | None = None
     """Calibration pours of a repetition, in place of the campaign's."""
 
-    holdout: PositiveCount | None = None
+    holdout: PositivePourCount | None = None
     """How many of them are kept for testing."""
 
     mismatch: list[LevelSection] | None = None
@@ -84,7 +94,7 @@ class StudyFile(Section):
     compared: Text | None = None
     """Level at which C1 to C4 are compared, or 'all'; the first unless given. C4 is run at all levels."""
 
-    random_baseline: Count = 0
+    random_baseline: SimulationCount = 0
     """Random parameters that each calibration is scored beside."""
 
     calibration: CalibrationsSection | None = None
@@ -93,11 +103,11 @@ class StudyFile(Section):
     deployment: DeploymentsSection | None = None
     """The deployments."""
 
-    confirm: Count | None = None
+    confirm: PourCount | None = None
     """How often each deployment's recommended action is poured again at its end, on the same bench with fresh chance
     errors; not at all unless given. May be raised later, as repetitions may."""
 
-    directory: Text | None = None
+    directory: FilePath | None = None
     """Where the study's folder goes; 'runs' in the working directory unless given."""
 
 
@@ -165,6 +175,13 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     )
     arms = calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
     poured = deployment_arms(file.deployment, base.deployment, arms, root, report)
+    if not arms and not poured and not report.problems:
+        empty = next(key for key in ("calibration", "deployment") if file.value(key) is not None)
+        examples = {
+            "calibration": "C4: {repetitions: 10, simulations: 108}",
+            "deployment": "D2: {repetitions: 10, pours: 15}",
+        }
+        report.add(root.at(empty), f"there is nothing to compare; name a strategy, for example '{examples[empty]}'")
     if report.problems or file.name is None:
         return None
     return StudyPlan(

@@ -56,6 +56,23 @@ def resolved(path: Path) -> Path:
         return path.absolute()
 
 
+def in_home(text: str) -> str:
+    """A path with the home directory for a leading `~`, as a shell writes it; other paths as they are.
+
+    Raises:
+        ValueError: `~name` and there is no such user, or `~` and this user has no home directory.
+    """
+    if not text.startswith("~"):
+        return text
+    try:
+        return str(Path(text).expanduser())
+    except RuntimeError:
+        user = text.partition("/")[0]
+        raise ValueError(
+            f"'{user}' is not the home directory of any user; write the whole path, or './{text}' for a name with a ~"
+        ) from None
+
+
 def why_unreadable(path: Path) -> str | None:
     """What is wrong with a path that should be that of a file; None where it is one."""
     if (outside := out_of_bounds(path)) is not None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Discriminator,
@@ -19,12 +20,67 @@ from pydantic import (
     Tag,
 )
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticKnownError, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError, PydanticKnownError, core_schema
 
+from orchestrator.config.yaml.files import in_home
 from sim_engine.marks import Mark
 
 Count = Annotated[int, Strict(), Field(ge=0)]
 """A whole number, 0 or more."""
+
+PositiveCount = Annotated[int, Strict(), Field(ge=1)]
+"""A whole number, 1 or more."""
+
+
+@dataclass(frozen=True)
+class AtMost:
+    """Pydantic annotation: an upper bound of a whole number, with the reason for it.
+
+    Attributes:
+        le: largest value that is allowed.
+        reason: completes 'at most 2,000: …'.
+    """
+
+    le: int
+    reason: str
+
+    def _validate(self, value: int) -> int:
+        if value > self.le:
+            text = f"{value} is too large; at most {self.le:,}: {self.reason}"
+            raise PydanticCustomError("at_most", "{text}", {"text": text})
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._validate, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {**handler(schema), "maximum": self.le}
+
+
+MOST_POURS = 2_000
+MOST_SIMULATIONS = 200_000
+
+_FEW_POURS = AtMost(MOST_POURS, "the surrogates are made for some hundreds of pours")
+_FEW_SIMULATIONS = AtMost(MOST_SIMULATIONS, "at ten simulations a second these take six hours")
+
+PourCount = Annotated[Count, _FEW_POURS]
+"""Real pours, 0 or more."""
+
+PositivePourCount = Annotated[PositiveCount, _FEW_POURS]
+"""Real pours, 1 or more."""
+
+SimulationCount = Annotated[Count, _FEW_SIMULATIONS]
+"""Simulations, iterations or parameters that are tried, 0 or more."""
+
+PositiveSimulationCount = Annotated[PositiveCount, _FEW_SIMULATIONS]
+"""Simulations, iterations or parameters that are tried, 1 or more."""
+
+
+LARGEST_SEED = 2**63 - 1
+"""The largest integer that SQLite, NumPy and JSON readers with 64-bit integers can hold."""
+
+Seed = Annotated[int, Strict(), Field(ge=0, le=LARGEST_SEED)]
+"""The seed of random choices."""
 
 
 def _count_form(value: Any) -> str | None:
@@ -34,15 +90,12 @@ def _count_form(value: Any) -> str | None:
 
 
 CountOrFree = Annotated[
-    Annotated[Count, Tag("number")] | Annotated[Literal["free"], Tag("word")],
+    Annotated[SimulationCount, Tag("number")] | Annotated[Literal["free"], Tag("word")],
     Discriminator(
         _count_form, custom_error_type="count_or_free", custom_error_message="should be a whole number, or 'free'"
     ),
 ]
 """A whole number, 0 or more, or 'free'."""
-
-PositiveCount = Annotated[int, Strict(), Field(ge=1)]
-"""A whole number, 1 or more."""
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 """A plain number without a unit."""
@@ -82,8 +135,16 @@ class Choice:
 
 IN_FILE = Mark("a path, relative to the file that it is written in")
 
-FilePath = Annotated[Text, IN_FILE]
-"""The path of a file or folder, relative to the file that names it."""
+
+def _in_home(text: str) -> str:
+    try:
+        return in_home(text)
+    except ValueError as error:
+        raise PydanticCustomError("home", "{text}", {"text": str(error)}) from None
+
+
+FilePath = Annotated[Text, AfterValidator(_in_home), IN_FILE]
+"""The path of a file or folder, relative to the file that names it; `~` is the home directory."""
 
 
 class Complaints(Protocol):
@@ -184,7 +245,9 @@ def word_or(word: str, model: type[Section]) -> Any:
     return Annotated[Annotated[Literal[word], Tag("word")] | Annotated[model, Tag("section")], Discriminator(form)]
 
 
-PathOr = Annotated[Annotated[Text, Tag("path")] | Annotated[S, Tag("inline")], Discriminator(_form)]
+PathOr = Annotated[
+    Annotated[Text, AfterValidator(_in_home), Tag("path")] | Annotated[S, Tag("inline")], Discriminator(_form)
+]
 """The path of a file that holds the section (relative to the file that names it), or the section itself."""
 
 

@@ -209,6 +209,8 @@ def _message(model: type[Section], detail: ErrorDetails, loc: Loc, data: Any) ->
             return f"should be a mapping (key: value), got {_name(value)}"
         case "missing":
             return "has too few items; should be [r, z]" if loc and isinstance(loc[-1], int) else "is missing"
+        case "too_short":
+            return "is empty; name at least one, or remove the key"
         case "too_long":
             return f"has {context['actual_length']} items; should have {context['max_length']}"
         case _:

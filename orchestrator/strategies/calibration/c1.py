@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Point
-from orchestrator.config.yaml.sections import Complaints, PositiveCount, Text
+from orchestrator.config.yaml.sections import Complaints, PositiveSimulationCount, Text
 from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.strategies.calibration.o1 import BestOfDesign
 from orchestrator.strategies.calibration.settings import DesignSettings
@@ -24,10 +24,10 @@ class C1Settings(DesignSettings):
     strategy: Literal["C1"] = "C1"
     """A uniform grid."""
 
-    grid: dict[Text, PositiveCount] | None = None
+    grid: dict[Text, PositiveSimulationCount] | None = None
     """Values of every searched parameter: {particles: 5, cohesion: 6}."""
 
-    per_axis: PositiveCount | None = None
+    per_axis: PositiveSimulationCount | None = None
     """Values of each searched parameter, in place of 'grid'."""
 
     @property

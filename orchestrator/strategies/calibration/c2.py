@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Point
-from orchestrator.config.yaml.sections import Complaints, PositiveCount
+from orchestrator.config.yaml.sections import Complaints, PositiveSimulationCount
 from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.strategies.calibration.design import stratified
 from orchestrator.strategies.calibration.o1 import BestOfDesign
@@ -23,7 +23,7 @@ class C2Settings(DesignSettings):
     strategy: Literal["C2"] = "C2"
     """Stratified sampling."""
 
-    samples: PositiveCount | None = None
+    samples: PositiveSimulationCount | None = None
     """θ in all, in equal strata where the number fits, else a Latin hypercube."""
 
     @property

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
-from orchestrator.config.yaml.sections import Complaints, PositiveCount
+from orchestrator.config.yaml.sections import Complaints, PositiveSimulationCount
 from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.strategies.calibration.base import MAP_RESOLUTION
 from orchestrator.strategies.calibration.o1 import DiscrepancyOverPours
@@ -23,10 +23,10 @@ class C3Settings(DesignSettings):
     strategy: Literal["C3"] = "C3"
     """Bayesian optimisation, each θ on all training pours."""
 
-    iterations: PositiveCount | None = None
+    iterations: PositiveSimulationCount | None = None
     """θ in all, each simulated on all training pours."""
 
-    initial: PositiveCount = 8
+    initial: PositiveSimulationCount = 8
     """Random parameters before the surrogate takes over."""
 
     kappa: Kappa = 2.0

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, ClassVar, Literal, Self
-
-from pydantic import Field
+from typing import ClassVar, Literal, Self
 
 from actors.optimizer.core.problem import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
-from orchestrator.config.yaml.sections import Complaints, PositiveCount
+from orchestrator.config.yaml.sections import Complaints, PositiveSimulationCount
 from orchestrator.errors import LearningError
 from orchestrator.plan import CalibrationPlan, MeasuredPour
 from orchestrator.requests import Decision, Simulate
@@ -22,7 +20,7 @@ from orchestrator.strategies.calibration.posterior import (
     posterior_found,
     unit_prior,
 )
-from orchestrator.strategies.calibration.settings import MOST_SIMULATIONS, Kappa, check_initial
+from orchestrator.strategies.calibration.settings import Kappa, check_initial
 from orchestrator.strategies.protocol import Strategy
 from orchestrator.strategies.settings import CalibrationSettings
 from orchestrator.strategies.trials import Trial
@@ -45,10 +43,10 @@ class C4Settings(CalibrationSettings):
     strategy: Literal["C4"] = "C4"
     """Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
 
-    simulations: Annotated[PositiveCount, Field(le=MOST_SIMULATIONS)] | None = None
+    simulations: PositiveSimulationCount | None = None
     """Single simulated pours."""
 
-    initial: PositiveCount = 8
+    initial: PositiveSimulationCount = 8
     """Random parameters before the surrogate takes over."""
 
     kappa: Kappa = 2.0

@@ -6,14 +6,11 @@ from abc import abstractmethod
 from typing import Annotated, ClassVar, Self
 
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Complaints, PositiveCount
+from orchestrator.config.yaml.sections import MOST_SIMULATIONS, Complaints, PositiveSimulationCount
 from orchestrator.strategies.settings import CalibrationSettings
 
 Kappa = Annotated[float, Quantity("1", "2.0", 0.0, 100.0)]
 """κ of the lower confidence bound."""
-
-MOST_SIMULATIONS = 200_000
-"""More than anybody waits for: a slip of the pen, or a grid over too many parameters."""
 
 
 class DesignSettings(CalibrationSettings):
@@ -25,7 +22,7 @@ class DesignSettings(CalibrationSettings):
     examples: ClassVar[dict[str, str]] = {}
     """Keys that say how many θ are tried, each with an example; the last one is asked for where all are missing."""
 
-    simulations: PositiveCount | None = None
+    simulations: PositiveSimulationCount | None = None
     """Single simulated pours: a limit, or, alone, all that says how many θ are tried."""
 
     @property

@@ -9,7 +9,7 @@ from statistics import NormalDist
 from typing import Any, ClassVar, Literal
 
 from actors.optimizer.core.problem import Data, Point, Suggestion, SuggestProblem
-from orchestrator.config.yaml.sections import Complaints, Count, PositiveCount
+from orchestrator.config.yaml.sections import Complaints, PositiveSimulationCount, PourCount
 from orchestrator.plan import DeploymentPlan, Draw
 from orchestrator.requests import Decision, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
@@ -42,13 +42,13 @@ class D1Settings(SearchSettings):
     strategy: Literal["D1"] = "D1"
     """Plan in simulation, then pour once."""
 
-    pours: Count = 1
+    pours: PourCount = 1
     """Whether it pours what it has planned; 0 only plans."""
 
-    iterations: PositiveCount | None = None
+    iterations: PositiveSimulationCount | None = None
     """Iterations of the optimiser; 15 unless given, 30 with 'risk'."""
 
-    simulations_per_iteration: PositiveCount = 2
+    simulations_per_iteration: PositiveSimulationCount = 2
     """Simulations averaged in each, under 'risk' one as planned and the others under errors."""
 
     risk: RiskSettings | None = None

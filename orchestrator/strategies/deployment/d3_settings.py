@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from actors.optimizer.core.mismatch import Limit
 from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Complaints, Count, CountOrFree
+from orchestrator.config.yaml.sections import Complaints, CountOrFree, SimulationCount
 from orchestrator.plan import DeploymentPlan
 from orchestrator.strategies.deployment.adaptive import IgnoranceSettings, RiskLimitSettings, Rules, StopSettings
 from orchestrator.strategies.deployment.prices import PricesSettings
@@ -29,7 +29,7 @@ class D3Settings(SearchSettings):
     strategy: Literal["D3"] = "D3"
     """Real pours with a simulated prior."""
 
-    prior_simulations: Count = 37
+    prior_simulations: SimulationCount = 37
     """Simulations before the first pour; with 'per_pour: free' at most so many."""
 
     per_pour: CountOrFree = 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orchestrator.config.yaml.sections import PositiveCount
+from orchestrator.config.yaml.sections import PositiveSimulationCount
 from orchestrator.strategies.calibration.settings import Kappa
 from orchestrator.strategies.settings import DeploymentSettings
 
@@ -13,5 +13,5 @@ class SearchSettings(DeploymentSettings):
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""
 
-    initial: PositiveCount = 3
+    initial: PositiveSimulationCount = 3
     """Random actions before the surrogate takes over."""

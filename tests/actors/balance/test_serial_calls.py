@@ -6,6 +6,7 @@ import asyncio
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from actors.balance.actor import DeviceBalance
@@ -13,20 +14,19 @@ from actors.balance.errors import BalanceError, NotStableError, OutOfRangeError
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.settling import SettlingRule
 from actors.device import LocalDevice, RayDevice
+from tests.patience import PATIENCE
 
 from .conftest import spec_for
 
 
 @pytest.mark.realtime
 def test_an_interrupt_ends_the_wait_for_an_answer_too(driver):
-    far, balance = driver("kcp", answer_time=10.0)
+    far, balance = driver("kcp", answer_time=2 * PATIENCE)
     balance.connect()
     far.faults(silent=True)
     threading.Timer(0.2, balance.interrupt).start()
-    started = time.monotonic()
     with pytest.raises(BalanceError, match="interrupted"):
         balance.weigh()
-    assert time.monotonic() - started < 3.0
 
 
 @pytest.mark.realtime
@@ -58,12 +58,11 @@ def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(
 def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver):
     _, balance = driver("kcp")
     shown = balance.weigh().shown
-    listening = threading.Thread(target=balance.listen, args=(1.5,))
+    listening = threading.Thread(target=balance.listen, args=(3.0,))
     listening.start()
     time.sleep(0.2)
-    started = time.monotonic()
     assert balance.read().shown == shown
-    assert time.monotonic() - started < 0.8
+    assert listening.is_alive(), "it was read while the other call had the line"
     listening.join()
 
 
@@ -83,12 +82,13 @@ def test_the_display_is_read_five_to_ten_times_a_second(driver):
     _, balance = driver("kern-swt", time_scale=1.0)
     balance.connect()
     times = set()
-    started = time.monotonic()
     for weight in balance.stream(0.1):
         times.add(weight.time)
-        if time.monotonic() - started > 2.0:
+        if len(times) == 12:
             break
-    assert 10 <= len(times) <= 21
+    steps = np.diff(sorted(times))
+    assert np.median(steps) > 0.08  # a busy machine reads late, never early
+    assert min(steps) < 0.3
 
 
 @pytest.mark.realtime

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
+
 PACE = 15.0
 
 PROGRAM = f"""
@@ -42,7 +44,9 @@ asyncio.run(play())
 @pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_whose_motion_was_forgotten_is_unknown_and_the_next_one_is_poured():
-    program = subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, text=True)
+    program = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, text=True, env=child_environment()
+    )
     assert program.stdout is not None
     try:
         for line in program.stdout:

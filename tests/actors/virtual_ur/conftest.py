@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.child_process import child_environment
 from actors.virtual_ur import VirtualController
 from actors.virtual_ur.controller import Controller, RuntimeState
 from actors.virtual_ur.messages import Message
@@ -102,6 +103,7 @@ class Client:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            env=child_environment(),
         )
         self._timer = threading.Timer(deadline, self._process.kill)
         self._timer.daemon = True

@@ -1,6 +1,7 @@
 """The unmodified client library against the controller: moves, streams, paths, questions, signals, programs, dashboard.
 
-Each scenario runs once (in a process of its own) and is judged by several tests.
+Each scenario runs once (in a process of its own) and is judged by several tests. A test that is tried again has all of
+them run again, on other controllers: fixtures of a module are renewed for it.
 """
 
 from __future__ import annotations
@@ -61,8 +62,10 @@ def robots() -> Iterator[dict[str, Robot]]:
                 VirtualController.start(address=next_address(), model=model, time_scale=SCALE)
             )
             controller.fault("inputs", digital={"3": True, "4": False}, analog=[3.3])
-            queue = stack.enter_context(ThreadPoolExecutor(1))
-            sightings = {name: queue.submit(observe, name, controller.address) for name in SCENARIOS}
+            queue = ThreadPoolExecutor(1)
+            stack.callback(queue.shutdown, cancel_futures=True)
+            asked = {name: {"model": model} if name == "questions" else {} for name in SCENARIOS}
+            sightings = {name: queue.submit(observe, name, controller.address, **asked[name]) for name in SCENARIOS}
             found[model] = Robot(model, controller, sightings)
         yield found
 

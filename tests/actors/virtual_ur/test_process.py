@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from actors.child_process import child_environment
 from actors.virtual_ur import VirtualController, VirtualControllerError, host
 from tests.depth import examples
 from tests.patience import PATIENCE
@@ -86,7 +87,7 @@ def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
         ({"frequency": 1.0}, "Hz"),
         ({"model": "ur5"}, "ur10"),
         ({"joints": [0.0, 1.0]}, "six numbers"),
-        ({"joints": [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]}, "joint 5"),
+        ({"joints": [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]}, "joint 6 \\(wrist 3\\)"),
     ],
 )
 def test_settings_that_make_no_sense_are_told(options: dict[str, object], says: str) -> None:
@@ -112,7 +113,11 @@ time.sleep(60)
 def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
     address = next_address()
     parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, address, how], stdout=subprocess.PIPE, text=True, start_new_session=True
+        [sys.executable, "-c", PARENT, address, how],
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=child_environment(),
     )
     try:
         assert parent.stdout is not None
@@ -145,7 +150,11 @@ asyncio.run(main())
 def test_an_interpreter_that_hangs_ends_all_the_same() -> None:
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
-            [sys.executable, "-c", HANGING], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints
+            [sys.executable, "-c", HANGING],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=complaints,
+            env=child_environment(),
         )
         try:
             assert process.stdout is not None

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from functools import partial
-from math import radians
+from math import degrees, radians
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
-from actors.arm.errors import NotAcceptedError
+from actors.arm.errors import ArmRefusedError, NotAcceptedError
 from actors.arm.ur import look
 from actors.arm.ur.accepted import require_accepted
 from actors.arm.ur.survey import read_exchange
 from actors.balance.virtual_serial.handle import VirtualSerialBalance
+from actors.ur.models import MODELS
 from actors.virtual_ur.launcher import VirtualController
+from actors.virtual_ur.safety import SafetyConfiguration
 from orchestrator.cli import app
+from orchestrator.config.load import load_laboratory
 from orchestrator.safety import SafetyRecordError, accepted_checksum, read_record, record_path
 from tests.orchestrator import hardware
 
@@ -182,6 +188,93 @@ def test_stops_are_named_and_never_unlocked(tmp_path: Path) -> None:
         assert "PROTECTIVE" in str(started.fault("state")["safety_mode"])
         started.fault("emergency_stop")
         assert checked(path)["safety"]["found"] == "robot emergency stop"
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize(
+    ("fault", "arguments", "line", "why"),
+    [
+        ("reduced", {}, "safety", "reduced mode is in force"),
+        ("slider", {"fraction": 0.5}, "motion", "the speed slider is at 50 %; a pour needs 100 %"),
+    ],
+)
+def test_doctor_fails_for_the_reason_for_which_the_driver_refuses(
+    tmp_path: Path, fault: str, arguments: dict[str, Any], line: str, why: str
+) -> None:
+    with VirtualController.start("127.81.3.6", "ur10", joints=JOINTS) as started:
+        hardware.install(started)
+        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+        ready = checked(path)["motion"]
+        assert (ready["state"], ready["found"]) == ("ok", "the arm is ready to move")
+        started.fault(fault, **arguments)
+        table = checked(path)
+        assert table[line]["state"] == "fail"
+        assert (table["motion"]["state"], table["motion"]["found"]) == ("fail", why)
+        spec = load_laboratory(path).arm
+        assert spec is not None
+        cls, given = spec.driver(None)
+        arm = cls(*given)
+        try:
+            assert arm.connect().problem == why
+            arm.release()
+            with pytest.raises(ArmRefusedError, match=why):
+                arm.jog("joint 6", 0.02, 0.1)
+        finally:
+            arm.close()
+
+
+@pytest.mark.realtime
+def test_joints_are_numbered_from_1_everywhere(tmp_path: Path) -> None:
+    away = [*JOINTS[:4], JOINTS[4] + 0.3, JOINTS[5]]
+    with VirtualController.start("127.81.3.7", "ur10", joints=away) as started:
+        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+        assert "joint 5 (wrist 2) is 17.2 deg away" in checked(path)["position"]["found"]
+    assert joints_violation(9.0) == f"joint 5 (wrist 2) is at {degrees(9.0):.1f} deg, outside -363 … 363 deg"
+
+
+def joints_violation(angle: float) -> str | None:
+    q = [0.0, 0.0, 0.0, 0.0, angle, 0.0]
+    return SafetyConfiguration.of(MODELS["ur10"]).joints_violation(q)
+
+
+@pytest.mark.parametrize(
+    ("module", "package"), [("psutil", "psutil"), ("serial", "pyserial"), ("rtde_receive", "ur-rtde"), ("ray", "Ray")]
+)
+def test_without_an_extra_doctor_names_package_and_extra_before_it_starts_anything(
+    module: str, package: str, tmp_path: Path
+) -> None:
+    """In a process that can't import the package: what is started is a controller, and it would be started 20 times."""
+    (tmp_path / "without.py").write_text(WITHOUT)
+    told = subprocess.run(
+        [sys.executable, tmp_path / "without.py", module, "doctor", "configs/laboratories/virtual.yaml"],
+        env=dict(os.environ),
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert "Traceback" not in told.stderr
+    said = " ".join((told.stdout + told.stderr).split())
+    assert package in said
+    assert "pip install 'decant[lab]'" in said
+    looked = module in ("rtde_receive", "ray")  # neither is needed to read what arm and balance say
+    assert ("started: 1" in told.stderr) is looked
+    assert told.returncode == (1 if looked else 2)
+
+
+WITHOUT = """\
+import importlib.util, sys
+from actors.virtual_ur.launcher import VirtualController
+missing, real, started = sys.argv.pop(1), importlib.util.find_spec, []
+importlib.util.find_spec = lambda name, *rest: None if name == missing else real(name, *rest)
+sys.modules[missing] = None
+start = VirtualController.start.__func__
+VirtualController.start = classmethod(lambda cls, *a, **k: (started.append(1), start(cls, *a, **k))[1])
+from orchestrator.cli import main
+try:
+    main()
+finally:
+    print("started:", len(started), file=sys.stderr)
+"""
 
 
 @pytest.mark.realtime

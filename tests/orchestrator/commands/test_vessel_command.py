@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import ExifTags, Image
 
 from orchestrator.commands.speaking import RefusalError
 from orchestrator.commands.vessel import Sources, vessel
+from orchestrator.commands.vessel_tables import read_photograph
 from orchestrator.config.load import load_vessel
 from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.profile import volume
@@ -72,6 +74,41 @@ def mesh(of: Bench, folder: Path) -> Sources:
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
     of, within = bench(name), 0.03 if door is depth else 0.015  # a pixel of the camera is 1.4 mm on the cup
     assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=within)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photograph_is_measured_as_it_is_shown_however_the_camera_was_held(tmp_path: Path, orientation: int) -> None:
+    """A camera stores what its sensor saw, and in EXIF how that has to be turned or mirrored."""
+    of = bench("tumbler")
+    shown = Image.open(of.photo(tmp_path / "shown.png"))
+    stored = shown if (turn := AS_STORED[orientation]) is None else shown.transpose(turn)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.save(tmp_path / "stored.png", exif=exif)
+    np.testing.assert_array_equal(read_photograph(tmp_path / "stored.png"), read_photograph(tmp_path / "shown.png"))
+
+
+AS_STORED = {
+    1: None,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+"""What undoes the turn that an EXIF orientation asks for."""
+
+
+def test_a_cup_photographed_upright_by_a_camera_on_its_side_comes_out_as_it_is(tmp_path: Path) -> None:
+    of = bench("tumbler")
+    sources = photo(of, tmp_path)
+    assert sources.photo is not None
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.open(sources.photo).transpose(Image.Transpose.ROTATE_90).save(sources.photo, exif=exif)
+    assert made(tmp_path, sources) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
 def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_level(tmp_path: Path) -> None:
@@ -211,6 +248,17 @@ def written(text: str) -> Door:
         (written("level_mm,mass_g\n10,20\n20,x\n"), r"fill.csv:3: should be two numbers"),
         (written("level_mm,mass_g\n10,20\n200,30\n"), r"fill.csv:3: level_mm is 200; should be .* at most 100"),
         (written("level_mm,mass_g\n10,20\n"), r"at least 3"),
+        (written("level_mm,mass_g\n50,20\n50,30\n50,40\n"), r"fill.csv: has 1 different value"),
+        (written("level_mm,mass_g\n10,90\n40,60\n80,30\n"), r"fill.csv:3: mass_g is 60 at 40, and 90 at 10 \(line 2\)"),
+        (written("level_mm,mass_g\n10,20\n50,90\n50,300\n90,400\n"), r"fill.csv:4: mass_g is 300 at 50, and 90 at 50"),
+        (written("level_mm,mass_g\n10,0\n40,0\n80,0\n"), r"fill.csv:2: 0 g below 10 mm make a vessel of 0 mm"),
+        (written("level_mm,mass_g\n10,9e4\n40,9.1e4\n80,9.2e4\n"), r"fill.csv:2: .* should be 4 to 1000 mm"),
+        (
+            lambda of, folder: replace(
+                written("tilt_deg,mass_g\n10,5\n50,60\n90,200\n")(of, folder), fill=None, tilt=folder / "fill.csv"
+            ),
+            r"fill.csv:3: mass_g is 60 at 50, and 5 at 10 \(line 2\); a vessel that is tilted further holds less",
+        ),
     ],
 )
 def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, door: Door, said: str) -> None:

@@ -5,15 +5,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 import textwrap
 from pathlib import Path
 
 import pytest
 
 from actors.spec import RaySpec
+from orchestrator.commands.options import call
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
+from orchestrator.config.study.sections import load_study
 from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.daemon.settings import load_settings
 from orchestrator.fingerprint import fingerprint
+from orchestrator.runs import create_run
+from orchestrator.state_directory import state_directory
 from orchestrator.strategies.calibration.c4 import C4Settings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
@@ -98,22 +104,43 @@ def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, mes
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("glycerin 80 %", "'glycerin 80 %' is not in the table; did you mean 'glycerol'?"),
-        ("honey 80 %", "'honey 80 %' is not in the table. Or give its 'viscosity' as well"),
-        ("ethanoll", "did you mean 'ethanol'?"),
+        ("glycerin 80 %", "'glycerin 80 %' is not in the table of liquids. Did you mean 'glycerol 80 %'?"),
+        ("ethanoll", "'ethanoll' is not in the table of liquids. Did you mean 'ethanol'?"),
+        ("honey 80 %", "'honey 80 %' is not in the table of liquids. The table has 'water', "),
+        ("honey", "'honey' is not in the table of liquids. The table has 'water', "),
+        ("olive oil", "'olive oil' is not in the table of liquids. The table has 'water', "),
     ],
 )
-def test_a_liquid_that_is_misspelt_is_not_poured_as_water(name: str, message: str, tmp_path: Path) -> None:
-    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
+def test_a_liquid_that_is_not_in_the_table_is_not_poured_as_water(name: str, message: str, tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
     path = tmp_path / "campaign.yaml"
     path.write_text(text.replace("name: water", f"name: {name}"), encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load_campaign(path)
-    assert message in str(caught.value)
+    (problem,) = caught.value.problems
+    assert message in problem.message
+    assert "give its 'density' and 'viscosity'" in problem.message
+    line = text.splitlines()[problem.line - 1]
+    assert (problem.path, line[problem.column - 1 :].startswith("water")) == (path, True)
+
     path.write_text(text.replace("name: water", f"name: {name}, viscosity: 50 mPa*s"), encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:  # for its vessels alone, which are not there
+    with pytest.raises(ConfigError, match="give its 'density' as well"):
         load_campaign(path)
-    assert "table" not in str(caught.value)
+    given = f"name: {name}, viscosity: 50 mPa*s, density: 1.4 g/cm^3"
+    path.write_text(text.replace("name: water", given), encoding="utf-8")
+    calibration = load_campaign(path).calibration
+    assert calibration is not None
+    liquid = calibration.scene.liquid
+    assert (liquid.name, liquid.density, liquid.dynamic_viscosity) == (name, pytest.approx(1400.0), 0.05)
+
+
+def test_a_temperature_next_to_a_liquid_that_is_not_in_the_table_is_refused(tmp_path: Path) -> None:
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
+    path = tmp_path / "campaign.yaml"
+    given = "name: honey, viscosity: 9 Pa*s, density: 1.4 g/cm^3, temperature: 30 degC"
+    path.write_text(text.replace("name: water", given), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"liquid\.temperature: has no effect: 'honey' is not in the table"):
+        load_campaign(path)
 
 
 def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_after_its_density_was(
@@ -132,6 +159,49 @@ def test_a_run_may_be_resumed_after_the_liquid_s_tension_was_corrected_but_not_a
     thick = ", viscosity: 50 mPa*s"
     assert printed(thick) != printed(thick + ", surface_tension: 40 mN/m")
     assert printed(thick) != printed(", viscosity: 60 mPa*s")
+
+
+def test_a_tilde_in_a_path_is_the_home_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = tmp_path / "home"
+    shutil.copytree(CONFIGS, home / "configs")
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.chdir(tmp_path)
+    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../../runs", "~/runs")
+    (tmp_path / "campaign.yaml").write_text(text.replace("../", "~/configs/"), encoding="utf-8")
+    plan = load_campaign(Path("campaign.yaml"))
+    assert plan.outputs.directory == home / "runs"
+    assert plan.laboratory_source == home / "configs" / "laboratories" / "virtual.yaml"
+    create_run(plan)
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith("~")] == []
+    assert len(list((home / "runs").iterdir())) == 1
+
+    data = json.dumps(
+        {"name": "s", "campaign": "~/configs/campaigns/quickstart.yaml", "directory": "~/studies"} | STUDY
+    )
+    (tmp_path / "study.yaml").write_text(data, encoding="utf-8")
+    assert load_study(Path("study.yaml")).folder == home / "studies" / "study-s"
+
+    (tmp_path / "decant.yaml").write_text("state: ~/state\nroots: [~/configs]\n", encoding="utf-8")
+    settings = load_settings(Path("decant.yaml"))
+    assert (settings.state, settings.roots) == (home / "state", (home / "configs",))
+    monkeypatch.setenv("DECANT_STATE", "~/named")
+    assert state_directory() == home / "named"
+
+
+def test_a_tilde_in_an_option_is_the_home_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shell leaves the one of `--laboratory=~/lab.yaml` as it is."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    taken: list[object] = []
+    call(lambda *args, **kwargs: taken.extend([args, kwargs]), Path("~/a"), [Path("~/b"), 3], state=Path("c/~"))
+    assert taken == [(tmp_path / "home/a", [tmp_path / "home/b", 3]), {"state": Path("c/~")}]
+
+
+STUDY = {
+    "laboratory": str(CONFIGS / "laboratories" / "twin.yaml"),
+    "pours": 6,
+    "holdout": 2,
+    "calibration": {"C4": {"repetitions": 1, "simulations": 12}},
+}
 
 
 def test_error_shows_the_line_and_a_caret_under_the_culprit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from actors.child_process import child_environment
 from orchestrator.config.campaign.check import check_campaign
 from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
 from orchestrator.config.schema import (
@@ -158,5 +159,7 @@ def test_loading_a_campaign_starts_nothing_heavy() -> None:
         "heavy = ('ray', 'taichi', 'rerun', 'sklearn', 'scipy.stats', 'matplotlib', 'trimesh');"
         "print([m for m in heavy if m in sys.modules])"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, env=child_environment()
+    )
     assert result.stdout.strip() == "[]", result.stderr

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from orchestrator.daemon.auth import Role
 from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
@@ -75,6 +78,11 @@ def test_aborting_stops_the_arm_and_leaves_the_pour_to_the_person_who_brings_it_
             question = await served.question()
             assert question["kind"] == "unknown"
             assert (await served.get(f"/campaigns/{key}"))["pours_made"][0]["state"] == "unknown"
+            assert question["details"]["load_g"] == pytest.approx(100.0)
+            for answer in ("weighed 500 0", "weighed 500 0 600"):  # more than the load of 100 g
+                refused = await served.post(f"/questions/{question['id']}/answer", {"answer": answer}, status=422)
+                assert "load of 100 g" in refused["detail"]
+            assert len(await served.get("/questions")) == 1
             await served.post(f"/questions/{question['id']}/answer", {"answer": "lost"})
             served.laboratories[-1].bench.go.set()
             while len(served.laboratories) < 2:
@@ -152,5 +160,32 @@ def test_one_emergency_stop_is_for_all_rigs(tmp_path: Path) -> None:
             assert [one.arm_stops for one in served.laboratories] == [1, 1]
             for key in keys:
                 await served.until(key, "unknown")
+
+    run(work())
+
+
+@pytest.mark.parametrize("lost", ["journal", "content", "folder"])
+def test_a_campaign_whose_journal_is_lost_while_it_is_paused_fails_and_pours_nothing(tmp_path: Path, lost: str) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, held) as served:
+            key = await served.submit()
+            laboratory = await served.pouring()
+            await served.post(f"/campaigns/{key}/pause")
+            await served.until(key, "pausing", "paused")
+            laboratory.bench.go.set()
+            found = await served.until(key, "paused")
+            run_folder = tmp_path / "state/runs" / found["run"]
+            if lost == "folder":
+                shutil.rmtree(run_folder)
+            elif lost == "journal":
+                (run_folder / JOURNAL_NAME).unlink()
+            else:
+                (run_folder / JOURNAL_NAME).write_bytes(b"")
+            await served.post(f"/campaigns/{key}/resume")
+            found = await served.until(key, "failed")
+            assert "Nothing was poured now" in found["reason"]
+            if lost != "folder":
+                assert "pours that may have been made: pour 1 of stage deployment:narrow (weighed: " in found["reason"]
+            assert [len(one.bench.poured) for one in served.laboratories] == [1]
 
     run(work())

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from actors.child_process import child_environment
+
 UNIT = Path(__file__).parents[3] / "configs" / "systemd" / "decant.service"
 
 
@@ -17,7 +19,9 @@ def test_systemd_has_nothing_against_the_unit(tmp_path: Path) -> None:
     unit = tmp_path / "decant.service"
     # The program is looked for; on this machine it is elsewhere.
     unit.write_text(UNIT.read_text().replace("/opt/decant/bin/decant", sys.executable))
-    done = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, timeout=120, env=child_environment()
+    )
     complaints = [line for line in done.stderr.splitlines() if "decant.service" in line]
     assert (done.returncode, complaints) == (0, []), done.stderr
 

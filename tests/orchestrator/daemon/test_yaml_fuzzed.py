@@ -21,7 +21,7 @@ from tests.end_to_end.small import write_campaign
 
 pytestmark = [pytest.mark.slow, pytest.mark.hypothesis]
 
-QUIET: dict[str, Any] = {"deadline": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
+QUIET: dict[str, Any] = {"deadline": None, "suppress_health_check": list(HealthCheck)}
 
 SCALARS = st.one_of(
     st.none(),

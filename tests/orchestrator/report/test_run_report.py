@@ -22,6 +22,7 @@ from orchestrator.commands.interrupted import report_of_what_stands
 from orchestrator.config.load import load_campaign
 from orchestrator.errors import RunError
 from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal_check import JournalCheck
 from orchestrator.plan import CampaignPlan
 from orchestrator.publish import Published, publish, summary_of
 from orchestrator.report import style
@@ -146,7 +147,10 @@ def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
     record.notes.append((0.0, SCRIPT))
     record.decisions.append((SCRIPT, SCRIPT))
     summary = summary_of(plan, made.result, {f"loss map {SCRIPT}": made.published.figures["discrepancy map"]})
-    page = run_page(plan, summary, record, Path(SCRIPT), versions={"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}})
+    damaged = JournalCheck(Path(SCRIPT), problems=(SCRIPT,))
+    versions = {"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}}
+    page = run_page(plan, summary, record, Path(SCRIPT), versions=versions, check=damaged)
+    assert "WARNING: the records of this run are damaged or incomplete" in page
     assert "<script" not in page
     assert page.count("&lt;script&gt;") > 10
 

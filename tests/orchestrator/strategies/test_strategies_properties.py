@@ -104,7 +104,7 @@ def spill(name: str) -> Callable[..., float]:
 
 
 @pytest.mark.parametrize("name", ALL)
-@settings(max_examples=examples(4), deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(4), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**31), slots=st.integers(1, 7), shuffle=st.integers(0, 1000))
 def test_the_order_in_which_simulations_return_changes_no_request(
     name: str, seed: int, slots: int, shuffle: int
@@ -122,7 +122,7 @@ NAN = math.nan
 
 
 @pytest.mark.parametrize("name", [*ALL, "D3, free", pytest.param("D3, free, varying noise", marks=pytest.mark.slow)])
-@settings(max_examples=examples(5), deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(5), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**31), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]))
 def test_whatever_fails_every_question_has_numbers_and_the_end_is_an_answer_or_a_reason(
     name: str, seed: int, share: float

@@ -175,6 +175,22 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "all for testing": (lambda d: {**d, "holdout": 5}, "holdout: 5 of 6 pours for testing"),
     "nothing to compare": (lambda d: without(without(d, "calibration"), "deployment"), "there is nothing to compare"),
+    "empty calibration and deployment": (
+        lambda d: {**d, "calibration": {}, "deployment": {}},
+        "calibration: there is nothing to compare; name a strategy, for example 'C4: {repetitions: 10, ",
+    ),
+    "empty deployment alone": (
+        lambda d: {**without(d, "calibration"), "deployment": {}},
+        "deployment: there is nothing to compare; name a strategy, for example 'D2: {repetitions: 10, pours: 15}'",
+    ),
+    "empty list of iterations": (
+        lambda d: {**d, "deployment": {"D1": {"repetitions": 1, "iterations": []}}},
+        "deployment.D1.iterations: is empty; name at least one",
+    ),
+    "too many final pours": (
+        lambda d: {**d, "confirm": 1_000_000_000},
+        "confirm: 1000000000 is too large; at most 2,000",
+    ),
 }
 
 

@@ -7,33 +7,32 @@ from typing import Any
 
 from rtde_control import Path, PathEntry, RTDEControlInterface
 from rtde_receive import RTDEReceiveInterface
-from shared import HOME, attempt, keep, until
+from shared import HOME, arrived, attempt, keep, until
 
 
 def moves(address: str) -> dict[str, Any]:
     control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     seen: dict[str, Any] = {"home": control.moveJ(HOME, 2.0, 4.0)}
     until(control.isSteady)
-    time.sleep(0.05)  # the receiving connection may be a package behind
+    arrived(receive.getActualQ, HOME)
     seen["moveJ time"] = receive.getTimestamp()
     target = [0.5, -1.4, 1.6, -1.7, -1.4, 0.3]
     seen["moveJ"] = control.moveJ(target, 1.05, 1.4)
     until(control.isSteady)
-    seen["moveJ target"], seen["moveJ reached"] = target, receive.getActualQ()
+    seen["moveJ target"], seen["moveJ reached"] = target, arrived(receive.getActualQ, target)
     pose = receive.getActualTCPPose()
     pose[2] += 0.1
-    time.sleep(0.05)
     seen["moveL time"] = receive.getTimestamp()
     seen["moveL"] = control.moveL(pose, 0.25, 1.2)
     until(control.isSteady)
-    seen["moveL target"], seen["moveL reached"] = list(pose), receive.getActualTCPPose()
+    seen["moveL target"], seen["moveL reached"] = list(pose), arrived(receive.getActualTCPPose, pose)
     pose[1] += 0.05
     seen["moveJ_IK"] = control.moveJ_IK(pose, 1.0, 2.0)
     until(control.isSteady)
-    seen["moveJ_IK target"], seen["moveJ_IK reached"] = pose, receive.getActualTCPPose()
+    seen["moveJ_IK target"], seen["moveJ_IK reached"] = pose, arrived(receive.getActualTCPPose, pose)
     seen["moveL_FK"] = control.moveL_FK(target, 0.5, 1.2)
     until(control.isSteady)
-    seen["moveL_FK reached"] = receive.getActualQ()
+    seen["moveL_FK reached"] = arrived(receive.getActualQ, target)
     return seen
 
 
@@ -41,6 +40,7 @@ def streams(address: str) -> dict[str, Any]:
     """Servo and speed commands, with their stops."""
     control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
+    arrived(receive.getActualQ, HOME)
     seen: dict[str, Any] = {}
     q = list(HOME)
     for _ in range(200):
@@ -64,14 +64,12 @@ def streams(address: str) -> dict[str, Any]:
     until(lambda: abs(receive.getActualQd()[5] + 0.4) < 1e-3)
     seen["speedJ"] = receive.getActualQd()
     control.speedStop(4.0)
-    time.sleep(0.05)  # the receiving connection may be a package behind
-    seen["speedJ after"] = receive.getTargetQd()
+    seen["speedJ after"] = arrived(receive.getTargetQd, [0.0] * 6)
     control.speedL([0.0, 0.0, 0.05, 0.0, 0.0, 0.0], 0.5, 0.5)
     until(lambda: abs(receive.getActualTCPSpeed()[2] - 0.05) < 1e-4)
     seen["speedL"] = receive.getActualTCPSpeed()
     control.speedStop(1.0)
-    time.sleep(0.05)
-    seen["speedL after"] = receive.getTargetTCPSpeed()
+    seen["speedL after"] = arrived(receive.getTargetTCPSpeed, [0.0] * 6)
     control.jogStart([0.0, 0.02, 0.0, 0.0, 0.0, 0.0], control.FEATURE_TOOL)
     seen["jog"] = until(lambda: max(map(abs, receive.getActualTCPSpeed()[:3])) > 0.015)
     control.jogStop()
@@ -98,8 +96,7 @@ def paths(address: str) -> dict[str, Any]:
     seen: dict[str, Any] = {}
     joints = [[*HOME[:5], 0.1 * k, 1.0, 3.0, 0.02 if k < 5 else 0.0] for k in range(1, 6)]
     seen["moveJ path"] = control.moveJ(joints)
-    time.sleep(0.05)  # the receiving connection may be a package behind
-    seen["moveJ path end"] = receive.getTargetQ()
+    seen["moveJ path end"] = arrived(receive.getActualQ, joints[-1][:6])
     start = receive.getActualTCPPose()
     corners = [(0.0, 0.1, 0.0), (0.0, 0.1, 0.1), (0.0, 0.0, 0.1), (0.0, 0.0, 0.0)]
     square = [[*(a + b for a, b in zip(start, c, strict=False)), *start[3:], 0.25, 1.2, 0.02] for c in corners]
@@ -117,8 +114,7 @@ def paths(address: str) -> dict[str, Any]:
         progress.add(control.getAsyncOperationProgressEx().progress())
         time.sleep(0.002)
     seen["movePath progress"] = sorted(progress)
-    time.sleep(0.05)
-    seen["movePath end"] = receive.getTargetTCPPose()
+    seen["movePath end"] = arrived(receive.getTargetTCPPose, start)
     return seen
 
 

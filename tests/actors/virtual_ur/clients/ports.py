@@ -9,15 +9,16 @@ from typing import Any
 from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
-from shared import HOME, attempt, dashboard, keep, until
+from shared import HOME, arrived, attempt, dashboard, keep, until
 
 
-def questions(address: str) -> dict[str, Any]:
+def questions(address: str, model: str = "ur10e") -> dict[str, Any]:
     """Kinematics, limits, settings that are read back."""
     control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ([0.3, -1.4, 1.6, -1.7, -1.4, 0.3], 2.0, 4.0)
     until(control.isSteady)
-    q, pose = receive.getActualQ(), receive.getActualTCPPose()
+    q = arrived(receive.getActualQ, [0.3, -1.4, 1.6, -1.7, -1.4, 0.3], 1e-11)
+    pose = receive.getActualTCPPose()
     seen: dict[str, Any] = {"q": q, "pose": pose}
     seen["steady"] = control.isSteady()
     seen["forward"] = control.getForwardKinematics()
@@ -30,22 +31,22 @@ def questions(address: str) -> dict[str, Any]:
     seen["joints within limits"] = [control.isJointsWithinSafetyLimits(p) for p in (q, [7.0, *q[1:]])]
     seen["pose trans"] = control.poseTrans([1.0, 0.0, 0.0, 0.0, 0.0, 1.5707963], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     seen["tcp before"] = control.getTCPOffset()
-    control.setTcp([0.0, 0.02, 0.15, 0.0, 0.0, 0.4])
+    tool = [0.0, 0.02, 0.15, 0.0, 0.0, 0.4]
+    control.setTcp(tool)
     seen["tcp"] = control.getTCPOffset()
-    seen["pose with tcp"] = receive.getActualTCPPose()
+    with_tool = control.getForwardKinematics(q, tool)
+    seen["pose with tcp"] = arrived(receive.getActualTCPPose, with_tool, 1e-7)
     seen["set payload"] = control.setPayload(0.75, [0.0, 0.0, 0.06])
     until(lambda: receive.getPayload() == 0.75)
     seen["payload"] = [receive.getPayload(), *receive.getPayloadCog()]
-    control.getActualToolFlangePose()
-    time.sleep(0.1)
-    seen["flange"] = control.getActualToolFlangePose()
-    control.getJointTorques()
-    time.sleep(0.1)
+    # The library reads an answer from registers that may still hold the answer to the question before.
+    seen["flange"] = arrived(control.getActualToolFlangePose, pose, 1e-10)
+    until(lambda: abs(control.getJointTorques()[1]) > 10.0, 5.0)
     seen["torques"] = control.getJointTorques()
-    control.getStepTime()
-    time.sleep(0.1)
-    seen["step time"] = control.getStepTime()
-    seen["waypoint"] = control.getTargetWaypoint()
+    if model == "ur10e":  # the library's script asks CB3 controllers for neither
+        until(lambda: abs(control.getStepTime() - 0.002) < 1e-6, 5.0)
+        seen["step time"] = control.getStepTime()
+        seen["waypoint"] = arrived(control.getTargetWaypoint, with_tool, 1e-7)
     control.setTcp([0.0] * 6)
     seen["zero ft"] = control.zeroFtSensor()
     seen["gravity"] = control.setGravity([0.0, 0.0, 9.82])
@@ -97,15 +98,14 @@ def scripts(address: str) -> dict[str, Any]:
         "q = get_target_joint_positions()\ni = 0\nwhile i < 3:\n  q[5] = q[5] + 0.1\n  movej(q, a=3, v=2)\n"
         "  i = i + 1\nend\nset_standard_digital_out(4, True)",
     )
-    time.sleep(0.05)
-    seen["reached"] = receive.getTargetQ()
+    until(lambda: receive.getDigitalOutState(4))
+    seen["reached"] = arrived(receive.getActualQ, [*HOME[:5], 0.3])
     seen["output"] = receive.getDigitalOutState(4)
     seen["script"] = control.sendCustomScript(
         "def own():\n  write_output_integer_register(0, 1)\n  movej([0, -1.5, 1.5, -1.5, -1.5, 0.2], a=3, v=2)\n"
         "  write_output_integer_register(0, 2)\nend\n"
     )
-    time.sleep(0.05)
-    seen["script reached"] = receive.getTargetQ()
+    seen["script reached"] = arrived(receive.getActualQ, [0.0, -1.5, 1.5, -1.5, -1.5, 0.2])
     seen["still works"] = control.moveJ(HOME, 2.0, 4.0)
     return seen
 

@@ -30,6 +30,22 @@ def until(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
     return False
 
 
+def arrived(read: Callable[[], list[float]], target: list[float], tolerance: float = 1e-5) -> list[float]:
+    """Wait until a reading is near a target: connections run packages behind each other, on a busy machine many.
+
+    Returns:
+        The last reading, near the target or not: what it should be is judged by the test.
+    """
+    last: list[float] = []
+
+    def near() -> bool:
+        last[:] = read()
+        return len(last) == len(target) and all(abs(a - b) <= tolerance for a, b in zip(last, target, strict=True))
+
+    until(near, 15.0)
+    return last
+
+
 def attempt(call: Callable[[], Any]) -> Any:
     """A call's result, or its error as text."""
     try:

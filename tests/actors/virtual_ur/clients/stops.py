@@ -87,7 +87,7 @@ def during(address: str, seconds: float = 0.0) -> dict[str, Any]:
     return seen
 
 
-def listening(address: str, seconds: float = 0.5, anew: bool = True) -> dict[str, Any]:
+def listening(address: str, seconds: float = 30.0, anew: bool = True) -> dict[str, Any]:
     """Receive only: a control interface that is cut off reconnects by itself and may crash its process."""
     receive = keep(RTDEReceiveInterface(address))
     print("ready", flush=True)

@@ -1,0 +1,40 @@
+"""Ctrl-C after the last stage, before the report is written: the run is finished, and one command publishes it."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+from orchestrator.journal import Entry, Kind
+from orchestrator.states import State
+from tests.end_to_end import small
+from tests.end_to_end.command import Workplace
+
+SHORT = small.CAMPAIGN[: small.CAMPAIGN.index("deployment:")] + "outputs: {directory: runs, rrd: false}\n"
+
+
+def test_a_run_interrupted_before_its_report_is_published_by_decant_report(tmp_path: Path) -> None:
+    small.write_campaign(tmp_path, SHORT)
+    place = Workplace(tmp_path)
+
+    def finished_without_summary(entries: list[Entry]) -> bool:
+        states = [entry.body["after"] for entry in entries if entry.kind == Kind.CAMPAIGN_STATE]
+        return states[-1:] == [State.FINISHED] and not (place.run_directory() / "summary.json").exists()
+
+    try:
+        process, errors = place.interrupt(finished_without_summary, signal.SIGINT, "run", "small.yaml", "--in-process")
+        run = place.run_directory()
+        assert process.returncode == 130, errors
+        assert "the run is finished, and nothing is lost" in errors
+        command = errors.strip().splitlines()[-1].rpartition("with: decant ")[2].split()
+        assert command == ["report", str(run)]
+        assert not (run / "summary.json").exists()
+
+        place.finish(*command)
+        summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+        assert json.loads((run / "theta.json").read_text(encoding="utf-8"))["theta"] == summary["theta"]
+        assert "finished" in (run / "report.html").read_text(encoding="utf-8")
+        assert list((run / "figures").iterdir())
+    finally:
+        place.close()

@@ -1,0 +1,268 @@
+"""What a run writes and shows, and what a version that did not write a run makes of its folder.
+
+`tests/data/old_runs` has folders of real runs: one that finished (C4, then D3), a calibration on a table of weighed
+pours, and one that died while a pour was under way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import re
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from typer.main import get_command
+from typer.testing import CliRunner
+
+import decant
+from orchestrator.campaign import run_campaign
+from orchestrator.cli import app
+from orchestrator.codec import encode_request
+from orchestrator.config.load import load_campaign
+from orchestrator.daemon.encode import PASSING as PASSED_BY
+from orchestrator.daemon.encode import event_json
+from orchestrator.events import Event, PourProgressed, StrategyProgressed
+from orchestrator.journal import JOURNAL_NAME, JournalReader
+from orchestrator.progress import ProgressDisplay
+from orchestrator.publish import publish
+from orchestrator.replay import ToldStep, read_history
+from orchestrator.report.table import summary_table
+from orchestrator.requests import Request
+from orchestrator.run_result import read_result
+from orchestrator.stages import stages_of
+from orchestrator.strategies.learnt import Learnt
+from tests.golden import old_runs
+from tests.golden.golden import ROOT, Golden, agree, compact, line, normalised
+from tests.golden.world import FormulaLaboratory
+
+RUNS = ("learnt", "weighed", "unknown")
+
+QUICKSTART, TWIN = ROOT / "configs/campaigns/quickstart.yaml", ROOT / "configs/laboratories/twin.yaml"
+
+PASSING = {"time", "t", "seconds", "cpu_s", "pid", "created"}
+PASSING |= {"pool_busy", "pool_useful", "arm_longest_wait_s", "arm_mean_wait_s"}
+"""Keys of what depends on the day, the machine and the process."""
+
+UNPORTABLE = (
+    (re.compile(r"<svg.*?</svg>", re.DOTALL), "<svg/>"),
+    (re.compile(r"<style.*?</style>", re.DOTALL), "<style/>"),
+    (re.compile(r"data:[\w/+;]+,[\w+/=%]+"), "<data>"),
+    (re.compile(r"(?<=>)(?=<(?:p|h\d|li|tr|dt|section|figure|div|ul|table|details|summary)\b)"), "\n"),
+)
+"""Pictures differ between versions of matplotlib and fonts. Tags of blocks begin a line."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rewritten(request: pytest.FixtureRequest) -> None:
+    """Make the folders of old runs anew, where that is asked for."""
+    if request.config.getoption("--rewrite-runs", default=False):
+        old_runs.make()
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Copies of the old runs, in a folder that commands are given in."""
+    folder = tmp_path / "here"
+    shutil.copytree(old_runs.KEPT, folder / "runs")
+    (folder / "pours.csv").write_text(old_runs.TABLE, encoding="utf-8")
+    for path in folder.glob("runs/*/resolved.json"):
+        moved = path.read_text(encoding="utf-8").replace(str(old_runs.HERE), str(folder))
+        path.write_text(moved, encoding="utf-8")
+    monkeypatch.chdir(folder)
+    command = get_command(app)
+    monkeypatch.setattr("typer.testing._get_command", lambda app: command)
+    return folder
+
+
+def typed(folder: Path, *arguments: str) -> str:
+    """What a command prints, and its exit code."""
+    result = CliRunner().invoke(app, list(arguments))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    printed = normalised(f"{result.stdout}{result.stderr}", [(str(folder), "<here>")])
+    return f"$ decant {' '.join(arguments)}\n{printed}exit {result.exit_code}\n\n"
+
+
+def page_of(path: Path, folder: Path) -> str:
+    """A report without pictures."""
+    text = path.read_text(encoding="utf-8")
+    for pattern, new in UNPORTABLE:
+        text = pattern.sub(new, text)
+    return normalised(text, [(str(folder), "<here>")])
+
+
+def timeless(value: Any) -> Any:
+    """A JSON-ready value without what depends on the day, the machine and the process."""
+    if isinstance(value, dict):
+        return {key: None if key in PASSING else timeless(one) for key, one in value.items()}
+    return [timeless(one) for one in value] if isinstance(value, list) else value
+
+
+# -- runs of this version ----------------------------------------------------------------------------------------------
+
+
+def test_a_run_writes_and_shows_the_same(golden: Golden, tmp_path: Path) -> None:
+    plan = load_campaign(QUICKSTART, TWIN)
+    folder = tmp_path / "quickstart-20300131-1"
+    folder.mkdir()
+    plan = replace(plan, outputs=replace(plan.outputs, directory=tmp_path, rrd=False, figures=False))
+    events: list[Event] = []
+    display = ProgressDisplay(plan, quiet=True)
+    work = run_campaign(plan, FormulaLaboratory(), folder, watchers=[events.append, display])
+    result = replace(asyncio.run(work), seconds=12.0)
+
+    passing = [
+        next(event for event in events if isinstance(event, kind)) for kind in (PourProgressed, StrategyProgressed)
+    ]
+    kept = [*passing, *(event for event in events if not isinstance(event, PASSED_BY))]
+    told = [timeless(compact(event_json(event))) for event in kept]
+    # How many of the passing ones come depends on the clock; of each kind the first one is kept.
+    golden.check("one_run/events.jsonl", normalised("\n".join(map(line, _first_in_full(told, "type")))))
+    with JournalReader(folder / JOURNAL_NAME) as journal:
+        entries = [
+            {"stage": entry.stage, "kind": str(entry.kind), "body": timeless(compact(entry.body))}
+            for entry in journal.entries()
+        ]
+    golden.check("one_run/journal.jsonl", normalised("\n".join(map(line, _first_in_full(entries, "kind")))))
+
+    published = publish(plan, result)
+    places = [(str(tmp_path), "<here>")]
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    golden.check("one_run/summary.json", normalised(_indented(timeless(compact(summary))), places))
+    theta = json.loads((folder / "theta.json").read_text(encoding="utf-8"))
+    golden.check("one_run/theta.json", normalised(_indented(compact(theta)), places))
+    golden.check("one_run/files.txt", "\n".join(sorted(path.name for path in folder.iterdir())))
+    console = Console(file=io.StringIO(), width=120, no_color=True)
+    console.print(summary_table(plan, published.summary))
+    shown = re.sub(r"pool .* at most", "<how busy the pool was>", console.file.getvalue())
+    golden.check("one_run/console.txt", normalised(shown, places))  # type: ignore[attr-defined]
+
+
+FULL = 3
+"""Rows of a kind that are kept in full, of each type of request."""
+
+
+def _first_in_full(rows: list[dict[str, Any]], key: str) -> Iterator[dict[str, Any]]:
+    """The first rows of each kind as they are; of the others, requests, outcomes and results by their type alone.
+
+    `test_campaigns.py` has every request.
+    """
+    seen: Counter[str] = Counter()
+    for row in rows:
+        body = row.get("body", row)
+        kind = f"{row[key]} {_type(body.get('request'))} {_type(body.get('outcome'))}"
+        seen[kind] += 1
+        short = {name: _type(body[name]) for name in ("request", "outcome", "result") if name in body}
+        if seen[kind] <= FULL:
+            yield row
+        else:
+            yield {**row, "body": {**body, **short}} if "body" in row else {**row, **short}
+
+
+def _type(value: Any) -> Any:
+    return value.get("type", value.get("kind")) if isinstance(value, dict) else None
+
+
+def _indented(value: Any) -> str:
+    return json.dumps(value, indent=1, ensure_ascii=False)
+
+
+# -- runs of former versions -------------------------------------------------------------------------------------------
+
+
+def test_old_runs_are_found(runs: Path, golden: Golden) -> None:
+    pages = [typed(runs, "runs", "add", "runs")]
+    pages += [typed(runs, "runs", "list"), typed(runs, "runs", "list", "--json"), typed(runs, "runs", "pours")]
+    pages += [typed(runs, "runs", "show", name) for name in RUNS]
+    pages += [typed(runs, "runs", "show", name, "--json") for name in RUNS]
+    pages.append(typed(runs, "runs", "compare", "learnt", "weighed"))
+    golden.check("old_runs/found.txt", "".join(pages))
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_old_run_is_reported(name: str, runs: Path, golden: Golden) -> None:
+    printed = typed(runs, "report", f"runs/{name}", "-o", "page.html", "--json")
+    golden.check(f"old_runs/{name}-report.html", page_of(runs / "page.html", runs))
+    golden.check(f"old_runs/{name}-report.txt", printed)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_old_run_has_the_same_tables(name: str, runs: Path, golden: Golden) -> None:
+    run = decant.open_run(runs / "runs" / name)
+    tables = {
+        table: compact(json.loads(getattr(run, table).to_json(orient="records", double_precision=15)))
+        for table in ("pours", "simulations", "decisions", "curves", "outflows")
+    }
+    found = {
+        "state": str(run.result.state),
+        "counts": [run.result.simulations, run.result.pours],
+        "recommended": {key: compact(one.model_dump(mode="json")) for key, one in run.recommended.items()},
+        **tables,
+    }
+    golden.check(f"old_runs/{name}-tables.json", normalised(_indented(found)))
+
+
+@pytest.mark.parametrize("name", ["learnt", "weighed"])
+def test_old_run_is_published_again_as_it_was(name: str, runs: Path, golden: Golden) -> None:
+    folder = runs / "runs" / name
+    plan = load_campaign(folder / "resolved.json")
+    with JournalReader(folder / JOURNAL_NAME) as journal:
+        result = read_result(journal, folder)
+    published = publish(plan, result)
+    console = Console(file=io.StringIO(), width=120, no_color=True)
+    console.print(summary_table(plan, published.summary))
+    places = [(str(runs), "<here>")]
+    golden.check(f"old_runs/{name}-console.txt", normalised(console.file.getvalue(), places))  # type: ignore[attr-defined]
+    for file in ("summary.json", "theta.json"):
+        again = json.loads((folder / file).read_text(encoding="utf-8"))
+        golden.check(f"old_runs/{name}-{file}", normalised(_indented(timeless(compact(again))), places))
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_old_run_is_replayed(name: str, runs: Path) -> None:
+    """Strategies that are told what the journal has ask again for what it has."""
+    folder = runs / "runs" / name
+    plan = load_campaign(folder / "resolved.json")
+    asked = 0
+    with JournalReader(folder / JOURNAL_NAME) as journal:
+        results: dict[str, Learnt] = {}
+        for stage in stages_of(plan):
+            history = read_history(journal, stage.name)
+            if history.seed is None:
+                break
+            strategy, open_ = stage.build(results, history.seed), dict[int, Request]()
+            for step in history.steps:
+                if isinstance(step, ToldStep):
+                    strategy.tell(open_.pop(step.id), history.outcomes[step.id])
+                    continue
+                requests = strategy.ask(step.slots)
+                assert len(requests) == len(step.ids)
+                for key, request in zip(step.ids, requests, strict=True):
+                    before, now = _sorted(history.requests[key]), _sorted(encode_request(request))
+                    assert agree(before, now), f"stage {stage.name}, request {key}:\n- {before}\n+ {now}"
+                    open_[key], asked = request, asked + 1
+            if history.result is not None:
+                before = _sorted(history.result.model_dump(mode="json"))
+                assert agree(before, _sorted(strategy.result().model_dump(mode="json")))
+                results[stage.name] = history.result
+    assert asked > 0
+
+
+def _sorted(value: Any) -> str:
+    return json.dumps(compact(value), ensure_ascii=False, sort_keys=True)
+
+
+def test_an_old_pour_of_unknown_outcome_needs_a_person(runs: Path, golden: Golden) -> None:
+    campaign = old_runs.CAMPAIGNS["unknown"][0]
+    for name, text in (("beaker", old_runs.BEAKER), ("narrow", old_runs.NARROW), ("unknown", campaign)):
+        (runs / f"{name}.yaml").write_text(text, encoding="utf-8")
+    printed = typed(runs, "run", "unknown.yaml", "--resume", "--run", "unknown", "--in-process", "--quiet")
+    golden.check("old_runs/unknown-resumed.txt", printed)
