@@ -214,7 +214,8 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
     done = run_python("-c", HARNESS)
     assert "3 pours" in done.stdout, done.stderr
     assert "pip install pytest" in run_python("-c", "from decant.testing import ArmContract").stderr
-    subprocess.run([python, "-m", "pip", "install", "-q", "pytest"], check=True, cwd=tmp_path, timeout=600)
+    command = [python, "-m", "pip", "install", "-q", "pytest"]
+    subprocess.run(command, check=True, cwd=tmp_path, timeout=600, env=child_environment())
     (tmp_path / "test_my_arm.py").write_text(CONTRACT, encoding="utf-8")
     done = run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
     assert "2 passed, 1 skipped" in done.stdout, done.stdout + done.stderr

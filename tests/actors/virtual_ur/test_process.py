@@ -267,7 +267,8 @@ thread.join()
 
 @pytest.mark.parametrize("who", ["as it is", "unprivileged"])
 def test_only_the_clock_s_thread_goes_before_other_work_and_where_that_is_not_permitted_it_says_so(who: str) -> None:
-    done = subprocess.run([sys.executable, "-c", ASK, who], stdout=subprocess.PIPE, text=True, check=True)
+    command = [sys.executable, "-c", ASK, who]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=child_environment())
     granted, thread, child, main_thread = done.stdout.strip().split(",")
     assert granted in ("real-time", f"nice {host.NICENESS}", "normal")
     assert int(thread) == (os.SCHED_FIFO if granted == "real-time" else os.SCHED_OTHER)
